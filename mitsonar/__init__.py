@@ -1,0 +1,68 @@
+"""mitsonar: sonar images from Mitsuba 3 scenes, and the motion of the vehicle that saw them.
+
+Importing mitsonar sets no Mitsuba variant and loads no Mitsuba; it only sees to it that the plugins are registered once
+a variant is set. Names are loaded when they are first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from mitsonar import plugins
+
+if TYPE_CHECKING:
+    from mitsonar.errors import MitsonarError, MitsonarWarning
+    from mitsonar.frames import SonarFrames
+    from mitsonar.motion import Motion, Pose, Trajectory
+    from mitsonar.noise import NoiseModel, load_noise
+    from mitsonar.presets import PRESETS, load_sonar
+    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.scenes import load_scene
+    from mitsonar.sonar import Sonar
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "PRESETS",
+    "MitsonarError",
+    "MitsonarWarning",
+    "Motion",
+    "NoiseModel",
+    "Pose",
+    "Simulator",
+    "Sonar",
+    "SonarFrames",
+    "Trajectory",
+    "load_noise",
+    "load_scene",
+    "load_sonar",
+]
+
+_HOME = {
+    "PRESETS": "presets",
+    "MitsonarError": "errors",
+    "MitsonarWarning": "errors",
+    "Motion": "motion",
+    "NoiseModel": "noise",
+    "Pose": "motion",
+    "Simulator": "simulation.imaging",
+    "Sonar": "sonar",
+    "SonarFrames": "frames",
+    "Trajectory": "motion",
+    "load_noise": "noise",
+    "load_scene": "simulation.scenes",
+    "load_sonar": "presets",
+}
+
+plugins.install()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'mitsonar' has no attribute {name!r}")
+    return getattr(import_module(f"mitsonar.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,192 @@
+"""Pose, motion and trajectory: conventions, composition (Almanza-Medina, eq. 3.4), sampling, TUM files.
+
+World: right-handed, z up. Vehicle: x sideways to starboard, y forward, z up. Heading is 0 along +y and grows
+clockwise seen from above; pitch > 0 looks down; roll > 0 puts starboard down. Rotation = heading, then pitch, then
+roll, intrinsic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from mitsonar.errors import MitsonarError
+
+__all__ = ["Motion", "Pose", "Trajectory", "compose", "pose_from_to_world", "to_world_matrices"]
+
+# Mitsuba's sensor frame in the vehicle's: local x = port, local y = up, local z = forward (columns)
+SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+
+class Pose(NamedTuple):
+    """Where the sonar is: x, y, z [m], pitch, roll, heading [rad]."""
+
+    x: float
+    y: float
+    z: float
+    pitch: float = 0.0
+    roll: float = 0.0
+    heading: float = 0.0
+
+    @classmethod
+    def from_degrees(cls, numbers: ArrayLike) -> Self:
+        """The pose of ``x, y, z, pitch, roll, heading`` with metres and degrees.
+
+        Raises:
+            MitsonarError: not six finite numbers.
+        """
+        values = np.asarray(numbers, dtype=float)
+        if values.shape != (6,):
+            raise MitsonarError(f"a pose is six numbers x,y,z,pitch,roll,heading (m, deg): got {values.size}")
+        if not np.isfinite(values).all():
+            raise MitsonarError(f"a pose must be finite: got {','.join(f'{v:g}' for v in values)}; give m and deg")
+        return cls(*values[:3], *np.radians(values[3:]))
+
+
+class Motion(NamedTuple):
+    """Between two pings: sideways [m], forward [m], yaw [rad], in the frame of the second heading (eq. 3.4)."""
+
+    sideways: float
+    forward: float
+    yaw: float
+
+
+def compose(pose: Pose, motion: Motion) -> Pose:
+    """The pose after a motion (Almanza-Medina, eq. 3.4): along the *new* heading."""
+    heading = pose.heading + motion.yaw
+    sin, cos = np.sin(heading), np.cos(heading)
+    x = pose.x + motion.forward * sin + motion.sideways * cos
+    y = pose.y + motion.forward * cos - motion.sideways * sin
+    return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
+
+
+def vehicle_rotation(poses: ArrayLike) -> Rotation:
+    """Rotations from (starboard, forward, up) to the world for poses ``(frames, 6)``."""
+    pitch, roll, heading = np.atleast_2d(np.asarray(poses, dtype=float))[:, 3:].T
+    return Rotation.from_euler("ZXY", np.column_stack([-heading, -pitch, roll]))
+
+
+def poses_from(position: ArrayLike, rotation: Rotation) -> NDArray[np.float64]:
+    """Poses ``(frames, 6)`` of positions ``(frames, 3)`` and the rotations of (starboard, forward, up) to the world."""
+    matrix = np.atleast_3d(rotation.as_matrix().reshape(-1, 3, 3))
+    starboard, forward, up = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
+    pitch = np.arcsin(np.clip(-forward[:, 2], -1, 1))
+    level = np.hypot(forward[:, 0], forward[:, 1]) > 1e-9
+    # looking straight up or down, heading and roll are one angle: it is given to the heading
+    heading = np.where(level, np.arctan2(forward[:, 0], forward[:, 1]), np.arctan2(-starboard[:, 1], starboard[:, 0]))
+    roll = np.where(level, np.arctan2(-starboard[:, 2], up[:, 2]), 0.0)
+    return np.column_stack([np.asarray(position, dtype=float).reshape(-1, 3), pitch, roll, heading])
+
+
+def to_world_matrices(poses: ArrayLike) -> NDArray[np.float64]:
+    """Mitsuba's ``to_world`` of each pose ``(frames, 4, 4)``: local +z the acoustic axis, +y up, +x port."""
+    table = np.atleast_2d(np.asarray(poses, dtype=float))
+    matrices = np.tile(np.eye(4), (len(table), 1, 1))
+    matrices[:, :3, :3] = vehicle_rotation(table).as_matrix() @ SENSOR_IN_VEHICLE
+    matrices[:, :3, 3] = table[:, :3]
+    return matrices
+
+
+def pose_from_to_world(matrix: ArrayLike) -> Pose:
+    """The pose behind a sensor's ``to_world`` ``(4, 4)``.
+
+    Raises:
+        MitsonarError: the matrix is not finite, scales, shears or mirrors.
+    """
+    matrix = np.asarray(matrix, dtype=float)
+    turn = matrix[:3, :3]
+    if not np.isfinite(matrix).all():
+        raise MitsonarError("the sonar's to_world must be finite: got inf or nan; give a lookat, translate or rotate")
+    if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-4) or np.linalg.det(turn) < 0:
+        raise MitsonarError("the sonar's to_world may only turn and move: got a scale, shear or mirror; remove it")
+    poses = poses_from(matrix[:3, 3], Rotation.from_matrix(turn @ SENSOR_IN_VEHICLE.T))
+    return Pose(*(float(value) for value in poses[0]))
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses ``(frames, 6)`` [m, rad] at times ``(frames,)`` [s]."""
+
+    poses: NDArray[np.float64]
+    time_s: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.poses.ndim != 2 or self.poses.shape != (len(self.time_s), 6) or not self.poses.size:
+            raise MitsonarError(f"a trajectory is poses (frames, 6) with a time each: got {self.poses.shape}")
+        if not (np.isfinite(self.poses).all() and np.isfinite(self.time_s).all()):
+            raise MitsonarError("a trajectory must be finite: got inf or nan in a pose or a time")
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    @classmethod
+    def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
+        """``frames`` poses equally spaced from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
+
+        The six numbers run linearly, as they are given: heading 350 to 370 deg turns 20 deg to starboard.
+        """
+        if frames < 1:
+            raise MitsonarError(f"frames must be at least 1: got {frames}")
+        return cls(np.linspace(start, end, frames), np.arange(frames) / rate_hz)
+
+    def resample(self, frames: int) -> Trajectory:
+        """``frames`` poses equally spaced in time; straight lines and shortest turns between the given ones."""
+        if frames < 1:
+            raise MitsonarError(f"frames must be at least 1: got {frames}")
+        if len(self) == 1:
+            return Trajectory(np.repeat(self.poses, frames, axis=0), np.arange(frames) + self.time_s[0])
+        time = np.linspace(self.time_s[0], self.time_s[-1], frames)
+        position = np.column_stack([np.interp(time, self.time_s, axis) for axis in self.poses[:, :3].T])
+        return Trajectory(poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time)), time)
+
+    @classmethod
+    def load_tum(cls, path: str | Path) -> Self:
+        """A TUM file: ``time x y z qx qy qz qw`` a line, the quaternion turning (starboard, forward, up) to the world.
+
+        Raises:
+            MitsonarError: unreadable file, or a broken line, with its number.
+        """
+        try:
+            lines = Path(path).read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not text"
+            raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM file") from None
+        rows = [
+            _tum_row(path, number, line)
+            for number, line in enumerate(lines, start=1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
+        if not rows:
+            raise MitsonarError(f"trajectory {path} holds no pose: give lines of `time x y z qx qy qz qw`")
+        table = np.array(rows)
+        backwards = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+        if backwards.size:
+            raise MitsonarError(
+                f"trajectory {path}: time must increase, got {table[backwards[0] + 1, 0]:g} s after "
+                f"{table[backwards[0], 0]:g} s; sort the lines"
+            )
+        return cls(poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:])), table[:, 0])
+
+    def save_tum(self, path: str | Path) -> None:
+        """Write a TUM file; :meth:`load_tum` reads it back to 1e-9."""
+        quaternions = vehicle_rotation(self.poses).as_quat(canonical=True)
+        table = np.column_stack([self.time_s, self.poses[:, :3], quaternions])
+        np.savetxt(path, table, fmt="%.9f", header="time_s x y z qx qy qz qw (starboard, forward, up to world)")
+
+
+def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
+    try:
+        row = [float(word) for word in line.split()]
+    except ValueError:
+        row = []
+    if len(row) != 8 or not np.isfinite(row).all() or np.linalg.norm(row[4:]) < 1e-6:
+        raise MitsonarError(
+            f"trajectory {path}, line {number}: expected `time x y z qx qy qz qw` as finite numbers with a "
+            f"quaternion other than zero, got {line.strip()[:60]!r}"
+        )
+    return row

@@ -1,0 +1,1 @@
+"""A scene becomes echoes, echoes become frames."""

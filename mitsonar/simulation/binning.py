@@ -1,0 +1,159 @@
+"""The one kernel: echoes to exact sums in range bins and beams.
+
+Every sum is carried out in 64-bit fixed point, so it does not depend on the order of rays, threads or batches; the scale
+follows from the largest sum that is possible, so nothing can overflow.
+
+``thesis``: a ray adds its level to the bin that holds its range (Almanza-Medina, eq. 2.2-2.3). ``physical``: its level is
+spread evenly over the range interval that its elevation cell covers. A box of density q over [a, b) is kept as its
+derivative by bins, four additions however long it is: q (1 - frac a) at floor a, q frac a at the next, the same at b
+with the other sign; one running sum over the bins then gives the image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.simulation.acoustics import largest_level, level
+from mitsonar.simulation.echoes import Echoes
+from mitsonar.sonar import Sonar
+
+__all__ = ["Counts", "accumulate", "fraction_bits", "levels", "strongest"]
+
+NARROWEST = 2.0**-6
+"""Shortest footprint [bins]: a surface seen straight on has none, and a density needs one."""
+
+COUNTERS = 3
+"""Cells a beam beyond its bins: returns nearer than the window, farther than it, and misses."""
+
+
+@dataclass
+class Counts:
+    """What became of the rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed."""
+
+    inside: NDArray[np.int64]
+    nearer: NDArray[np.int64]
+    farther: NDArray[np.int64]
+    missed: NDArray[np.int64]
+
+
+def fraction_bits(sonar: Sonar) -> int:
+    """Bits below one of the fixed-point sums: all rays of a beam, each as strong as can be, stay below 2^62."""
+    cell = sonar.beam_width_rad / sonar.across * math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
+    largest = largest_level(sonar, cell) * sonar.across * sonar.rays_per_beam
+    return 62 - math.ceil(math.log2(largest if sonar.model == "thesis" else largest / NARROWEST))
+
+
+def stride(sonar: Sonar) -> int:
+    """Cells of the sums a beam: bins, the one past the last, counters."""
+    return sonar.range_bins + 1 + COUNTERS
+
+
+def accumulate(echoes: Echoes, line: mi.UInt32, lines: int, sonar: Sonar) -> mi.UInt64:
+    """Sums ``(lines, stride)``, flat; a line is one beam of one ping. Joins the kernel that makes the echoes.
+
+    Args:
+        echoes: Dr.Jit arrays, one value a ray.
+        line: which line a ray belongs to.
+        lines: how many lines there are.
+        sonar: the instrument.
+    """
+    exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
+    hit = exact.hit > 0
+    sums = dr.zeros(mi.UInt64, lines * stride(sonar))
+    start = line * stride(sonar)
+    value = level(exact, sonar, dr.select) * 2.0 ** fraction_bits(sonar)
+    if sonar.model == "thesis":
+        place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
+        inside = hit & (place >= 0) & (place < sonar.range_bins)
+        cell = dr.select(inside, _whole(place), _counter(hit, place < 0, sonar))
+        dr.scatter_add(sums, dr.select(inside, mi.UInt64(value), 1), start + cell)
+        return sums
+    a, b, width = footprint(exact, sonar)
+    inside = hit & (b > 0) & (a < sonar.range_bins)
+    a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
+    first, last = _whole(a), _whole(b)
+    density = value / width
+    whole, late, left = (mi.UInt64(density * part) for part in (1, a - dr.floor(a), b - dr.floor(b)))
+    cell = dr.select(inside, first, _counter(hit, b <= 0, sonar))
+    dr.scatter_add(sums, dr.select(inside, whole - late, 1), start + cell)
+    dr.scatter_add(sums, late, start + first + 1, inside)
+    dr.scatter_add(sums, left - whole, start + last, inside)
+    dr.scatter_add(sums, mi.UInt64(0) - left, start + last + 1, inside & (left > 0))
+    return sums
+
+
+def footprint(exact: Echoes, sonar: Sonar) -> tuple[Any, Any, Any]:
+    """Begin, end and length of each ray's range interval [bins], at least :data:`NARROWEST` long."""
+    a = (exact.near_m - sonar.range_min) * (1 / sonar.bin_m)
+    b = (exact.far_m - sonar.range_min) * (1 / sonar.bin_m)
+    wide = b - a > NARROWEST
+    middle = (a + b) * 0.5
+    a = dr.select(wide, a, middle - NARROWEST / 2)
+    b = dr.select(wide, b, middle + NARROWEST / 2)
+    return a, b, b - a
+
+
+def levels(sums: mi.UInt64, pings: int, sonar: Sonar) -> tuple[NDArray[np.float32], Counts]:
+    """Levels ``(pings, bins, beams)`` and counts from the sums of :func:`accumulate`."""
+    bins, size = sonar.range_bins, stride(sonar)
+    beam_first = dr.arange(mi.UInt32, pings * bins * sonar.beams)
+    ping, cell = beam_first // (bins * sonar.beams), beam_first % (bins * sonar.beams)
+    source = (ping * sonar.beams + cell % sonar.beams) * size + cell // sonar.beams
+    total = sums
+    if sonar.model == "physical":
+        total = dr.block_prefix_sum(sums, size, exclusive=False)
+    image = mi.Float(mi.Float64(dr.gather(mi.UInt64, total, source)) * 2.0 ** -fraction_bits(sonar))
+    lines = dr.arange(mi.UInt32, pings * sonar.beams) * size + bins + 1
+    counted = [dr.gather(mi.UInt64, sums, lines + k) for k in range(COUNTERS)]
+    dr.eval(image, counted)
+    near, far, miss = (np.array(cells).astype(np.int64).reshape(pings, sonar.beams) for cells in counted)
+    counts = Counts(sonar.rays // sonar.beams - near - far - miss, near, far, miss)
+    return np.array(image).reshape(pings, bins, sonar.beams), counts
+
+
+def strongest(echoes: Echoes, line: mi.UInt32, ray: mi.UInt32, lines: int, sonar: Sonar) -> mi.UInt64:
+    """For each cell ``(lines, bins)`` the strongest ray that reaches it: density in the high 32 bits, ray in the low."""
+    exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
+    best = dr.zeros(mi.UInt64, lines * sonar.range_bins)
+    value = level(exact, sonar, dr.select)
+    if sonar.model == "thesis":
+        place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
+        a, b = dr.floor(place), dr.floor(place) + 1
+    else:
+        a, b, width = footprint(exact, sonar)
+        value = value / width
+    inside = (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
+    a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
+    strength = dr.reinterpret_array(mi.UInt32, mi.Float(value))
+    # a level below float32's smallest still beats an empty cell
+    key = (mi.UInt64(dr.select(strength > 0, strength, 1)) << 32) | mi.UInt64(ray)
+    start, bin_, end = line * sonar.range_bins, _whole(a), _whole(dr.ceil(b))
+
+    def step(bin_: mi.UInt32) -> tuple[mi.UInt32]:
+        dr.scatter_reduce(dr.ReduceOp.Max, best, key, start + bin_, inside & (bin_ < end))
+        return (bin_ + 1,)
+
+    dr.while_loop((bin_,), lambda bin_: inside & (bin_ < end), step)
+    return best
+
+
+def _counter(hit: mi.Bool, near: mi.Bool, sonar: Sonar) -> mi.UInt32:
+    """The counter's cell of a ray that is not inside the window."""
+    near_cell = mi.UInt32(sonar.range_bins + 1)
+    return dr.select(hit, dr.select(near, near_cell, near_cell + 1), near_cell + 2)
+
+
+def _clip(place: Any, bins: int) -> Any:
+    """Into 0..bins; by comparisons, since LLVM 15 and 16 abort on `max` (see simulation.variant)."""
+    return dr.select(place > 0, dr.select(place < bins, place, bins), 0)
+
+
+def _whole(place: Any) -> mi.UInt32:
+    return mi.UInt32(dr.select(place > 0, place, 0))

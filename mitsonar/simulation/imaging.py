@@ -1,0 +1,296 @@
+"""Scene, sonar and poses to frames: tracing and binning in one launch, many pings a launch, constant memory."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.frames import SonarFrames
+from mitsonar.motion import Trajectory
+from mitsonar.noise import NoiseModel
+from mitsonar.simulation.variant import ensure_variant
+from mitsonar.sonar import Sonar
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsonar.simulation.binning import Counts
+
+__all__ = ["Pings", "Simulator", "Tally", "constant_gain"]
+
+CALIBRATION_FRAMES = 20
+"""Frames whose brightest pixels set the gain of a run."""
+
+
+@dataclass
+class Pings:
+    """A batch of consecutive pings.
+
+    Attributes:
+        first: number of the first.
+        levels: ``(pings, bins, beams)`` float32, before gain.
+        height_m: ``(pings,)``.
+        counts: what became of the rays.
+        labels: ``elevation_rad``, ``shape_id``, ``shadow``, like ``levels``, where asked for.
+    """
+
+    first: int
+    levels: NDArray[np.float32]
+    height_m: NDArray[np.float64]
+    counts: Counts
+    labels: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.levels)
+
+
+class Simulator:
+    """Renders what a sonar receives in a scene.
+
+    Args:
+        scene: a Mitsuba scene; its cameras are ignored.
+        sonar: the instrument; default: the scene's ``imaging_sonar``.
+        rays_per_launch: bound of a launch's memory: about 30 bytes a ray.
+
+    Raises:
+        MitsonarError: no sonar given and none in the scene.
+    """
+
+    def __init__(self, scene: mi.Scene, sonar: Sonar | None = None, *, rays_per_launch: int = 2**23) -> None:
+        ensure_variant()
+        from mitsonar.simulation.scenes import sonar_in
+        from mitsonar.simulation.tracing import Tracer
+
+        if sonar is None:
+            found = sonar_in(scene)
+            if found is None:
+                raise MitsonarError(
+                    "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300)"
+                )
+            sonar = found[0]
+        self.sonar = sonar
+        self.tracer = Tracer(scene, sonar)
+        self.notes = self.tracer.notes
+        self.pings_per_launch = max(1, rays_per_launch // sonar.rays)
+        self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
+
+    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
+        """Levels of consecutive pings, in batches; ping ``first + k`` draws its own jitter whatever the batches are.
+
+        Args:
+            poses: ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad].
+            first: number of the first ping.
+            labels: per-pixel truth as well.
+        """
+        table = np.atleast_2d(np.asarray(poses, dtype=float))
+        if table.ndim != 2 or table.shape[1] != 6 or not np.isfinite(table).all():
+            raise MitsonarError(f"poses must be finite numbers (frames, 6): got {table.shape}; give m and rad")
+        for start in range(0, len(table), self.pings_per_launch):
+            yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
+
+    def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> Pings:
+        from mitsonar.simulation import binning
+
+        key = (len(poses), labels)
+        if key not in self._launches:
+            self._launches[key] = self._compile(*key)
+        sums, truth = self._launches[key](self.tracer.scene, *self.tracer.inputs(poses, first))
+        levels, counts = binning.levels(sums, len(poses), self.sonar)
+        pings = Pings(first, levels, self.tracer.height_m(poses), counts)
+        if labels:
+            pings.labels = labels_of(pings, *truth, self.sonar)
+        return pings
+
+    def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
+        """The fused launch, traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python."""
+        import drjit as dr
+
+        from mitsonar.simulation.binning import accumulate, strongest
+        from mitsonar.simulation.tracing import Rays
+
+        tracer, sonar = self.tracer, self.sonar
+
+        @dr.freeze
+        def launch(scene: Any, rows: Any, keys: Any, tables: Any) -> Any:
+            rays = Rays(sonar, pings)
+            echoes = tracer.echoes(rays, scene, rows, keys, tables)
+            lines = pings * sonar.beams
+            sums = accumulate(echoes, rays.line, lines, sonar)
+            if not labels:
+                return sums, None
+            best = strongest(echoes, rays.line, rays.ray, lines, sonar)
+            return sums, (best, tracer.fan(rays, keys).elevation, echoes.shape_id)
+
+        return launch
+
+    def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
+        """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
+        echoes = self.tracer.film_echoes(pose, ping)
+        outside = (echoes.hit > 0) & ((echoes.far_m <= self.sonar.range_min) | (echoes.near_m >= self.sonar.range_max))
+        found = echoes.range_m[outside]
+        return (float(found.min()), float(found.max())) if found.size else None
+
+    def render(
+        self,
+        trajectory: Trajectory | ArrayLike,
+        *,
+        noise: NoiseModel | None = None,
+        seed: int = 0,
+        labels: bool = False,
+        gain: float | None = None,
+    ) -> SonarFrames:
+        """All frames in memory.
+
+        Args:
+            trajectory: poses with times, or poses ``(frames, 6)`` [m, rad], one every ``1 / frame_rate_hz``.
+            noise: drawn from (seed, frame, cell); default none.
+            seed: of the noise; the jitter's is the sonar's.
+            labels: per-pixel truth as well.
+            gain: the constant that levels are multiplied by; default: from the first 20 frames.
+
+        Warns:
+            MitsonarWarning: nothing hit, returns outside the window, saturated pixels, too few rays a bin, BSDFs
+                without a diffuse reflectance.
+        """
+        if not isinstance(trajectory, Trajectory):
+            poses = np.atleast_2d(np.asarray(trajectory, dtype=float))
+            trajectory = Trajectory(poses, np.arange(len(poses)) / self.sonar.frame_rate_hz)
+        batches = self.pings(trajectory.poses, labels=labels)
+        if gain is None:
+            gain, batches = constant_gain(batches)
+        tally = Tally(self.sonar)
+        images, heights, truth = [], [], []
+        for pings in batches:
+            image = to_image(pings, gain)
+            tally.add(pings, image)
+            frames = np.arange(pings.first, pings.first + len(pings))
+            images.append(image if noise is None else noise.apply(image, seed=seed, frames=frames))
+            heights.append(pings.height_m)
+            truth.append(pings.labels)
+        for sentence in [*self.notes, *tally.warnings(self, trajectory.poses)]:
+            warnings.warn(sentence, MitsonarWarning, stacklevel=2)
+        return SonarFrames(
+            image=np.concatenate(images),
+            range_m=self.sonar.range_m,
+            bearing_rad=self.sonar.bearing_rad,
+            time_s=trajectory.time_s,
+            sonar=self.sonar,
+            poses=trajectory.poses,
+            height_m=np.concatenate(heights),
+            level_scale=1 / gain,
+            **{name: np.concatenate([part[name] for part in truth]) for name in truth[0]},
+        )
+
+
+def constant_gain(batches: Iterable[Pings]) -> tuple[float, Iterator[Pings]]:
+    """The gain that lifts the 99.9th percentile of all pixels of the first 20 frames to 0.9, and all the batches again.
+
+    Where that percentile is empty the largest pixel takes its place; where all pixels are, the gain is 1.
+    """
+    batches = iter(batches)
+    head: list[Pings] = []
+    while sum(map(len, head)) < CALIBRATION_FRAMES and (pings := next(batches, None)) is not None:
+        head.append(pings)
+    levels = np.concatenate([pings.levels for pings in head])[:CALIBRATION_FRAMES]
+    bright = float(np.percentile(levels, 99.9)) or float(levels.max())
+    return (0.9 / bright if bright > 0 else 1.0), chain(head, batches)
+
+
+def to_image(pings: Pings, gain: float) -> NDArray[np.float32]:
+    """Levels times gain, clipped to 0..1."""
+    return np.clip(pings.levels * np.float32(gain), 0, 1)
+
+
+def labels_of(pings: Pings, best: Any, elevation: Any, shape_id: Any, sonar: Sonar) -> dict[str, NDArray[Any]]:
+    """Label maps of a batch (see :class:`mitsonar.frames.SonarFrames`), from the strongest ray of each cell."""
+    shape = (len(pings), sonar.beams, sonar.range_bins)
+    winner = np.array(best).reshape(shape).transpose(0, 2, 1)
+    filled = (winner > 0) & (pings.levels > 0)
+    ray = (winner & 0xFFFFFFFF).astype(np.int64) + np.arange(len(pings))[:, None, None] * sonar.rays
+    ray = np.where(filled, ray, 0)
+    return {
+        "elevation_rad": np.where(filled, np.array(elevation)[ray], np.float32(np.nan)),
+        "shape_id": np.where(filled, np.array(shape_id)[ray], -1).astype(np.int32),
+        "shadow": shadow(pings),
+    }
+
+
+def shadow(pings: Pings) -> NDArray[np.uint8]:
+    """0 lit or not yet intercepted; 1 dark between what intercepts and what still travels; 2 dark beyond all echoes."""
+    echo = pings.levels > 0
+    nearer = np.logical_or.accumulate(echo, axis=1) | (pings.counts.nearer > 0)[:, None]
+    still = np.logical_or.accumulate(echo[:, ::-1], axis=1)[:, ::-1]
+    still = still | ((pings.counts.farther > 0) | (pings.counts.missed > 0))[:, None]
+    return np.where(nearer & ~echo, np.where(still, 1, 2), 0).astype(np.uint8)
+
+
+@dataclass
+class Tally:
+    """What a run adds up to warn of."""
+
+    sonar: Sonar
+    frames: int = 0
+    rays: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("inside", "nearer", "farther", "missed"), 0))
+    pixels: int = 0
+    filled: int = 0
+    saturated: int = 0
+    worst: tuple[int, int] = (0, 0)
+
+    def add(self, pings: Pings, image: NDArray[np.float32]) -> None:
+        """Count a batch; ``image`` before noise."""
+        self.frames += len(pings)
+        for name in self.rays:
+            self.rays[name] += int(getattr(pings.counts, name).sum())
+        self.pixels += image.size
+        self.filled += int(np.count_nonzero(image))
+        self.saturated += int(np.count_nonzero(image >= 1))
+        outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1)
+        self.worst = max(self.worst, (int(outside.max()), pings.first + int(outside.argmax())))
+
+    def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
+        """A sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
+        sonar, rays = self.sonar, self.rays
+        outside = rays["nearer"] + rays["farther"]
+        hits = rays["inside"] + outside
+        sentences = []
+        if hits == 0:
+            sentences.append(
+                f"no ray hit anything in {self.frames} frames: check the pose (x, y, z in m; pitch > 0 looks down) and "
+                "the scene's units"
+            )
+        if outside > 0:
+            frame = self.worst[1]
+            found = source.window_range(poses[frame], frame)
+            where = f", in frame {frame} at {found[0]:.2f}..{found[1]:.2f} m" if found else ""
+            sentences.append(
+                f"{outside:,} of {hits:,} returns ({100 * outside / hits:.2g} %) lie outside the window "
+                f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen range_min, range_max if they matter"
+            )
+        if self.saturated > 0.01 * self.pixels:
+            sentences.append(
+                f"{100 * self.saturated / self.pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set "
+                "on the first 20 frames, is too high for the rest"
+            )
+        if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:
+            sentences.append(
+                f"{rays['inside'] / self.filled:.1f} rays a bin on average, below 10: point deposits make the levels "
+                "noisy; raise rays_per_beam, lower range_bins, or use the model physical"
+            )
+        return sentences
+
+    def state(self) -> dict[str, Any]:
+        """As JSON can hold it; :meth:`restore` reads it back."""
+        names = ("frames", "rays", "pixels", "filled", "saturated", "worst")
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
+        """The tally of a run that was broken off."""
+        return cls(sonar, **{**state, "worst": tuple(state["worst"])})

@@ -1,0 +1,99 @@
+"""Scene, sonar and poses to echoes: the only file beside the plugins that calls the ray tracer."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.motion import to_world_matrices
+from mitsonar.plugins import echo, imaging_sonar, surfaces
+from mitsonar.simulation.echoes import Echoes
+from mitsonar.sonar import Sonar
+
+__all__ = ["Rays", "Tracer"]
+
+
+class Rays:
+    """Which ray is which in a launch: elevation fastest, then column, then ping, so that neighbours stay together.
+
+    Attributes:
+        ping: number of the ping in the launch.
+        ray: number of the ray in its ping.
+        column: ray across, ``beam * across + k``.
+        row: ray over elevation, 0 the highest.
+        line: ``ping * beams + beam``.
+        film: pixel of the ray on the sensor's film.
+    """
+
+    def __init__(self, sonar: Sonar, pings: int) -> None:
+        index = dr.arange(mi.UInt32, pings * sonar.rays)
+        self.ray = index % sonar.rays
+        self.row = index % sonar.rays_per_beam
+        across = index // sonar.rays_per_beam
+        self.ping, self.column = across // sonar.columns, across % sonar.columns
+        self.line = across // sonar.across
+        self.film = self.row * sonar.columns + self.column
+
+
+class Tracer:
+    """A scene seen by a sonar.
+
+    Attributes:
+        notes: what a user should know about the scene's BSDFs.
+    """
+
+    def __init__(self, scene: mi.Scene, sonar: Sonar) -> None:
+        self.scene = scene
+        self.sonar = sonar
+        given = {name: value for name, value in sonar.model_dump(exclude={"name"}).items() if value is not None}
+        self.sensor: imaging_sonar.ImagingSonar = mi.load_dict({"type": "imaging_sonar", **given})
+        self.surfaces = surfaces.Surfaces.of(scene)
+        self.notes = self.surfaces.notes
+
+    def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[Any, ...]:
+        """What a launch reads: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces."""
+        matrices = to_world_matrices(poses)[:, :3].astype(np.float32)
+        keys = np.array([self.sensor.key(first_ping + k) for k in range(len(matrices))], np.uint32)
+        tables = (self.surfaces.facets, self.surfaces.first, self.surfaces.constant, self.surfaces.shape_id)
+        return mi.Float(matrices.ravel()), mi.UInt32(keys), tables
+
+    def fan(self, rays: Rays, keys: mi.UInt32) -> imaging_sonar.Fan:
+        """The rays in the sensor's frame."""
+        return self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
+
+    def echoes(self, rays: Rays, scene: mi.Scene, rows: mi.Float, keys: mi.UInt32, tables: tuple[Any, ...]) -> Echoes:
+        """Echoes of a launch, not evaluated yet."""
+        facets, first, constant, shape_id = tables
+        known = replace(self.surfaces, facets=facets, first=first, constant=constant, shape_id=shape_id)
+        fan = self.fan(rays, keys)
+        lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
+
+        def to_world(v: mi.Vector3f) -> mi.Vector3f:
+            return mi.Vector3f(*(line.x * v.x + line.y * v.y + line.z * v.z for line in lines))
+
+        ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), to_world(fan.d))
+        fan = replace(fan, lift=to_world(fan.lift), side=to_world(fan.side))
+        return echo.Echo.measure(scene, known, ray, fan)
+
+    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
+        """One ping's echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
+        rays = Rays(self.sonar, 1)
+        traced = self.echoes(rays, self.scene, *self.inputs([pose], ping))
+        values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
+        for name, target in values.items():
+            dr.scatter(target, getattr(traced, name), rays.film)
+        dr.eval(values)
+        return Echoes(**{name: np.array(value) for name, value in values.items()})
+
+    def height_m(self, poses: ArrayLike) -> NDArray[np.float64]:
+        """Height of each pose over what is straight below it ``(frames,)`` [m]; nan where there is nothing."""
+        position = np.atleast_2d(np.asarray(poses, dtype=np.float32))[:, :3]
+        ray = mi.Ray3f(mi.Point3f(position.T), mi.Vector3f(0, 0, -1))
+        found = self.scene.ray_intersect_preliminary(ray)
+        distance = np.array(dr.select(found.is_valid(), found.t, -1), dtype=float)
+        return np.where(distance >= 0, distance, np.nan)

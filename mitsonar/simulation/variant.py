@@ -1,0 +1,65 @@
+"""Choose and set the Mitsuba variant: ``cuda_ad_mono`` where there is a GPU, else ``llvm_ad_mono``."""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+from mitsonar.errors import MitsonarError, nearest_names
+
+__all__ = ["VARIANTS", "Backend", "backend", "ensure_variant"]
+
+VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
+"""The variants that mitsonar works with; monochrome ones need less memory."""
+
+INSTALL = "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (any libllvm from 15 on will do)"
+
+
+class Backend(NamedTuple):
+    """What the renderer runs on: variant, and version of LLVM or None on CUDA."""
+
+    variant: str
+    llvm: tuple[int, int, int] | None
+
+
+def ensure_variant(name: str | None = None) -> str:
+    """Set a variant unless a usable one is set; the name (or ``MITSONAR_VARIANT``) forces one.
+
+    Raises:
+        MitsonarError: unknown variant; neither CUDA nor LLVM is found (with the command that installs it).
+    """
+    cuda, llvm = _backends()
+    import mitsuba as mi
+
+    wanted = name or os.environ.get("MITSONAR_VARIANT")
+    if wanted is None:
+        if mi.variant() in VARIANTS:
+            return str(mi.variant())
+        wanted = "cuda_ad_mono" if cuda else "llvm_ad_mono"
+    if wanted not in VARIANTS:
+        raise MitsonarError(f"unknown variant {wanted!r}: {nearest_names(wanted, VARIANTS)}")
+    if not (cuda if wanted.startswith("cuda") else llvm):
+        if wanted.startswith("cuda"):
+            raise MitsonarError(f"{wanted} needs an NVIDIA driver, and none was found: use llvm_ad_mono")
+        raise MitsonarError(f"the library libLLVM was not found, which the renderer needs: {INSTALL}")
+    if mi.variant() != wanted:
+        mi.set_variant(wanted)
+    return wanted
+
+
+def backend() -> Backend:
+    """The variant, set if need be, and the LLVM that it runs on."""
+    variant = ensure_variant()
+    import drjit as dr
+
+    return Backend(variant, tuple(dr.detail.llvm_version()) if variant.startswith("llvm") else None)
+
+
+def _backends() -> tuple[bool, bool]:
+    try:
+        import drjit as dr
+    except Exception as error:  # without libatomic1 this is a NameError about something else
+        raise MitsonarError(
+            f"Dr.Jit cannot be loaded ({type(error).__name__}: {error}); it needs the library libatomic: {INSTALL}"
+        ) from error
+    return bool(dr.has_backend(dr.JitBackend.CUDA)), bool(dr.has_backend(dr.JitBackend.LLVM))

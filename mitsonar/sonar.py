@@ -1,0 +1,151 @@
+"""What the instrument is: field of view, beams, rays, window, and which model of it is computed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mitsonar.errors import MitsonarError, nearest_names
+
+__all__ = ["Bearing", "Model", "Sonar"]
+
+Model = Literal["physical", "thesis"]
+Bearing = Literal["azimuth", "cone"]
+
+
+class Sonar(BaseModel):
+    """An imaging sonar. Angles in degrees (the edge of the program), all else SI.
+
+    The same names are the XML properties of the sensor ``imaging_sonar`` and the keys of a sonar's YAML file
+    (``docs/sonar.md``).
+
+    Raises:
+        MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field("custom", description="what the instrument is called")
+    azimuth_fov_deg: float = Field(29.0, gt=0, le=360, description="field of view across the beams [deg]")
+    elevation_fov_deg: float = Field(14.0, gt=0, le=180, description="field of view within a beam [deg]")
+    beams: int = Field(96, ge=1, le=65_536, description="number of beams")
+    rays_per_beam: int = Field(700, ge=1, le=1_000_000, description="rays over a beam's elevation")
+    range_min: float = Field(3.2, ge=0, le=1e5, description="start of the window [m]")
+    range_max: float = Field(5.6, gt=0, le=1e5, description="end of the window [m], beyond range_min")
+    range_bins: int = Field(512, ge=1, le=1_000_000, description="range bins of the window")
+    sound_speed: float = Field(1500.0, gt=0, le=1e4, description="sound speed [m/s]")
+    bearing: Bearing = Field("azimuth", description="what a beam's angle is: azimuth, or the cone of a line array")
+    beam_layout: Literal["even", "sine"] = Field(
+        "even", description="axes at equal steps of the angle, or of its sine (beamformers without steering tables)"
+    )
+    beam_width_deg: float | None = Field(
+        None, gt=0, le=360, description="width of one beam [deg]; default: the spacing of the beams"
+    )
+    rays_across: int = Field(4, ge=1, le=4096, description="rays across a beam's width (thesis: one, on the axis)")
+    jitter: bool | None = Field(
+        None, description="rays move at random within their cells, anew each ping; default: physical yes, thesis no"
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
+    model: Model = Field("physical", description="physical, or thesis with its artefacts")
+    gain_exponent: int = Field(
+        0, ge=0, le=4, description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading"
+    )
+    frame_rate_hz: float = Field(10.0, gt=0, le=1e6, description="pings a second [Hz]")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not self.range_max > self.range_min:
+            raise ValueError(
+                f"range_max must exceed range_min: got {self.range_max:g} m <= {self.range_min:g} m; "
+                "give the far end of the window as range_max"
+            )
+        if self.bearing == "cone" and self.azimuth_fov_deg > 180:
+            raise ValueError(
+                f"a cone bearing covers at most 180 deg: got azimuth_fov_deg {self.azimuth_fov_deg:g}; "
+                "use bearing azimuth for wider fans"
+            )
+        if self.beam_layout == "sine" and self.azimuth_fov_deg > 180:
+            raise ValueError(f"beam_layout sine covers at most 180 deg: got azimuth_fov_deg {self.azimuth_fov_deg:g}")
+        rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
+        if rays > 2**28:
+            raise ValueError(
+                f"a ping has at most {2**28:,} rays: got {rays:,}; lower beams, rays_across or rays_per_beam"
+            )
+        return self
+
+    @classmethod
+    def create(cls, **fields: Any) -> Self:
+        """The sonar with these fields; a mistake is answered by a :class:`MitsonarError` of one sentence."""
+        try:
+            return cls(**fields)
+        except ValidationError as error:
+            raise MitsonarError(_sentence(error, cls)) from None
+
+    def replace(self, **fields: Any) -> Self:
+        """This sonar with some fields changed, checked again."""
+        return self.create(**{**self.model_dump(), **fields})
+
+    @property
+    def across(self) -> int:
+        """Rays across a beam that are traced: ``rays_across``, or the thesis's one."""
+        return 1 if self.model == "thesis" else self.rays_across
+
+    @property
+    def jittered(self) -> bool:
+        """Whether rays move within their cells."""
+        return self.model == "physical" if self.jitter is None else self.jitter
+
+    @property
+    def columns(self) -> int:
+        """Rays side by side: the width of the film."""
+        return self.beams * self.across
+
+    @property
+    def rays(self) -> int:
+        """Rays a ping."""
+        return self.columns * self.rays_per_beam
+
+    @property
+    def beam_spacing_rad(self) -> float:
+        """Field of view over beams [rad]: the angle from one beam's axis to the next where they are even."""
+        return math.radians(self.azimuth_fov_deg) / self.beams
+
+    @property
+    def beam_width_rad(self) -> float:
+        """Width of the fan of rays that make one beam [rad]; the thesis's single ray stands for its spacing."""
+        if self.beam_width_deg is None or self.model == "thesis":
+            return self.beam_spacing_rad
+        return math.radians(self.beam_width_deg)
+
+    @property
+    def bin_m(self) -> float:
+        """Length of a range bin [m]."""
+        return (self.range_max - self.range_min) / self.range_bins
+
+    @property
+    def range_m(self) -> NDArray[np.float64]:
+        """Centres of the range bins ``(bins,)`` [m], nearest first."""
+        return self.range_min + (np.arange(self.range_bins) + 0.5) * self.bin_m
+
+    @property
+    def bearing_rad(self) -> NDArray[np.float64]:
+        """Bearings of the beams' axes ``(beams,)`` [rad], most to port first."""
+        place = (np.arange(self.beams) + 0.5) / self.beams * 2 - 1
+        half = math.radians(self.azimuth_fov_deg) / 2
+        return place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
+
+
+def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first of pydantic's complaints as one sentence: what, got, allowed."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown sonar key {key}: {nearest_names(key, model.model_fields)}"
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
+    message = first["msg"][0].lower() + first["msg"][1:]
+    return f"sonar {key}: {message}, got {first['input']!r} (see `mitsonar presets --help` and docs/sonar.md)"

@@ -1,0 +1,74 @@
+"""Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``echo``, ``cell_noise``, ``perlin``.
+
+Mitsuba keeps one registry of plugins a variant, and a class can derive from ``mi.Sensor`` only once a variant is set.
+So :func:`install` registers them for the variant that is set, if any, and again after each change of variant, whether
+Mitsuba is imported before mitsonar or after it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+__all__ = ["PLUGINS", "install"]
+
+PLUGINS = ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")
+"""The modules that speak Mitsuba, in the order in which they import each other."""
+
+
+def install() -> None:
+    """Register the plugins now if Mitsuba is imported, otherwise as soon as it is. Sets no variant."""
+    if "mitsuba" in sys.modules:
+        _watch_variants()
+    elif not any(isinstance(finder, _AfterMitsuba) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _AfterMitsuba())
+
+
+def _watch_variants() -> None:
+    import mitsuba as mi
+
+    mi.detail.add_variant_callback(_register)
+    if mi.variant() is not None:
+        _register(None, mi.variant())
+
+
+def _register(_old: str | None, new: str | None) -> None:
+    """Load the plugin modules for the variant that is set now; scalar variants cannot run plugins written in Python."""
+    if new is None or not new.startswith(("llvm", "cuda")):
+        return
+    for name in PLUGINS:
+        module = sys.modules.get(f"{__name__}.{name}")
+        if module is None:
+            importlib.import_module(f"{__name__}.{name}")
+        else:
+            importlib.reload(module)
+
+
+class _AfterMitsuba(MetaPathFinder, Loader):
+    """Finds ``mitsuba`` as usual, then watches its variants: ``import mitsonar`` need not wait for it to load."""
+
+    def __init__(self) -> None:
+        self.real: Loader | None = None
+
+    def find_spec(self, name: str, path: object = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        if name != "mitsuba":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.loader is not None:
+            self.real, spec.loader = spec.loader, self
+        return spec
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        assert self.real is not None
+        return self.real.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        assert self.real is not None
+        module.__spec__.loader = module.__loader__ = self.real  # type: ignore[union-attr]
+        self.real.exec_module(module)
+        _watch_variants()
