@@ -72,9 +72,7 @@ class Sonar(BaseModel):
             raise ValueError(f"beam_layout sine covers at most 180 deg: got azimuth_fov_deg {self.azimuth_fov_deg:g}")
         rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
         if rays > 2**28:
-            raise ValueError(
-                f"a ping has at most {2**28:,} rays: got {rays:,}; lower beams, rays_across or rays_per_beam"
-            )
+            raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower beams, rays_across or rays_per_beam")
         return self
 
     @classmethod

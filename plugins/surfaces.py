@@ -24,7 +24,8 @@ DEFAULT_REFLECTIVITY = 0.5
 
 DIFFUSE = {"SmoothDiffuse", "SmoothPlastic", "RoughPlastic"}
 APPROXIMATED = {"Principled", "PrincipledThin", "BlendBSDF"}
-WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", "BumpMap", "NormalMap"}
+BENT = {"BumpMap", "NormalMap"}
+WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", *BENT}
 
 
 @dataclass
@@ -42,24 +43,27 @@ class Hit:
 class Surfaces:
     """Tables of a scene's shapes; made once a scene by :meth:`of`.
 
-    A mesh whose reflectivity is constant on each triangle is a row of four floats a triangle, normal and
-    reflectivity: one fetch of 16 bytes replaces two virtual calls and a dozen scattered reads. Other shapes are asked
-    through Mitsuba. Both give the same bits.
+    A triangle of a mesh is a row of four floats, normal and reflectivity: one fetch of 16 bytes replaces two virtual calls
+    and a dozen scattered reads. Where the reflectivity varies within triangles a second table gives uv, and the BSDF is
+    asked. Shapes that are not meshes (and instances, bump maps, vertex colours) are asked through Mitsuba.
 
     Attributes:
-        facets: normal and reflectivity, four floats a triangle.
-        first: first facet of a shape by its registry index; -1: ask Mitsuba.
-        constant: reflectivity of a shape that has no diffuse reflectance, by registry index; negative: ask its BSDF.
-        shape_id: place of a shape in ``scene.shapes()``, by registry index.
-        tabulated: every shape of the scene is in the table.
+        facets: normal and reflectivity (negative: ask the BSDF), four floats a triangle.
+        corners: uv of the first corner and its change to the second and third, eight floats a triangle (two unused).
+        shapes: by registry index, four numbers a shape: first facet (-1: ask Mitsuba), first row in ``corners``, place of
+            the shape in ``scene.shapes()``, unused.
+        constant: by registry index, reflectivity of a shape that has no diffuse reflectance; negative: ask its BSDF.
+        textured: some shape has a reflectivity that varies within a triangle.
+        foreign: some shape is not in the tables.
         notes: what a user should know about the scene's BSDFs, a sentence each.
     """
 
     facets: mi.Float
-    first: mi.Int32
+    corners: mi.Float
+    shapes: mi.Int32
     constant: mi.Float
-    shape_id: mi.Int32
-    tabulated: bool
+    textured: bool
+    foreign: bool
     notes: list[str]
 
     @classmethod
@@ -67,13 +71,15 @@ class Surfaces:
         """The tables of a scene."""
         shapes = scene.shapes()
         size = 1 + max((_registry_index(shape) for shape in shapes), default=0)
-        first, constant, ids = [-1] * size, [-1.0] * size, [-1] * size
-        rows: list[mi.Float] = []
+        rows = [[-1, 0, -1, 0] for _ in range(size)]
+        constant = [-1.0] * size
+        facets: list[mi.Float] = []
+        corners: list[mi.Float] = []
         named: dict[str, list[str]] = {"approximated": [], "without": []}
-        facets = 0
+        facet_count = corner_count = 0
         for number, shape in enumerate(shapes):
             index = _registry_index(shape)
-            ids[index] = number
+            rows[index][2] = number
             if shape.bsdf() is None:  # an instance: its group's shapes are asked through Mitsuba
                 continue
             kinds, textures = _walk(shape.bsdf())
@@ -82,62 +88,110 @@ class Surfaces:
                 named["without"] += [shape.id()]
             elif kinds & APPROXIMATED:
                 named["approximated"] += [shape.id()]
-            if shape.is_mesh() and (constant[index] >= 0 or all(map(_constant_on_facets, textures))):
-                first[index] = facets
-                rows.append(_facet_rows(shape, constant[index]))
-                facets += shape.face_count()
+            flat = constant[index] >= 0 or all(map(_constant_on_facets, textures))
+            if shape.is_mesh() and (flat or not (kinds & BENT or any(map(_by_vertex, textures)))):
+                rows[index][:2] = facet_count, corner_count
+                facets.append(_facet_rows(shape, constant[index], flat))
+                facet_count += shape.face_count()
+                if not flat:
+                    corners.append(_corner_rows(shape))
+                    corner_count += shape.face_count()
         tables = cls(
-            facets=dr.concat(rows) if rows else mi.Float([0.0] * 4),
-            first=mi.Int32(first),
+            facets=dr.concat(facets) if facets else dr.zeros(mi.Float, 4),
+            corners=dr.concat(corners) if corners else dr.zeros(mi.Float, 8),
+            shapes=mi.Int32([number for row in rows for number in row]),
             constant=mi.Float(constant),
-            shape_id=mi.Int32(ids),
-            tabulated=len(rows) == len(shapes) > 0,
+            textured=bool(corners),
+            foreign=len(facets) < len(shapes),
             notes=_notes(named),
         )
-        dr.eval(tables.facets, tables.first, tables.constant, tables.shape_id)
+        dr.eval(tables.arrays())
         return tables
+
+    def arrays(self) -> tuple[mi.Float, mi.Float, mi.Int32, mi.Float]:
+        """The tables themselves, the inputs of a launch."""
+        return self.facets, self.corners, self.shapes, self.constant
 
     def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: Any = True) -> Hit:
         """Trace rays to the nearest surface. The arrays are not evaluated: what follows joins the same kernel."""
         found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         valid = found.is_valid() & active
         index = dr.reinterpret_array(mi.UInt32, found.shape)
-        known = valid & (index < dr.width(self.first))
-        first = dr.select(known, dr.gather(mi.Int32, self.first, index, known), -1)
-        tabled = known & (first >= 0)
+        known = valid & (index * 4 < dr.width(self.shapes))
+        shape = dr.gather(mi.Vector4i, self.shapes, index, known)
+        first = dr.select(known, shape.x, -1)
+        tabled = first >= 0
         row = dr.gather(mi.Vector4f, self.facets, mi.UInt32(first) + found.prim_index, tabled)
         normal, reflectivity = mi.Normal3f(row.x, row.y, row.z), row.w
-        top = dr.select(found.instance != None, dr.reinterpret_array(mi.UInt32, found.instance), index)  # noqa: E711
-        listed = valid & (top < dr.width(self.shape_id))
-        shape_id = dr.select(listed, dr.gather(mi.Int32, self.shape_id, top, listed), -1)
-        if not self.tabulated:
+        shape_id = dr.select(known, shape.z, -1)
+        if self.textured:
+            asked = tabled & (reflectivity < 0)
+            si = self._on_facet(found, ray, normal, mi.UInt32(shape.y), asked)
+            own = _one_number(found.shape.bsdf().eval_diffuse_reflectance(si, asked))
+            reflectivity = dr.select(asked, _unit(own), reflectivity)
+        if self.foreign:
             asked = valid & ~tabled
             si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, asked)
             fixed = dr.select(known, dr.gather(mi.Float, self.constant, index, known), -1)
             own = _one_number(si.bsdf().eval_diffuse_reflectance(si, asked & (fixed < 0)))
             normal = dr.select(tabled, normal, si.n)
             reflectivity = dr.select(tabled, reflectivity, _unit(dr.select(fixed < 0, own, fixed)))
+            top = dr.reinterpret_array(mi.UInt32, found.instance)
+            inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
+            shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
         return Hit(valid, found.t, normal, reflectivity, shape_id)
+
+    def _on_facet(self, found: Any, ray: mi.Ray3f, normal: mi.Normal3f, first: mi.UInt32, active: mi.Bool) -> Any:
+        """What a texture or BSDF asks of a point: uv, position, triangle, and the side that is seen."""
+        corner = (first + found.prim_index) * 2
+        uv = dr.gather(mi.Vector4f, self.corners, corner, active)
+        change = dr.gather(mi.Vector4f, self.corners, corner + 1, active)
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(found.t))
+        si.t, si.p, si.n = found.t, ray.o + ray.d * found.t, normal
+        si.uv = mi.Point2f(uv.x, uv.y) + mi.Point2f(uv.z, uv.w) * found.prim_uv.x
+        si.uv += mi.Point2f(change.x, change.y) * found.prim_uv.y
+        si.shape, si.prim_index = found.shape, found.prim_index
+        si.wi = mi.Vector3f(0, 0, -dr.dot(normal, ray.d))
+        return si
 
 
 def _registry_index(shape: mi.Shape) -> int:
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
 
 
-def _facet_rows(mesh: mi.Mesh, constant: float) -> mi.Float:
+def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> mi.Float:
     """Normal and reflectivity of each triangle, as Mitsuba itself computes them."""
+    si = _points_on_facets(mesh, 1 / 3, 1 / 3)
+    if not flat:
+        own = mi.Float(-1)
+    else:
+        own = _unit(_one_number(mesh.bsdf().eval_diffuse_reflectance(si)) if constant < 0 else mi.Float(constant))
+    return dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, own))
+
+
+def _corner_rows(mesh: mi.Mesh) -> mi.Float:
+    """uv of each triangle's first corner, and its change to the second and to the third."""
+    first, second, third = (_points_on_facets(mesh, *place).uv for place in ((0, 0), (1, 0), (0, 1)))
+    second, third = second - first, third - first
+    rows = mi.Float(dr.zeros(mi.Float, 8 * mesh.face_count()))
+    start = dr.arange(mi.UInt32, mesh.face_count()) * 8
+    for offset, value in enumerate((first.x, first.y, second.x, second.y, third.x, third.y)):
+        dr.scatter(rows, value, start + offset)
+    return rows
+
+
+def _points_on_facets(mesh: mi.Mesh, second: float, third: float) -> mi.SurfaceInteraction3f:
+    """The point with these barycentric coordinates on each triangle."""
     count = mesh.face_count()
     found = dr.zeros(mi.PreliminaryIntersection3f, count)
     found.valid = dr.full(mi.Bool, True, count)
     found.t = mi.Float(1)
     found.prim_index = dr.arange(mi.UInt32, count)
-    found.prim_uv = mi.Point2f(1 / 3, 1 / 3)
+    found.prim_uv = mi.Point2f(second, third)
     found.shape = mi.ShapePtr(mesh)
     ray = dr.zeros(mi.Ray3f, count)
     ray.d = mi.Vector3f(0, 0, 1)
-    si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
-    own = _one_number(mesh.bsdf().eval_diffuse_reflectance(si)) if constant < 0 else mi.Float(constant)
-    return dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, _unit(own)))
+    return found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
 
 
 def _one_number(spectrum: Any) -> mi.Float:
@@ -179,6 +233,10 @@ def _walk(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
 def _constant_on_facets(texture: mi.Object) -> bool:
     name = texture.class_name()
     return name == "UniformSpectrum" or (name == "MeshAttribute" and 'name = "face_' in str(texture))
+
+
+def _by_vertex(texture: mi.Object) -> bool:
+    return texture.class_name() == "MeshAttribute"
 
 
 def _notes(named: dict[str, list[str]]) -> list[str]:

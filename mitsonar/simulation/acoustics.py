@@ -57,4 +57,3 @@ def _spreading(radius: Any, gain_exponent: int) -> Any:
             return radius
         case _:
             return radius * radius
-

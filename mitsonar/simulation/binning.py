@@ -24,7 +24,7 @@ from mitsonar.simulation.acoustics import largest_level, level
 from mitsonar.simulation.echoes import Echoes
 from mitsonar.sonar import Sonar
 
-__all__ = ["Counts", "accumulate", "fraction_bits", "levels", "strongest"]
+__all__ = ["Counts", "accumulate", "develop", "fetch", "fraction_bits", "strongest"]
 
 NARROWEST = 2.0**-6
 """Shortest footprint [bins]: a surface seen straight on has none, and a density needs one."""
@@ -82,10 +82,13 @@ def accumulate(echoes: Echoes, line: mi.UInt32, lines: int, sonar: Sonar) -> mi.
     density = value / width
     whole, late, left = (mi.UInt64(density * part) for part in (1, a - dr.floor(a), b - dr.floor(b)))
     cell = dr.select(inside, first, _counter(hit, b <= 0, sonar))
-    dr.scatter_add(sums, dr.select(inside, whole - late, 1), start + cell)
-    dr.scatter_add(sums, late, start + first + 1, inside)
-    dr.scatter_add(sums, left - whole, start + last, inside)
-    dr.scatter_add(sums, mi.UInt64(0) - left, start + last + 1, inside & (left > 0))
+    # additions to one cell are joined: a footprint within a bin takes two, across one border three
+    same, apart = inside & (last == first), inside & (last > first + 1)
+    second = dr.select(same, late - left, dr.select(apart, late, late + left - whole))
+    dr.scatter_add(sums, dr.select(inside, dr.select(same, left, whole) - late, 1), start + cell)
+    dr.scatter_add(sums, second, start + first + 1, inside)
+    dr.scatter_add(sums, left - whole, start + last, apart)
+    dr.scatter_add(sums, mi.UInt64(0) - left, start + last + 1, inside & ~same & (left > 0))
     return sums
 
 
@@ -100,22 +103,20 @@ def footprint(exact: Echoes, sonar: Sonar) -> tuple[Any, Any, Any]:
     return a, b, b - a
 
 
-def levels(sums: mi.UInt64, pings: int, sonar: Sonar) -> tuple[NDArray[np.float32], Counts]:
-    """Levels ``(pings, bins, beams)`` and counts from the sums of :func:`accumulate`."""
-    bins, size = sonar.range_bins, stride(sonar)
-    beam_first = dr.arange(mi.UInt32, pings * bins * sonar.beams)
-    ping, cell = beam_first // (bins * sonar.beams), beam_first % (bins * sonar.beams)
-    source = (ping * sonar.beams + cell % sonar.beams) * size + cell // sonar.beams
-    total = sums
-    if sonar.model == "physical":
-        total = dr.block_prefix_sum(sums, size, exclusive=False)
-    image = mi.Float(mi.Float64(dr.gather(mi.UInt64, total, source)) * 2.0 ** -fraction_bits(sonar))
-    lines = dr.arange(mi.UInt32, pings * sonar.beams) * size + bins + 1
-    counted = [dr.gather(mi.UInt64, sums, lines + k) for k in range(COUNTERS)]
-    dr.eval(image, counted)
-    near, far, miss = (np.array(cells).astype(np.int64).reshape(pings, sonar.beams) for cells in counted)
-    counts = Counts(sonar.rays // sonar.beams - near - far - miss, near, far, miss)
-    return np.array(image).reshape(pings, bins, sonar.beams), counts
+def develop(sums: mi.UInt64, lines: int, sonar: Sonar) -> tuple[mi.Float, mi.UInt64]:
+    """Levels ``(lines, stride)`` and counters ``(COUNTERS, lines)``, flat, from the sums of :func:`accumulate`."""
+    size = stride(sonar)
+    total = sums if sonar.model == "thesis" else dr.block_prefix_sum(sums, size, exclusive=False)
+    index = dr.arange(mi.UInt32, lines * COUNTERS)
+    counters = dr.gather(mi.UInt64, sums, index % lines * size + (sonar.range_bins + 1) + index // lines)
+    return mi.Float(mi.Float64(total) * 2.0 ** -fraction_bits(sonar)), counters
+
+
+def fetch(image: mi.Float, counters: mi.UInt64, pings: int, sonar: Sonar) -> tuple[NDArray[np.float32], Counts]:
+    """Levels ``(pings, bins, beams)``, a view of beam-major memory, and counts, from what :func:`develop` gave."""
+    levels = np.array(image, copy=False).reshape(pings, sonar.beams, stride(sonar))[:, :, : sonar.range_bins]
+    near, far, miss = np.array(counters).astype(np.int64).reshape(COUNTERS, pings, sonar.beams)
+    return levels.transpose(0, 2, 1), Counts(sonar.rays // sonar.beams - near - far - miss, near, far, miss)
 
 
 def strongest(echoes: Echoes, line: mi.UInt32, ray: mi.UInt32, lines: int, sonar: Sonar) -> mi.UInt64:

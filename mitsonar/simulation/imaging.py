@@ -101,9 +101,9 @@ class Simulator:
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._compile(*key)
-        sums, truth = self._launches[key](self.tracer.scene, *self.tracer.inputs(poses, first))
-        levels, counts = binning.levels(sums, len(poses), self.sonar)
-        pings = Pings(first, levels, self.tracer.height_m(poses), counts)
+        image, counters, height, truth = self._launches[key](self.tracer.scene, *self.tracer.inputs(poses, first))
+        levels, counts = binning.fetch(image, counters, len(poses), self.sonar)
+        pings = Pings(first, levels, np.array(height, dtype=float), counts)
         if labels:
             pings.labels = labels_of(pings, *truth, self.sonar)
         return pings
@@ -112,7 +112,7 @@ class Simulator:
         """The fused launch, traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python."""
         import drjit as dr
 
-        from mitsonar.simulation.binning import accumulate, strongest
+        from mitsonar.simulation.binning import accumulate, develop, strongest
         from mitsonar.simulation.tracing import Rays
 
         tracer, sonar = self.tracer, self.sonar
@@ -123,10 +123,11 @@ class Simulator:
             echoes = tracer.echoes(rays, scene, rows, keys, tables)
             lines = pings * sonar.beams
             sums = accumulate(echoes, rays.line, lines, sonar)
+            frame = *develop(sums, lines, sonar), tracer.height_m(scene, rows)
             if not labels:
-                return sums, None
+                return *frame, None
             best = strongest(echoes, rays.line, rays.ray, lines, sonar)
-            return sums, (best, tracer.fan(rays, keys).elevation, echoes.shape_id)
+            return *frame, (best, tracer.fan(rays, keys).elevation, echoes.shape_id)
 
         return launch
 
@@ -271,7 +272,7 @@ class Tally:
             where = f", in frame {frame} at {found[0]:.2f}..{found[1]:.2f} m" if found else ""
             sentences.append(
                 f"{outside:,} of {hits:,} returns ({100 * outside / hits:.2g} %) lie outside the window "
-                f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen range_min, range_max if they matter"
+                f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen the window if they matter"
             )
         if self.saturated > 0.01 * self.pixels:
             sentences.append(

@@ -43,7 +43,8 @@ def find_scene(name_or_file: str | Path) -> Path:
         return shipped[str(name_or_file)]
     if path.is_dir():
         raise MitsonarError(f"scene {path} is a folder: give the XML file in it")
-    raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or a shipped scene, {nearest_names(path.stem, shipped)}")
+    names = nearest_names(path.stem, shipped)
+    raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or the name of a shipped scene, {names}")
 
 
 def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mitsonar.motion import to_world_matrices
 from mitsonar.plugins import echo, imaging_sonar, surfaces
@@ -59,8 +59,7 @@ class Tracer:
         """What a launch reads: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces."""
         matrices = to_world_matrices(poses)[:, :3].astype(np.float32)
         keys = np.array([self.sensor.key(first_ping + k) for k in range(len(matrices))], np.uint32)
-        tables = (self.surfaces.facets, self.surfaces.first, self.surfaces.constant, self.surfaces.shape_id)
-        return mi.Float(matrices.ravel()), mi.UInt32(keys), tables
+        return mi.Float(matrices.ravel()), mi.UInt32(keys), self.surfaces.arrays()
 
     def fan(self, rays: Rays, keys: mi.UInt32) -> imaging_sonar.Fan:
         """The rays in the sensor's frame."""
@@ -68,8 +67,7 @@ class Tracer:
 
     def echoes(self, rays: Rays, scene: mi.Scene, rows: mi.Float, keys: mi.UInt32, tables: tuple[Any, ...]) -> Echoes:
         """Echoes of a launch, not evaluated yet."""
-        facets, first, constant, shape_id = tables
-        known = replace(self.surfaces, facets=facets, first=first, constant=constant, shape_id=shape_id)
+        known = replace(self.surfaces, **dict(zip(("facets", "corners", "shapes", "constant"), tables, strict=True)))
         fan = self.fan(rays, keys)
         lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
 
@@ -90,10 +88,9 @@ class Tracer:
         dr.eval(values)
         return Echoes(**{name: np.array(value) for name, value in values.items()})
 
-    def height_m(self, poses: ArrayLike) -> NDArray[np.float64]:
-        """Height of each pose over what is straight below it ``(frames,)`` [m]; nan where there is nothing."""
-        position = np.atleast_2d(np.asarray(poses, dtype=np.float32))[:, :3]
-        ray = mi.Ray3f(mi.Point3f(position.T), mi.Vector3f(0, 0, -1))
-        found = self.scene.ray_intersect_preliminary(ray)
-        distance = np.array(dr.select(found.is_valid(), found.t, -1), dtype=float)
-        return np.where(distance >= 0, distance, np.nan)
+    def height_m(self, scene: mi.Scene, rows: mi.Float) -> mi.Float:
+        """Height of each pose over what is straight below it [m]; nan where there is nothing."""
+        line = dr.arange(mi.UInt32, dr.width(rows) // 12) * 3
+        place = mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3)))
+        found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
+        return dr.select(found.is_valid(), found.t, dr.nan)
