@@ -142,6 +142,8 @@ class SonarFrames:
                 group = zarr.open_group(path, mode="r")
                 table = {name: array[...] for name, array in group.arrays()}
                 table |= {name: np.array(value) for name, value in group.attrs.items()}
+                done = int(table.pop("frames_done", len(table["image"])))
+                table |= {name: table[name][:done] for name in PER_FRAME if name in table}
             else:
                 with np.load(path, allow_pickle=False) as file:
                     table = {name: file[name] for name in file.files}

@@ -47,6 +47,13 @@ class Echoes:
     nz: Any
     shape_id: Any
 
+    def outside(self, sonar: Sonar) -> tuple[float, float] | None:
+        """Nearest and farthest return outside the sonar's window [m]; None where all lie inside. NumPy arrays only."""
+        near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)
+        missed = (far < sonar.range_min) | (near >= sonar.range_max)
+        found = self.range_m[(self.hit > 0) & missed]
+        return (float(found.min()), float(found.max())) if found.size else None
+
 
 CHANNELS = tuple(field.name for field in fields(Echoes))
 """Channels of the integrator ``echo`` and of an EXR of ``echoes/``, in this order; EXR files sort them by name."""

@@ -15,6 +15,7 @@ from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.frames import SonarFrames
 from mitsonar.motion import Trajectory
 from mitsonar.noise import NoiseModel
+from mitsonar.simulation.echoes import Echoes
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.sonar import Sonar
 
@@ -131,12 +132,13 @@ class Simulator:
 
         return launch
 
+    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
+        """One ping's echoes as NumPy arrays, in the order of the film."""
+        return self.tracer.film_echoes(pose, ping)
+
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
-        echoes = self.tracer.film_echoes(pose, ping)
-        outside = (echoes.hit > 0) & ((echoes.far_m <= self.sonar.range_min) | (echoes.near_m >= self.sonar.range_max))
-        found = echoes.range_m[outside]
-        return (float(found.min()), float(found.max())) if found.size else None
+        return self.film_echoes(pose, ping).outside(self.sonar)
 
     def render(
         self,

@@ -1,0 +1,6 @@
+"""``python -m mitsonar``."""
+
+from mitsonar.cli import main
+
+if __name__ == "__main__":
+    main()

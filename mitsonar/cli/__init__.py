@@ -1,0 +1,27 @@
+"""The command line: one file a group of commands, each loading what it needs when it is called."""
+
+from __future__ import annotations
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """``mitsonar`` and ``python -m mitsonar``."""
+    import typer
+
+    from mitsonar.cli import doctor, image, presets, render
+
+    app = typer.Typer(
+        name="mitsonar",
+        help="Sonar images from Mitsuba 3 scenes.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.command()(render.render)
+    app.command()(image.image)
+    app.command()(presets.presets)
+    app.command()(presets.scenes)
+    app.command()(doctor.doctor)
+    app()

@@ -1,0 +1,96 @@
+"""What every command shares: answers to mistakes, warnings, progress."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, ParamSpec, TypeVar
+
+import typer
+
+from mitsonar.errors import MitsonarError, MitsonarWarning
+
+__all__ = ["answered", "numbers", "progress_bar", "say", "warn"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def say(text: str) -> None:
+    """A line on standard output, as it is."""
+    typer.echo(text)
+
+
+def warn(text: str) -> None:
+    """A warning's line on standard error."""
+    typer.echo(f"warning: {text}", err=True)
+
+
+def answered(command: Callable[P, R]) -> Callable[P, R]:
+    """Answer a mistake with one sentence and exit code 2, and a full disk or Ctrl-C likewise; never with a traceback."""
+
+    @functools.wraps(command)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        warnings.filterwarnings("always", category=MitsonarWarning)
+        warnings.showwarning = _show
+        try:
+            return command(*args, **kwargs)
+        except MitsonarError as error:
+            typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        except BrokenPipeError:  # the reader of our output has gone: nothing is wrong here
+            raise typer.Exit(0) from None
+        except OSError as error:
+            where = f" ({error.filename})" if error.filename else ""
+            typer.echo(f"error: {error.strerror or error}{where}; what is whole on disk stays, --resume goes on", err=True)
+        except MemoryError:
+            typer.echo("error: out of memory; lower beams, rays_per_beam, rays_across or range_bins of the sonar", err=True)
+        except KeyboardInterrupt:
+            typer.echo("stopped; whole frames stay on disk, --resume goes on", err=True)
+            raise typer.Exit(130) from None
+        raise typer.Exit(2)
+
+    return wrapped
+
+
+def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, MitsonarWarning):
+        warn(str(message))
+
+
+def numbers(text: str | None, count: int, what: str) -> list[float] | None:
+    """``count`` numbers between commas; None stays None.
+
+    Raises:
+        MitsonarError: others.
+    """
+    if text is None:
+        return None
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise MitsonarError(f"{what} takes {count} numbers with commas between them: got {text!r}")
+    return values
+
+
+@contextmanager
+def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    """A bar with rate and time left on standard error, once the work has taken a second; yields what to call."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        def render(self, task: Any) -> Text:
+            rate = task.finished_speed or task.speed
+            return Text(f"{rate:.1f} {unit}/s" if rate else f"- {unit}/s")
+
+    console = Console(stderr=True)
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda done: bar.advance(task, done)
