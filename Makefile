@@ -1,0 +1,42 @@
+# make demo: a picture of a sunken ship as a sonar sees it. make test: the test suite. Each makes .venv first.
+PYTHON ?= python3
+VENV ?= .venv
+PIP = $(VENV)/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt
+SOURCES = pyproject.toml constraints.txt
+
+.PHONY: demo test lint bench clean system
+
+demo: $(VENV)/.installed
+	@rm -rf out/demo
+	$(VENV)/bin/python -m mitsonar render sunken_ship --cartesian -o out/demo
+
+test: $(VENV)/.tested
+	$(VENV)/bin/python -m pytest -m "not slow" $(PYTEST_FLAGS)
+
+lint: $(VENV)/.tested
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+bench: $(VENV)/.tested
+	$(PIP) -e '.[bench]'
+	$(VENV)/bin/python benchmarks/bench_render.py
+
+system:
+	@.ci/system_libraries
+
+$(VENV)/bin/python: | system
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.installed: $(SOURCES) | system $(VENV)/bin/python
+	@echo "installing mitsonar into $(VENV) (about 100 MB to fetch)"
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/.tested: $(SOURCES) $(VENV)/.installed
+	@echo "installing what the tests need into $(VENV) (torch alone is 200 MB or more, see README)"
+	$(PIP) -e '.[dev,learn]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) out build dist *.egg-info
