@@ -120,7 +120,8 @@ class SonarFrames:
 
     def save(self, path: str | Path) -> None:
         """Write ``frames.npz``."""
-        np.savez_compressed(Path(path), **self.arrays())
+        table: dict[str, Any] = self.arrays()
+        np.savez_compressed(Path(path), **table)
 
     @classmethod
     def load(cls, path: str | Path) -> SonarFrames:
@@ -140,7 +141,7 @@ class SonarFrames:
                 import zarr
 
                 group = zarr.open_group(path, mode="r")
-                table = {name: array[...] for name, array in group.arrays()}
+                table: dict[str, Any] = {name: array[...] for name, array in group.arrays()}
                 table |= {name: np.array(value) for name, value in group.attrs.items()}
                 done = int(table.pop("frames_done", len(table["image"])))
                 table |= {name: table[name][:done] for name in PER_FRAME if name in table}

@@ -132,7 +132,7 @@ def strongest(echoes: Echoes, line: mi.UInt32, ray: mi.UInt32, lines: int, sonar
         value = value / width
     inside = (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
     a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
-    strength = dr.reinterpret_array(mi.UInt32, mi.Float(value))
+    strength: Any = dr.reinterpret_array(mi.UInt32, mi.Float(value))
     # a level below float32's smallest still beats an empty cell
     key = (mi.UInt64(dr.select(strength > 0, strength, 1)) << 32) | mi.UInt64(ray)
     start, bin_, end = line * sonar.range_bins, _whole(a), _whole(dr.ceil(b))

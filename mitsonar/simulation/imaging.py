@@ -46,7 +46,7 @@ class Pings:
     levels: NDArray[np.float32]
     height_m: NDArray[np.float64]
     counts: Counts
-    labels: dict[str, NDArray[Any]] = field(default_factory=dict)
+    labels: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.levels)
@@ -106,7 +106,7 @@ class Simulator:
         levels, counts = binning.fetch(image, counters, len(poses), self.sonar)
         pings = Pings(first, levels, np.array(height, dtype=float), counts)
         if labels:
-            pings.labels = labels_of(pings, *truth, self.sonar)
+            pings.labels = labels_of(pings, truth, self.sonar)
         return pings
 
     def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
@@ -177,6 +177,7 @@ class Simulator:
             images.append(image if noise is None else noise.apply(image, seed=seed, frames=frames))
             heights.append(pings.height_m)
             truth.append(pings.labels)
+        labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
         for sentence in [*self.notes, *tally.warnings(self, trajectory.poses)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
         return SonarFrames(
@@ -188,7 +189,7 @@ class Simulator:
             poses=trajectory.poses,
             height_m=np.concatenate(heights),
             level_scale=1 / gain,
-            **{name: np.concatenate([part[name] for part in truth]) for name in truth[0]},
+            **labelled,
         )
 
 
@@ -211,8 +212,9 @@ def to_image(pings: Pings, gain: float) -> NDArray[np.float32]:
     return np.clip(pings.levels * np.float32(gain), 0, 1)
 
 
-def labels_of(pings: Pings, best: Any, elevation: Any, shape_id: Any, sonar: Sonar) -> dict[str, NDArray[Any]]:
+def labels_of(pings: Pings, truth: Any, sonar: Sonar) -> dict[str, NDArray[Any]]:
     """Label maps of a batch (see :class:`mitsonar.frames.SonarFrames`), from the strongest ray of each cell."""
+    best, elevation, shape_id = truth
     shape = (len(pings), sonar.beams, sonar.range_bins)
     winner = np.array(best).reshape(shape).transpose(0, 2, 1)
     filled = (winner > 0) & (pings.levels > 0)

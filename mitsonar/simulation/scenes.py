@@ -58,7 +58,8 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
     import mitsuba as mi
 
     try:
-        scene = mi.load_file(str(path), **{key: str(value) for key, value in parameters.items()})
+        texts: dict[str, Any] = {key: str(value) for key, value in parameters.items()}
+        scene = mi.load_file(str(path), **texts)
     except Exception as error:
         raise MitsonarError(f"cannot load scene {path}: {_reason(error)}") from error
     if not isinstance(scene, mi.Scene):

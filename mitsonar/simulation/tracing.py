@@ -81,14 +81,14 @@ class Tracer:
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """One ping's echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
         rays = Rays(self.sonar, 1)
-        traced = self.echoes(rays, self.scene, *self.inputs([pose], ping))
+        traced = self.echoes(rays, self.scene, *self.inputs(np.reshape(pose, (1, 6)), ping))
         values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
         for name, target in values.items():
             dr.scatter(target, getattr(traced, name), rays.film)
         dr.eval(values)
         return Echoes(**{name: np.array(value) for name, value in values.items()})
 
-    def height_m(self, scene: mi.Scene, rows: mi.Float) -> mi.Float:
+    def height_m(self, scene: mi.Scene, rows: mi.Float) -> Any:
         """Height of each pose over what is straight below it [m]; nan where there is nothing."""
         line = dr.arange(mi.UInt32, dr.width(rows) // 12) * 3
         place = mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3)))
