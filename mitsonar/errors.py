@@ -19,5 +19,6 @@ class MitsonarWarning(UserWarning):
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
     """The known names, nearest to ``wrong`` first, for the end of an error message."""
     known = list(names)
-    near = difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
+    near = [name for name in known if wrong and wrong.lower() in name.lower()]
+    near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
     return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"

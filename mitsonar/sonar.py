@@ -134,7 +134,7 @@ class Sonar(BaseModel):
         """Bearings of the beams' axes ``(beams,)`` [rad], most to port first."""
         place = (np.arange(self.beams) + 0.5) / self.beams * 2 - 1
         half = math.radians(self.azimuth_fov_deg) / 2
-        axes = place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
+        axes: Any = place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
         return np.asarray(axes, dtype=np.float64)
 
 

@@ -74,7 +74,7 @@ class ImagingSonar(mi.Sensor):
         self.ping = int(props.get("ping", 0))
         if self.ping < 0:
             raise MitsonarError(f"ping must be 0 or more: got {self.ping}")
-        if not any(isinstance(props[key], mi.Film) for key in props.keys()):  # noqa: SIM118
+        if not any(isinstance(child, mi.Film) for _, child in props.objects(mark_queried=False)):
             props["film"] = self._film()
         super().__init__(props)
         self._check_film()

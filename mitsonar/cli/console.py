@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -79,7 +80,10 @@ def numbers(text: str | None, count: int, what: str) -> list[float] | None:
 
 @contextmanager
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """A bar with rate and time left on standard error, once the work has taken a second; yields what to call."""
+    """A bar with rate and time left on standard error, or in a log a line every ten seconds; yields what to call."""
+    if not sys.stderr.isatty():
+        yield _Log(what, total, unit)
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
     from rich.text import Text
@@ -89,8 +93,26 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
             rate = task.finished_speed or task.speed
             return Text(f"{rate:.1f} {unit}/s" if rate else f"- {unit}/s")
 
-    console = Console(stderr=True)
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), Rate(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=not sys.stderr.isatty()) as bar:
+    with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.advance(task, done)
+
+
+class _Log:
+    """Progress where there is no terminal."""
+
+    def __init__(self, what: str, total: int, unit: str, every_s: float = 10.0) -> None:
+        self.what, self.total, self.unit, self.every_s = what, total, unit, every_s
+        self.done, self.begun = 0, time.monotonic()
+        self.said = self.begun
+
+    def __call__(self, done: int) -> None:
+        self.done += done
+        now = time.monotonic()
+        if now - self.said >= self.every_s and self.done > 0:
+            rate = self.done / (now - self.begun)
+            left = (self.total - self.done) / rate
+            line = f"{self.what} {self.done}/{self.total}, {rate:.1f} {self.unit}/s, {left:.0f} s left"
+            typer.echo(line, err=True)
+            self.said = now

@@ -34,6 +34,7 @@ def render(
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
+    rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
@@ -52,7 +53,7 @@ def render(
     instrument, standing = _instrument(loaded, sonar, model, seed)
     path = _path(instrument, standing, scene, frames, start, end, trajectory)
     folder = out or Path("out") / find_scene(scene).stem
-    simulator = Simulator(loaded, instrument, rays_per_launch=2**22)
+    simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
     origin = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)

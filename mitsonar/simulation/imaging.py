@@ -257,7 +257,8 @@ class Tally:
         self.filled += int(np.count_nonzero(image))
         self.saturated += int(np.count_nonzero(image >= 1))
         outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1)
-        self.worst = max(self.worst, (int(outside.max()), pings.first + int(outside.argmax())))
+        if outside.max() > self.worst[0]:
+            self.worst = int(outside.max()), pings.first + int(outside.argmax())
 
     def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
         """A sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""

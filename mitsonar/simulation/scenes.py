@@ -76,10 +76,11 @@ def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
 
 
 def _reason(error: BaseException) -> str:
-    """One line of Mitsuba's complaint: our own error where a plugin raised one, else the innermost that it names."""
+    """Mitsuba's complaint in one line: our own error where a plugin raised one, else all but the traceback in it."""
     text = str(error).strip()
     ours = re.findall(r"^mitsonar\.errors\.MitsonarError: (.+)$", text, flags=re.MULTILINE)
     if ours:
         return str(ours[-1])
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return re.sub(r"^\[\w+\.cpp:\d+\] ", "", lines[-1] if lines[0].endswith("last):") else lines[0])
+    head, _, trace = text.partition("Traceback (most recent call last):")
+    said = f"{head} {trace.strip().splitlines()[-1]}" if trace.strip() else head
+    return " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", said).split())
