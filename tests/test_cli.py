@@ -265,7 +265,7 @@ def test_presets_scenes_and_doctor_print() -> None:
     doctor = mitsonar("doctor")
     assert doctor.returncode == 0, doctor.stderr
     assert "all is well" in doctor.stdout
-    assert "rays a second" in doctor.stdout
+    assert "rays traced and binned" in doctor.stdout
 
 
 @pytest.mark.parametrize("name", sorted(shipped_scenes()))

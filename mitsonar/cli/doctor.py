@@ -80,9 +80,7 @@ def _check_floor() -> None:
     for batch in simulator.pings(poses):
         batch.levels.sum()
     rate = len(poses) * sonar.rays / (time.perf_counter() - start)
-    say(
-        f"rays a second, traced and binned: {rate / 1e6:.1f} million ({rate / sonar.rays:.0f} pings/s of {sonar.rays:,} rays)"
-    )
+    say(f"rays traced and binned a second: {rate / 1e6:.1f} million ({rate / sonar.rays:.0f} pings of {sonar.rays:,})")
     if error > 1e-4:
         raise MitsonarError(f"the flat floor's energy is off by {error:.1e}, allowed 1e-4: trust nothing")
 
