@@ -124,7 +124,7 @@ class Simulator:
             echoes = tracer.echoes(rays, scene, rows, keys, tables)
             lines = pings * sonar.beams
             sums = accumulate(echoes, rays.line, lines, sonar)
-            frame = *develop(sums, lines, sonar), tracer.height_m(scene, rows)
+            frame = *develop(sums, pings, sonar), tracer.height_m(scene, rows)
             if not labels:
                 return *frame, None
             best = strongest(echoes, rays.line, rays.ray, lines, sonar)

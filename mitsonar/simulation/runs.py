@@ -174,7 +174,7 @@ class StoredEchoes:
             stored = self.film_echoes(poses, number)
             echoes = Echoes(**{name: mi.Float(value) for name, value in vars(stored).items()})
             sums = accumulate(echoes, beam, self.sonar.beams, self.sonar)
-            levels, counts = fetch(*develop(sums, self.sonar.beams, self.sonar), 1, self.sonar)
+            levels, counts = fetch(*develop(sums, 1, self.sonar), 1, self.sonar)
             yield Pings(number, levels, self.height_m[number : number + 1], counts)
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
