@@ -15,9 +15,13 @@ if TYPE_CHECKING:
 
 __all__ = ["fan_figure", "save_fan"]
 
+GAMMA = 0.6
+"""Power that levels are shown with, so that faint ground can be seen beside bright faces; the colour bar says it."""
+
 
 def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figure:
     """One frame as a fan with metre axes: forward up, starboard to the right."""
+    from matplotlib.colors import PowerNorm
     from matplotlib.figure import Figure
 
     fan = to_cartesian(frames.image[index], frames.range_m, frames.bearing_rad)
@@ -26,10 +30,11 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figur
     width = float(np.clip(height * (right - left) / (high - low), 3.0, 14.0))
     figure = Figure(figsize=(width + 1.6, height), layout="constrained")
     axes = figure.add_subplot(facecolor="black")
+    norm = PowerNorm(GAMMA, vmin=0, vmax=1)
     scale = 255 if frames.image.dtype == np.uint8 else 1
-    shown = axes.imshow(fan.image / scale, extent=fan.extent, cmap="copper", vmin=0, vmax=1, interpolation="nearest")
+    shown = axes.imshow(fan.image / scale, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
     axes.set(xlabel="starboard (m)", ylabel="forward (m)", title=title)
-    figure.colorbar(shown, ax=axes, label="level (1 = full scale)", fraction=0.04)
+    figure.colorbar(shown, ax=axes, label=f"level (1 = full scale; shown with gamma {GAMMA:g})", fraction=0.04)
     return figure
 
 

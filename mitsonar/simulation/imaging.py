@@ -91,7 +91,7 @@ class Simulator:
             labels: per-pixel truth as well.
         """
         table = np.atleast_2d(np.asarray(poses, dtype=float))
-        if table.ndim != 2 or table.shape[1] != 6 or not np.isfinite(table).all():
+        if table.ndim != 2 or table.shape[1] != 6 or not len(table) or not np.isfinite(table).all():
             raise MitsonarError(f"poses must be finite numbers (frames, 6): got {table.shape}; give m and rad")
         for start in range(0, len(table), self.pings_per_launch):
             yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
