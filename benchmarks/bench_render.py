@@ -104,9 +104,11 @@ def limit(scene: Any, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], 
     tracer = Tracer(scene, sonar)
     rows, keys, _ = tracer.inputs(poses, 0)
 
+    index = Rays.numbered(sonar, len(poses))
+
     @dr.freeze
-    def launch(scene: Any, rows: Any, keys: Any) -> Any:
-        rays = Rays(sonar, len(poses))
+    def launch(index: Any, scene: Any, rows: Any, keys: Any) -> Any:
+        rays = Rays(sonar, index)
         line = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
         d = tracer.fan(rays, keys).d
         to_world = mi.Vector3f(*(a.x * d.x + a.y * d.y + a.z * d.z for a in line))
@@ -114,7 +116,7 @@ def limit(scene: Any, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], 
         return scene.ray_intersect_preliminary(ray, coherent=True).t
 
     def call() -> None:
-        dr.eval(launch(scene, rows, keys))
+        dr.eval(launch(index, scene, rows, keys))
         dr.sync_thread()
 
     return call

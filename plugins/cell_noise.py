@@ -6,9 +6,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-from mitsonar.plugins.place import TextureOfPlace
 
 from mitsonar.errors import MitsonarError
+from mitsonar.plugins.place import TextureOfPlace
 
 __all__ = ["CellNoise"]
 

@@ -7,13 +7,16 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-from mitsonar.plugins.imaging_sonar import Fan, ImagingSonar
-from mitsonar.plugins.surfaces import Surfaces
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
+from mitsonar.plugins.imaging_sonar import Fan, ImagingSonar
+from mitsonar.plugins.surfaces import Surfaces
 from mitsonar.simulation.echoes import CHANNELS, Echoes
 
-__all__ = ["Echo"]
+__all__ = ["GRAZING", "Echo"]
+
+GRAZING = 0.02
+"""Sine of the flattest angle (1.1 deg) at which a cell's tangent plane is followed: beyond it leaves the object."""
 
 
 class Echo(ADIntegrator):
@@ -36,8 +39,6 @@ class Echo(ADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self._scene: mi.Scene | None = None
-        self._surfaces: Surfaces | None = None
         self._fan: Fan | None = None
         self._origin = mi.Point3f(0)
 
@@ -53,7 +54,7 @@ class Echo(ADIntegrator):
         valid = hit.valid
         toward = dr.dot(hit.n, ray.d)
         cosine = dr.select(dr.abs(toward) < 1, dr.abs(toward), 1)
-        steep = dr.select(dr.abs(toward) > 1e-6, toward, 1e-6)
+        steep = dr.select(cosine > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
         range_m = hit.t + skipped
         per_radian = -range_m / steep
         slope = per_radian * dr.dot(hit.n, fan.lift)
@@ -109,13 +110,12 @@ class Echo(ADIntegrator):
 
     def sample(self, mode: Any, scene: mi.Scene, sampler: Any, ray: mi.RayDifferential3f, **_: Any) -> Any:
         """Values, validity, channels and no state, as ``ADIntegrator`` wants them."""
-        if self._surfaces is None or self._scene is not scene:
-            self._scene, self._surfaces = scene, Surfaces.of(scene)
-            for note in self._surfaces.notes:
-                mi.Log(mi.LogLevel.Warn, note)
+        surfaces = Surfaces.of(scene)
+        for note in surfaces.notes:
+            mi.Log(mi.LogLevel.Warn, note)
         assert self._fan is not None
         skipped = dr.dot(ray.o - self._origin, ray.d)
-        echoes = self.measure(scene, self._surfaces, mi.Ray3f(ray), self._fan, skipped)
+        echoes = self.measure(scene, surfaces, mi.Ray3f(ray), self._fan, skipped)
         value = mi.Spectrum(echoes.reflectivity * echoes.cosine)
         return value, echoes.hit > 0, [getattr(echoes, name) for name in CHANNELS], None
 

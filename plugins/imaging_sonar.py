@@ -11,6 +11,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import pose_from_to_world
+from mitsonar.plugins.place import ROUNDS
 from mitsonar.presets import sonar_from
 from mitsonar.sonar import Sonar
 
@@ -121,7 +122,7 @@ class ImagingSonar(mi.Sensor):
         """Across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray)."""
         if not self.sonar.jittered:
             return mi.Float(0.5), mi.Float(0.5)
-        first, second = mi.sample_tea_32(ray, key)
+        first, second = mi.sample_tea_32(ray, key, ROUNDS)
         return (mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24
 
     # ---------------------------------------------------------------- what Mitsuba asks of a sensor

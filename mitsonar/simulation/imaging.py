@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -119,8 +120,8 @@ class Simulator:
         tracer, sonar = self.tracer, self.sonar
 
         @dr.freeze
-        def launch(scene: Any, rows: Any, keys: Any, tables: Any) -> Any:
-            rays = Rays(sonar, pings)
+        def launch(index: Any, scene: Any, rows: Any, keys: Any, tables: Any) -> Any:
+            rays = Rays(sonar, index)
             echoes = tracer.echoes(rays, scene, rows, keys, tables)
             lines = pings * sonar.beams
             sums = accumulate(echoes, rays.line, lines, sonar)
@@ -130,7 +131,7 @@ class Simulator:
             best = strongest(echoes, rays.line, rays.ray, lines, sonar)
             return *frame, (best, tracer.fan(rays, keys).elevation, echoes.shape_id)
 
-        return launch
+        return partial(launch, Rays.numbered(sonar, pings))
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """One ping's echoes as NumPy arrays, in the order of the film."""

@@ -59,7 +59,7 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
 
     try:
         texts: dict[str, Any] = {key: str(value) for key, value in parameters.items()}
-        scene = mi.load_file(str(path), **texts)
+        scene = mi.load_file(str(path), optimize=False, **texts)  # merged meshes would lose their ids
     except Exception as error:
         raise MitsonarError(f"cannot load scene {path}: {_reason(error)}") from error
     if not isinstance(scene, mi.Scene):

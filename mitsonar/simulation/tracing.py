@@ -28,16 +28,30 @@ class Rays:
         row: ray over elevation, 0 the highest.
         line: ``ping * beams + beam``.
         film: pixel of the ray on the sensor's film.
+
+    Args:
+        sonar: the instrument.
+        index: numbers of the rays in the launch, of :meth:`numbered`.
     """
 
-    def __init__(self, sonar: Sonar, pings: int) -> None:
-        index = dr.arange(mi.UInt32, pings * sonar.rays)
+    def __init__(self, sonar: Sonar, index: mi.UInt32) -> None:
         self.ray = index % sonar.rays
         self.row = index % sonar.rays_per_beam
         across = index // sonar.rays_per_beam
         self.ping, self.column = across // sonar.columns, across % sonar.columns
         self.line = across // sonar.across
         self.film = self.row * sonar.columns + self.column
+
+    @staticmethod
+    def numbered(sonar: Sonar, pings: int) -> mi.UInt32:
+        """0, 1, 2 ... for all rays of a launch, in memory: the width of a frozen launch follows from its inputs.
+
+        Without an input as wide as the launch, Dr.Jit 1.5 infers the width from whatever input divides it, the
+        data of virtual calls too, and a replay can lose rays.
+        """
+        index = dr.arange(mi.UInt32, pings * sonar.rays)
+        dr.make_opaque(index)
+        return index
 
 
 class Tracer:
@@ -80,7 +94,7 @@ class Tracer:
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """One ping's echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
-        rays = Rays(self.sonar, 1)
+        rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
         traced = self.echoes(rays, self.scene, *self.inputs(np.reshape(pose, (1, 6)), ping))
         values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
         for name, target in values.items():
