@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -148,7 +147,7 @@ class SonarFrames:
             else:
                 with np.load(path, allow_pickle=False) as file:
                     table = {name: file[name] for name in file.files}
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
             raise MitsonarError(f"cannot read frames {path}: {error}; give frames.npz or a run's folder") from None
         return cls.from_arrays(table, str(path))
 

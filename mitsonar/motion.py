@@ -156,20 +156,18 @@ class Trajectory:
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not text"
             raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM file") from None
-        rows = [
-            _tum_row(path, number, line)
-            for number, line in enumerate(lines, start=1)
-            if line.strip() and not line.lstrip().startswith("#")
-        ]
+        rows: list[list[float]] = []
+        for number, line in enumerate(lines, start=1):
+            if line.strip() and not line.lstrip().startswith("#"):
+                rows.append(_tum_row(path, number, line))
+                if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+                    raise MitsonarError(
+                        f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:g} s after "
+                        f"{rows[-2][0]:g} s; sort the lines"
+                    )
         if not rows:
             raise MitsonarError(f"trajectory {path} holds no pose: give lines of `time x y z qx qy qz qw`")
         table = np.array(rows)
-        backwards = np.flatnonzero(np.diff(table[:, 0]) <= 0)
-        if backwards.size:
-            raise MitsonarError(
-                f"trajectory {path}: time must increase, got {table[backwards[0] + 1, 0]:g} s after "
-                f"{table[backwards[0], 0]:g} s; sort the lines"
-            )
         return cls(poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:])), table[:, 0])
 
     def save_tum(self, path: str | Path) -> None:

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
-from mitsonar.plugins.imaging_sonar import Fan, ImagingSonar
+from mitsonar.plugins.imaging_sonar import Fan, carried, is_imaging_sonar
 from mitsonar.plugins.surfaces import Surfaces
 from mitsonar.simulation.echoes import CHANNELS, Echoes
 
@@ -99,10 +99,9 @@ class Echo(ADIntegrator):
         ray, weight = sensor.sample_ray_differential(
             time=sensor.shutter_open(), sample1=0.5, sample2=position, sample3=mi.Point2f(0.5)
         )
-        if isinstance(sensor, ImagingSonar):
-            self._fan = sensor.film_fan(position)
-            to_world = sensor.world_transform()
-            self._fan = replace(self._fan, lift=to_world @ self._fan.lift, side=to_world @ self._fan.side)
+        if is_imaging_sonar(sensor):
+            fan, lines = sensor.film_fan(position), sensor.lines()
+            self._fan = replace(fan, lift=carried(lines, fan.lift), side=carried(lines, fan.side))
         else:
             self._fan = Fan(ray.d, mi.Vector3f(0), mi.Vector3f(0), *(mi.Float(0) for _ in range(5)))
         self._origin = mi.Point3f(sensor.world_transform().translation())

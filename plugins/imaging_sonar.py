@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import pose_from_to_world
+from mitsonar.motion import Pose, pose_from_to_world, to_world_matrices
 from mitsonar.plugins.place import ROUNDS
 from mitsonar.presets import sonar_from
 from mitsonar.sonar import Sonar
 
-__all__ = ["Fan", "ImagingSonar"]
+__all__ = ["Fan", "ImagingSonar", "carried", "is_imaging_sonar"]
 
 
 @dataclass
@@ -79,7 +79,16 @@ class ImagingSonar(mi.Sensor):
             props["film"] = self._film()
         super().__init__(props)
         self._check_film()
-        self.pose = pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
+        self.pose  # noqa: B018  a to_world that scales is refused here
+
+    @property
+    def pose(self) -> Pose:
+        """Where ``to_world`` puts the sonar."""
+        return pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
+
+    def lines(self) -> list[mi.Vector4f]:
+        """The first three rows of ``to_world``, as :func:`carried` wants them."""
+        return [mi.Vector4f(*map(float, row)) for row in to_world_matrices(self.pose)[0, :3].astype(np.float32)]
 
     # ---------------------------------------------------------------- the law of the rays
 
@@ -130,10 +139,10 @@ class ImagingSonar(mi.Sensor):
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         """The ray of the film's cell that ``sample2`` lies in, and weight 1."""
         fan = self.film_fan(sample2)
-        to_world = self.world_transform()
+        lines = self.lines()
         ray = dr.zeros(mi.Ray3f, dr.width(fan.d))
-        ray.o = mi.Point3f(to_world.translation())
-        ray.d = to_world @ fan.d
+        ray.o = mi.Point3f(*(line.w for line in lines))
+        ray.d = carried(lines, fan.d)
         ray.maxt = dr.largest(mi.Float)
         ray.time = time
         return ray, mi.Spectrum(1.0)
@@ -184,6 +193,16 @@ def _read_sonar(props: mi.Properties) -> Sonar:
 def _local(starboard: mi.Float, forward: mi.Float, up: mi.Float) -> mi.Vector3f:
     """From (starboard, forward, up) to the sensor's axes."""
     return mi.Vector3f(-starboard, up, forward)
+
+
+def carried(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
+    """A direction from the sensor's axes to the world's, by the same products wherever rays are made."""
+    return mi.Vector3f(*(line.x * v.x + line.y * v.y + line.z * v.z for line in lines))
+
+
+def is_imaging_sonar(sensor: mi.Sensor) -> bool:
+    """Whether a sensor is one, also of an earlier load of this module: the class is made anew with each variant."""
+    return any(base.__name__ == ImagingSonar.__name__ for base in type(sensor).__mro__)
 
 
 mi.register_sensor("imaging_sonar", ImagingSonar)

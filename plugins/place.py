@@ -6,6 +6,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mitsonar.errors import MitsonarError
 
@@ -27,7 +28,8 @@ class TextureOfPlace(mi.Texture):
         self.cell_size = float(props.get("cell_size", cell_size))
         self.octaves = int(props.get("octaves", octaves))
         self.seed = int(props.get("seed", 0))
-        self.to_uv = props.get("to_uv", mi.ScalarTransform3f())
+        to_uv = np.array(props.get("to_uv", mi.ScalarTransform4f()).matrix, dtype=float)
+        self.to_uv = to_uv[:2][:, [0, 1, 3]]
         if not (self.cells > 0 and self.cell_size > 0 and 1 <= self.octaves <= 24):
             raise MitsonarError(
                 f"{self.name} needs cells > 0, cell_size > 0 and octaves 1..24: got cells {self.cells:g}, cell_size "
@@ -58,12 +60,16 @@ class TextureOfPlace(mi.Texture):
     def value(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """The mean of the octaves, each with half the weight of the one before."""
         on_surface = self.coordinates == "uv"
-        place = mi.Transform3f(self.to_uv) @ si.uv * self.cells if on_surface else si.p / self.cell_size
+        place = self._moved(si.uv) * self.cells if on_surface else si.p / self.cell_size
         total, weight = mi.Float(0), 0.0
         for octave in range(self.octaves):
             total += 0.5**octave * self.octave(place * 2**octave, _scramble(self.seed, octave))
             weight += 0.5**octave
         return self.finish(total / weight)
+
+    def _moved(self, uv: mi.Point2f) -> mi.Point2f:
+        """uv after ``to_uv``."""
+        return mi.Point2f(*(float(u) * uv.x + float(v) * uv.y + float(one) for u, v, one in self.to_uv))
 
     def eval(self, si: mi.SurfaceInteraction3f, active: Any = True) -> Any:
         return mi.UnpolarizedSpectrum(dr.select(active, self.value(si), 0))

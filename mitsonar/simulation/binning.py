@@ -29,6 +29,9 @@ __all__ = ["Counts", "accumulate", "develop", "fetch", "fraction_bits", "stronge
 NARROWEST = 2.0**-6
 """Shortest footprint [bins]: a surface seen straight on has none, and a density needs one."""
 
+ADD = dr.ReduceMode.Local
+"""How additions meet: Dr.Jit's own choice counts on the number of threads staying the same until a launch is replayed."""
+
 COUNTERS = 3
 """Cells a beam beyond its bins: returns nearer than the window, farther than it, and misses."""
 
@@ -73,7 +76,7 @@ def accumulate(echoes: Echoes, line: mi.UInt32, lines: int, sonar: Sonar) -> mi.
         place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
         inside = hit & (place >= 0) & (place < sonar.range_bins)
         cell = dr.select(inside, _whole(place), _counter(hit, place < 0, sonar))
-        dr.scatter_add(sums, dr.select(inside, mi.UInt64(value), 1), start + cell)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.select(inside, mi.UInt64(value), 1), start + cell, mode=ADD)
         return sums
     a, b, width = footprint(exact, sonar)
     inside = hit & (b > 0) & (a < sonar.range_bins)
@@ -85,10 +88,12 @@ def accumulate(echoes: Echoes, line: mi.UInt32, lines: int, sonar: Sonar) -> mi.
     # additions to one cell are joined: a footprint within a bin takes two, across one border three
     same, apart = inside & (last == first), inside & (last > first + 1)
     second = dr.select(same, late - left, dr.select(apart, late, late + left - whole))
-    dr.scatter_add(sums, dr.select(inside, dr.select(same, left, whole) - late, 1), start + cell)
-    dr.scatter_add(sums, second, start + first + 1, inside)
-    dr.scatter_add(sums, left - whole, start + last, apart)
-    dr.scatter_add(sums, mi.UInt64(0) - left, start + last + 1, inside & ~same & (left > 0))
+    dr.scatter_reduce(
+        dr.ReduceOp.Add, sums, dr.select(inside, dr.select(same, left, whole) - late, 1), start + cell, mode=ADD
+    )
+    dr.scatter_reduce(dr.ReduceOp.Add, sums, second, start + first + 1, inside, mode=ADD)
+    dr.scatter_reduce(dr.ReduceOp.Add, sums, left - whole, start + last, apart, mode=ADD)
+    dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.UInt64(0) - left, start + last + 1, inside & ~same & (left > 0), mode=ADD)
     return sums
 
 

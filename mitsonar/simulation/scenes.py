@@ -69,9 +69,9 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
 
 def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
     """Sonar and pose of the scene's ``imaging_sonar`` number ``index``; None where there is none. Cameras are ignored."""
-    from mitsonar.plugins.imaging_sonar import ImagingSonar
+    from mitsonar.plugins.imaging_sonar import is_imaging_sonar
 
-    found = [sensor for sensor in scene.sensors() if isinstance(sensor, ImagingSonar)]
+    found = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
     return (found[index].sonar, found[index].pose) if index < len(found) else None
 
 

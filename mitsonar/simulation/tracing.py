@@ -84,12 +84,9 @@ class Tracer:
         known = replace(self.surfaces, **dict(zip(("facets", "corners", "shapes", "constant"), tables, strict=True)))
         fan = self.fan(rays, keys)
         lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
-
-        def to_world(v: mi.Vector3f) -> mi.Vector3f:
-            return mi.Vector3f(*(line.x * v.x + line.y * v.y + line.z * v.z for line in lines))
-
-        ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), to_world(fan.d))
-        fan = replace(fan, lift=to_world(fan.lift), side=to_world(fan.side))
+        carried = imaging_sonar.carried
+        ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), carried(lines, fan.d))
+        fan = replace(fan, lift=carried(lines, fan.lift), side=carried(lines, fan.side))
         return echo.Echo.measure(scene, known, ray, fan)
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
