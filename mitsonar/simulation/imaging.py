@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
@@ -103,7 +105,9 @@ class Simulator:
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._compile(*key)
-        image, counters, height, truth = self._launches[key](self.tracer.scene, *self.tracer.inputs(poses, first))
+        inputs = self.tracer.inputs(poses, first)
+        with _garbage_stays():
+            image, counters, height, truth = self._launches[key](self.tracer.scene, *inputs)
         levels, counts = binning.fetch(image, counters, len(poses), self.sonar)
         pings = Pings(first, levels, np.array(height, dtype=float), counts)
         if labels:
@@ -192,6 +196,18 @@ class Simulator:
             level_scale=1 / gain,
             **labelled,
         )
+
+
+@contextmanager
+def _garbage_stays() -> Iterator[None]:
+    """No garbage collection while a launch is recorded: Dr.Jit 1.5 ends the process where an array is freed then."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def constant_gain(batches: Iterable[Pings]) -> tuple[float, Iterator[Pings]]:

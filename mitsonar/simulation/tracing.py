@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -19,7 +20,7 @@ __all__ = ["Rays", "Tracer"]
 
 
 class Rays:
-    """Which ray is which in a launch: elevation fastest, then column, then ping, so that neighbours stay together.
+    """Which ray is which in a launch: strips of a few columns, down each, so that rays traced together are neighbours.
 
     Attributes:
         ping: number of the ping in the launch.
@@ -35,11 +36,11 @@ class Rays:
     """
 
     def __init__(self, sonar: Sonar, index: mi.UInt32) -> None:
-        self.ray = index % sonar.rays
-        self.row = index % sonar.rays_per_beam
-        across = index // sonar.rays_per_beam
-        self.ping, self.column = across // sonar.columns, across % sonar.columns
-        self.line = across // sonar.across
+        wide = strip_columns(sonar)
+        self.ping, self.ray = index // sonar.rays, index % sonar.rays
+        strip, place = self.ray // (wide * sonar.rays_per_beam), self.ray % (wide * sonar.rays_per_beam)
+        self.column, self.row = strip * wide + place % wide, place // wide
+        self.line = self.ping * sonar.beams + self.column // sonar.across
         self.film = self.row * sonar.columns + self.column
 
     @staticmethod
@@ -52,6 +53,14 @@ class Rays:
         index = dr.arange(mi.UInt32, pings * sonar.rays)
         dr.make_opaque(index)
         return index
+
+
+def strip_columns(sonar: Sonar) -> int:
+    """Columns of a strip: the power of two, dividing all columns, that makes 16 rays in a row most nearly a square."""
+    across = sonar.beam_width_rad / sonar.across
+    down = math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
+    wanted = 2 ** min(4, max(0, round(math.log2(math.sqrt(16 * down / across)))))
+    return math.gcd(wanted, sonar.columns)
 
 
 class Tracer:

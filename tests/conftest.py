@@ -1,0 +1,36 @@
+"""What all tests share: the variant, and the markers that need a device or an extra."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+
+import pytest
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what this machine lacks and say so; with MITSONAR_REQUIRE_LEARN=1 an absent torch fails the tests instead."""
+    skips = []
+    if importlib.util.find_spec("torch") is None and os.environ.get("MITSONAR_REQUIRE_LEARN") != "1":
+        reason = "torch is not installed: install mitsonar[learn]; MITSONAR_REQUIRE_LEARN=1 makes this a failure"
+        skips.append(("learn", pytest.mark.skip(reason=reason)))
+    if any(item.get_closest_marker("gpu") for item in items) and not _has_cuda():
+        skips.append(("gpu", pytest.mark.skip(reason="no CUDA device")))
+    for item in items:
+        for name, skip in skips:
+            if item.get_closest_marker(name):
+                item.add_marker(skip)
+
+
+def _has_cuda() -> bool:
+    import drjit as dr
+
+    return bool(dr.has_backend(dr.JitBackend.CUDA))
+
+
+@pytest.fixture(scope="session")
+def variant() -> str:
+    """A Mitsuba variant is set."""
+    from mitsonar.simulation.variant import ensure_variant
+
+    return ensure_variant()

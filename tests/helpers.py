@@ -1,0 +1,202 @@
+"""Scenes, plain NumPy truths and scripts that several tests share. Truths are written from SPEC.md, not from the code."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from mitsonar.motion import Pose
+from mitsonar.sonar import Sonar
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+Array = NDArray[np.float64]
+
+# ---------------------------------------------------------------- scenes
+
+
+def diffuse(reflectance: Any = 0.5) -> dict[str, Any]:
+    """A diffuse BSDF; ``reflectance`` a number or a texture."""
+    if isinstance(reflectance, int | float):
+        reflectance = {"type": "uniform", "value": float(reflectance)}
+    return {"type": "diffuse", "reflectance": reflectance}
+
+
+def floor(bsdf: dict[str, Any] | None = None, half: float = 100.0) -> dict[str, Any]:
+    """The plane z = 0, normal up."""
+    import mitsuba as mi
+
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half), "bsdf": bsdf or diffuse()}
+
+
+def plate(point: ArrayLike, normal: ArrayLike, half: float = 50.0, bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A square plate through ``point`` with that normal."""
+    import mitsuba as mi
+
+    point, normal = np.asarray(point, float), np.asarray(normal, float)
+    up = [0, 0, 1] if abs(normal[2]) < 0.9 * np.linalg.norm(normal) else [0, 1, 0]
+    look = mi.ScalarTransform4f().look_at(origin=point.tolist(), target=(point + normal).tolist(), up=up)
+    return {"type": "rectangle", "to_world": look @ mi.ScalarTransform4f().scale(half), "bsdf": bsdf or diffuse()}
+
+
+def sphere(center: ArrayLike, radius: float, bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A sphere."""
+    return {"type": "sphere", "center": np.asarray(center, float).tolist(), "radius": radius, "bsdf": bsdf or diffuse()}
+
+
+def box(center: ArrayLike, half: ArrayLike, bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A box along the axes, a mesh."""
+    import mitsuba as mi
+
+    place = mi.ScalarTransform4f().translate(np.asarray(center, float).tolist()).scale(np.asarray(half, float).tolist())
+    return {"type": "cube", "to_world": place, "bsdf": bsdf or diffuse()}
+
+
+def scene(**shapes: dict[str, Any]) -> mi.Scene:
+    """A scene of these shapes; each is named by its key."""
+    import mitsuba as mi
+
+    return mi.load_dict({"type": "scene", **shapes})
+
+
+def place_of(scene: mi.Scene, name: str) -> int:
+    """The place of a shape in the scene, which ``shape_id`` tells."""
+    return [shape.id() for shape in scene.shapes()].index(name)
+
+
+# ---------------------------------------------------------------- geometry
+
+
+def axes(pose: Pose) -> tuple[Array, Array, Array]:
+    """Starboard, forward and up of a pose in the world, from the conventions of SPEC.md, section 1."""
+    sin_h, cos_h, sin_p, cos_p = np.sin(pose.heading), np.cos(pose.heading), np.sin(pose.pitch), np.cos(pose.pitch)
+    forward = np.array([cos_p * sin_h, cos_p * cos_h, -sin_p])
+    level = np.array([cos_h, -sin_h, 0.0])  # starboard before the roll
+    upright = np.cross(level, forward)
+    starboard = np.cos(pose.roll) * level - np.sin(pose.roll) * upright
+    return starboard, forward, np.cross(starboard, forward)
+
+
+def direction(sonar: Sonar, bearing: ArrayLike, elevation: ArrayLike) -> Array:
+    """Directions ``(rays, 3)`` as (starboard, forward, up) of bearings and elevations [rad]."""
+    b, e = np.broadcast_arrays(np.asarray(bearing, float), np.asarray(elevation, float))
+    if sonar.bearing == "azimuth":
+        return np.stack([np.cos(e) * np.sin(b), np.cos(e) * np.cos(b), np.sin(e)], axis=-1)
+    return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], axis=-1)
+
+
+def angles(sonar: Sonar, local: ArrayLike) -> tuple[Array, Array]:
+    """Bearing and elevation [rad] of directions ``(rays, 3)`` (starboard, forward, up): :func:`direction` inverted."""
+    starboard, forward, up = np.asarray(local, float).T
+    if sonar.bearing == "azimuth":
+        return np.arctan2(starboard, forward), np.arctan2(up, np.hypot(starboard, forward))
+    return np.arctan2(starboard, np.hypot(forward, up)), np.arctan2(up, forward)
+
+
+def cells(sonar: Sonar) -> tuple[Array, Array]:
+    """Bearing and elevation [rad] of the middle of each ray's cell, in the order of the film (row 0 highest)."""
+    across = sonar.across
+    offset = ((np.arange(across) + 0.5) / across - 0.5) * sonar.beam_width_rad
+    bearing = (sonar.bearing_rad[:, None] + offset).ravel()
+    rows = sonar.rays_per_beam
+    elevation = np.radians(sonar.elevation_fov_deg) * (0.5 - (np.arange(rows) + 0.5) / rows)
+    return np.tile(bearing, rows), np.repeat(elevation, len(bearing))
+
+
+def world_directions(sonar: Sonar, pose: Pose, bearing: ArrayLike, elevation: ArrayLike) -> Array:
+    """Directions ``(rays, 3)`` in the world."""
+    return direction(sonar, bearing, elevation) @ np.array(axes(pose))
+
+
+def floor_levels(
+    sonar: Sonar, height: float, pitch: float, reflectivity: float, *, axis_only: bool = False, nodes: int = 8
+) -> Array:
+    """Levels ``(bins, beams)`` that an endless flat floor sends back, by Gauss-Legendre over width and bin.
+
+    The floor lies ``height`` below; heading and roll are 0. ``physical``: the integral of C cos(theta) R^(g-2) over the
+    bin's solid angle. ``thesis``: rays a radian of elevation times the integral of C cos(theta), averaged over the
+    beam's width (jitter) or on its axis.
+    """
+    edges = sonar.range_min + np.arange(sonar.range_bins + 1) * sonar.bin_m
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    over_width, width_weight = (np.zeros(1), np.full(1, 2.0)) if axis_only else (x, weight)
+    b = sonar.bearing_rad[:, None] + over_width * sonar.beam_width_rad / 2
+    half = np.radians(sonar.elevation_fov_deg) / 2
+    if sonar.bearing == "azimuth":  # down-going part of a ray: steep cos(e + lean)
+        steep, lean = (
+            np.hypot(np.cos(b) * np.sin(pitch), np.cos(pitch)),
+            np.arctan2(np.cos(pitch), np.cos(b) * np.sin(pitch)),
+        )
+        e = np.arccos(np.clip(height / (edges[:, None, None] * steep), -1, 1)) - lean
+    else:  # cos b sin(pitch - e)
+        e = pitch - np.arcsin(np.clip(height / (edges[:, None, None] * np.cos(b)), -1, 1))
+    e = np.clip(e, -half, half)
+    middle, reach = (e[1:] + e[:-1]) / 2, (e[1:] - e[:-1]) / 2
+    inner = middle[..., None] + reach[..., None] * x
+    if sonar.bearing == "azimuth":
+        radius = height / (steep[..., None] * np.cos(inner + lean[..., None]))
+        metric = np.cos(inner)
+    else:
+        radius = height / (np.cos(b)[..., None] * np.sin(pitch - inner))
+        metric = np.broadcast_to(np.cos(b)[..., None], inner.shape)
+    value = reflectivity * height / radius
+    if sonar.model == "physical":
+        value = value * radius ** (sonar.gain_exponent - 2.0) * metric * sonar.beam_width_rad
+    else:
+        value = value * sonar.rays_per_beam / np.radians(sonar.elevation_fov_deg)
+    over_bin = (value * weight).sum(-1) * reach
+    return (over_bin * width_weight).sum(-1) / 2
+
+
+def slope(x: ArrayLike, y: ArrayLike) -> float:
+    """The order of a convergence: slope on log axes."""
+    return float(np.polyfit(np.log(np.asarray(x, float)), np.log(np.asarray(y, float)), 1)[0])
+
+
+# ---------------------------------------------------------------- checks
+
+
+def assert_image_close(got: NDArray[Any], wanted: Array, rms: float, picture: Path) -> None:
+    """Relative error below ``rms`` where ``wanted`` is not 0; a failure says by how much and leaves a picture to look at."""
+    filled = wanted > 0
+    relative = np.zeros(wanted.shape)
+    relative[filled] = np.asarray(got, float)[filled] / wanted[filled] - 1
+    error = float(np.sqrt(np.mean(relative[filled] ** 2)))
+    if not error < rms:
+        brightest = wanted.max()
+        panels = [np.clip(panel, 0, 1) for panel in (got / brightest, wanted / brightest, 0.5 + relative / (8 * error))]
+        Image.fromarray((255 * np.hstack(panels)).astype(np.uint8)).save(picture)
+        worst = np.unravel_index(np.abs(relative).argmax(), relative.shape)
+        raise AssertionError(
+            f"relative error {error:.3e} rms, allowed {rms:.1e}; worst {relative[worst]:+.3e} at (bin, beam) {worst}; "
+            f"got | wanted | difference in {picture}"
+        )
+
+
+BLOCK = """
+import sys
+class Block:
+    def find_spec(name, path=None, target=None):
+        if name.split(".")[0] in {names!r}:
+            raise ModuleNotFoundError(f"{{name}} is blocked", name=name)
+sys.meta_path.insert(0, Block)
+"""
+
+
+def run_python(script: str, *, block: tuple[str, ...] = (), **environment: str) -> str:
+    """What a fresh interpreter, in which ``block`` cannot be imported, prints for a script; its failure is the test's."""
+    script = BLOCK.format(names=block) + textwrap.dedent(script)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, **environment}, timeout=120
+    )
+    assert done.returncode == 0, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
+    return done.stdout

@@ -1,0 +1,58 @@
+"""Levels: the formula of each model in plain NumPy, and a bound that no echo exceeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsonar.simulation.acoustics import largest_level, level
+from mitsonar.simulation.echoes import CHANNELS, Echoes
+from mitsonar.sonar import Sonar
+
+
+def echoes(sonar: Sonar, count: int = 2000) -> Echoes:
+    """Random echoes within the window, some with the largest possible values."""
+    rng = np.random.default_rng(0)
+    values = {name: rng.random(count) for name in CHANNELS}
+    values["range_m"] = rng.uniform(sonar.range_min, sonar.range_max, count)
+    values["solid_angle_sr"] = 1e-5 * rng.random(count)
+    values["range_m"][:2] = sonar.range_min, sonar.range_max
+    values["reflectivity"][:2] = values["cosine"][:2] = 1
+    values["solid_angle_sr"][:2] = 1e-5
+    return Echoes(**values)
+
+
+def test_thesis_is_reflectivity_times_cosine() -> None:
+    """Almanza-Medina, eq. 2.2: C L, whatever range and solid angle."""
+    sonar = Sonar(model="thesis", gain_exponent=3)
+    got = echoes(sonar)
+    np.testing.assert_array_equal(level(got, sonar, np.where), got.reflectivity * got.cosine)
+    assert largest_level(sonar, 1e-5) == 1
+
+
+@pytest.mark.parametrize("exponent", range(5))
+def test_physical_is_spread_by_the_square_of_the_range(exponent: int) -> None:
+    """C cos(theta) dOmega / R^2 times R^g."""
+    sonar = Sonar(gain_exponent=exponent)
+    got = echoes(sonar)
+    wanted = got.reflectivity * got.cosine * got.solid_angle_sr * got.range_m ** (exponent - 2.0)
+    np.testing.assert_allclose(level(got, sonar, np.where), wanted, rtol=1e-14)
+
+
+@pytest.mark.parametrize("window", [(0.0, 2.0), (0.3, 0.9), (3.2, 5.6), (2.0, 100.0)])
+@pytest.mark.parametrize("exponent", range(5))
+def test_no_echo_exceeds_the_bound(exponent: int, window: tuple[float, float]) -> None:
+    """Overflow is impossible because of it; within the window it is not far from what can be."""
+    sonar = Sonar(gain_exponent=exponent, range_min=window[0], range_max=window[1])
+    found = level(echoes(sonar), sonar, np.where)
+    bound = largest_level(sonar, 1e-5)
+    assert found.max() <= bound * (1 + 1e-12)
+    assert found.max() >= bound / 17
+
+
+def test_nearer_than_one_bin_the_law_is_held() -> None:
+    sonar = Sonar(range_min=0, range_max=5.12, range_bins=512)  # bins of 1 cm
+    got = echoes(sonar, 3)
+    got.reflectivity[:] = got.cosine[:] = got.solid_angle_sr[:] = 1
+    got.range_m[:] = 0, 0.005, 0.01
+    np.testing.assert_allclose(level(got, sonar, np.where), 1e4, rtol=1e-12)

@@ -1,0 +1,215 @@
+"""The house rules: what imports cost and need, which module may import which, what is packaged."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers import run_python
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+SETUPTOOLS = PROJECT["tool"]["setuptools"]
+
+STAGES = (
+    *("errors", "files", "sonar", "presets", "motion", "frames", "framestore", "noise", "geometry", "plots"),
+    "simulation.echoes",
+    *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")),
+    *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "binning", "tracing", "imaging", "runs")),
+    "cli",
+    "__main__",
+)
+"""Each module imports only from earlier ones; those of `cli` may import each other. A new module needs a place here."""
+
+
+def folder_of(package: str) -> Path:
+    """Where a package's files are in the checkout."""
+    if package in SETUPTOOLS["package-dir"]:
+        return ROOT / SETUPTOOLS["package-dir"][package]
+    return ROOT / package.replace(".", "/")
+
+
+def modules() -> dict[str, Path]:
+    """All modules by their name within mitsonar; a package is its ``__init__``, and mitsonar itself the empty name."""
+    found = {}
+    for package in SETUPTOOLS["packages"]:
+        within = package.removeprefix("mitsonar").removeprefix(".")
+        for path in sorted(folder_of(package).glob("*.py")):
+            name = within if path.stem == "__init__" else f"{within}.{path.stem}".lstrip(".")
+            found[name] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    """What a module imports of mitsonar, also within functions, but not for type checking: ``simulation.echoes``."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING"):
+            for other in node.orelse:
+                yield from imports(other)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide where a name comes from"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        else:
+            yield from imports(node)
+
+
+def imported(path: Path) -> set[str]:
+    """Modules of mitsonar that a file imports; a name in a module counts as the module."""
+    found = set()
+    for full in imports(ast.parse(path.read_text())):
+        if full.split(".")[0] == "mitsonar":
+            name = full.removeprefix("mitsonar").removeprefix(".")
+            while name not in MODULES:
+                name = name.rpartition(".")[0]
+            found.add(name)
+    return found
+
+
+def stage(name: str) -> int:
+    """The place of a module in the order."""
+    return STAGES.index("cli" if name.split(".")[0] == "cli" else name)
+
+
+PACKAGES = {"", "plugins", "simulation", "scenes"}
+"""Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
+
+
+def test_every_module_has_its_place() -> None:
+    # scenes holds data; a script that makes them may stand beside
+    unknown = {name for name in MODULES if name not in STAGES and name.split(".")[0] not in ("cli", "scenes")} - PACKAGES
+    assert not unknown, f"give these modules their place in STAGES: {sorted(unknown)}"
+    missing = {name for name in STAGES if name not in MODULES}
+    assert not missing, f"these have gone: {sorted(missing)}"
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name not in PACKAGES and not name.startswith("scenes")])
+def test_modules_import_from_earlier_stages_only(name: str) -> None:
+    for other in imported(MODULES[name]) - {"scenes"}:
+        assert other, f"{name} imports from mitsonar itself: import from the module that holds the name"
+        same_command_line = other.split(".")[0] == name.split(".")[0] == "cli"
+        assert other not in PACKAGES, f"{name} imports the package {other}: import from its modules"
+        assert same_command_line or stage(other) < stage(name), f"{name} imports from {other}, a later stage"
+
+
+def test_packages_import_nothing_but_the_register_of_plugins() -> None:
+    found = {name: imported(MODULES[name]) for name in PACKAGES}
+    assert found == {"": {"plugins"}, "plugins": set(), "simulation": set(), "scenes": set()}
+
+
+def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
+    """What evaluates images must work where there is no renderer."""
+    speak = set()
+    for name, path in MODULES.items():
+        tops = {full.split(".")[0] for full in imports(ast.parse(path.read_text()))}
+        if tops & {"mitsuba", "drjit"}:
+            speak.add(name.split(".")[0])
+    assert speak <= {"plugins", "simulation", "cli"}
+
+
+def test_every_module_says_what_it_is() -> None:
+    for name, path in MODULES.items():
+        assert ast.get_docstring(ast.parse(path.read_text())), f"{name or 'mitsonar'} has no docstring"
+
+
+# ---------------------------------------------------------------- what imports load
+
+
+def test_import_sets_no_variant_and_loads_no_renderer() -> None:
+    run_python("""
+        import sys
+        import mitsonar
+        heavy = {"mitsuba", "drjit", "torch", "matplotlib", "zarr"} & set(sys.modules)
+        assert not heavy, heavy
+        import mitsuba
+        assert mitsuba.variant() is None, mitsuba.variant()
+        assert "Simulator" in dir(mitsonar) and mitsonar.Sonar().beams == 96
+        assert mitsuba.variant() is None
+        try:
+            mitsonar.Sona
+        except AttributeError as error:
+            assert "Sona" in str(error)
+        else:
+            raise AssertionError("an unknown name must be an AttributeError")
+    """)
+
+
+def test_public_names_are_all_there() -> None:
+    run_python("""
+        import mitsonar
+        from mitsonar.simulation.variant import ensure_variant
+        for name in mitsonar.__all__:
+            assert getattr(mitsonar, name) is not None, name
+    """)
+
+
+def test_all_but_rendering_works_without_a_renderer() -> None:
+    script = """
+        import numpy as np, mitsonar, tempfile
+        sonar = mitsonar.load_sonar("didson300").replace(beams=4, range_bins=8)
+        flown = mitsonar.Trajectory.between(mitsonar.Pose(0, 0, 2), mitsonar.Pose(0, 1, 2), 3, 10)
+        noise = mitsonar.load_noise("low")
+        image = noise.apply(np.zeros((3, 8, 4), np.float32), seed=1, frames=np.arange(3))
+        frames = mitsonar.SonarFrames(image, sonar.range_m, sonar.bearing_rad, flown.time_s, sonar, flown.poses)
+        with tempfile.TemporaryDirectory() as folder:
+            frames.save(folder + "/frames.npz")
+            assert len(mitsonar.SonarFrames.load(folder)) == 3
+        try:
+            mitsonar.load_scene("flat_floor")
+        except mitsonar.MitsonarError as error:
+            assert "Dr.Jit cannot be loaded" in str(error) and "apt-get install" in str(error), error
+        else:
+            raise AssertionError("without Dr.Jit nothing can be rendered")
+    """
+    run_python(script, block=("mitsuba", "drjit", "torch"))
+
+
+def test_rendering_works_without_torch() -> None:
+    script = """
+        import warnings
+        import mitsonar
+        from mitsonar.simulation.variant import ensure_variant
+        ensure_variant()
+        import mitsuba as mi
+        warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
+        floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100), "bsdf": {"type": "diffuse"}}
+        simulator = mitsonar.Simulator(mi.load_dict({"type": "scene", "floor": floor}), mitsonar.Sonar(beams=4))
+        pose = mitsonar.Pose.from_degrees([0, 0, 2.5, 35, 0, 0])
+        frames = simulator.render([pose], noise=mitsonar.load_noise("high"), seed=1)
+        assert frames.image.max() > 0.5
+    """
+    run_python(script, block=("torch",))
+
+
+# ---------------------------------------------------------------- what is packaged
+
+
+def test_package_list_matches_the_folders() -> None:
+    """The list is explicit: a sub-package that is forgotten is missing from the wheel without a word."""
+    folders = {
+        f"mitsonar.{path.parent.relative_to(ROOT / 'mitsonar').as_posix().replace('/', '.')}".removesuffix(
+            ".."
+        ).removesuffix(".")
+        for path in (ROOT / "mitsonar").rglob("__init__.py")
+    }
+    mapped = set(SETUPTOOLS["package-dir"])
+    assert all((folder_of(package) / "__init__.py").is_file() for package in SETUPTOOLS["packages"])
+    assert set(SETUPTOOLS["packages"]) == folders | mapped
+    loose = {path.parent for path in (ROOT / "mitsonar").rglob("*.py")} - {folder_of(name) for name in folders}
+    assert not loose, f"folders with modules but no __init__.py: {loose}"
+
+
+def test_package_data_names_every_shipped_file() -> None:
+    """What lies in scenes/ and is no Python is in the wheel, and no pattern is left over."""
+    scenes = ROOT / "scenes"
+    named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.scenes"] for path in scenes.glob(pattern)}
+    shipped = {path for path in scenes.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    assert shipped == named
+    assert (ROOT / "mitsonar" / "py.typed").is_file()
