@@ -127,14 +127,14 @@ class Sonar(BaseModel):
     @property
     def range_m(self) -> NDArray[np.float64]:
         """Centres of the range bins ``(bins,)`` [m], nearest first."""
-        return self.range_min + (np.arange(self.range_bins) + 0.5) * self.bin_m
+        return np.asarray(self.range_min + (np.arange(self.range_bins) + 0.5) * self.bin_m, dtype=np.float64)
 
     @property
     def bearing_rad(self) -> NDArray[np.float64]:
         """Bearings of the beams' axes ``(beams,)`` [rad], most to port first."""
         place = (np.arange(self.beams) + 0.5) / self.beams * 2 - 1
         half = math.radians(self.azimuth_fov_deg) / 2
-        axes: Any = place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
+        axes = place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
         return np.asarray(axes, dtype=np.float64)
 
 
