@@ -15,7 +15,8 @@ def level(echoes: Echoes, sonar: Sonar, where: Any) -> Any:
 
     ``thesis``: C L, reflectivity times cosine (Almanza-Medina, eq. 2.2). ``physical``, monostatic: C cos(theta) dOmega
     / R^2 times the gain law R^g [sr/m^2]: spreading 1/R^4 there and back, Lambert's cosine squared, and the lit area
-    dA = R^2 dOmega / cos(theta), which takes one cosine away again. Nearer than one bin the law is held.
+    dA = R^2 dOmega / cos(theta), which takes one cosine away again. The law is held nearer than the window or one bin,
+    and beyond four times the window's end (where only a footprint's tail can reach it).
 
     Args:
         echoes: arrays of float64.
@@ -25,8 +26,8 @@ def level(echoes: Echoes, sonar: Sonar, where: Any) -> Any:
     lambert = echoes.reflectivity * echoes.cosine
     if sonar.model == "thesis":
         return lambert
-    nearest = _nearest(sonar)
-    radius = where(echoes.range_m > nearest, echoes.range_m, nearest)
+    nearest, farthest = _ends(sonar)
+    radius = where(echoes.range_m > nearest, where(echoes.range_m < farthest, echoes.range_m, farthest), nearest)
     return lambert * echoes.solid_angle_sr * _spreading(radius, sonar.gain_exponent)
 
 
@@ -34,14 +35,13 @@ def largest_level(sonar: Sonar, solid_angle: float) -> float:
     """The most that one ray can contribute, ``solid_angle`` [sr] being the largest of a cell."""
     if sonar.model == "thesis":
         return 1.0
-    ends = (_nearest(sonar), max(sonar.range_max, _nearest(sonar)))
-    # a footprint that reaches into the window may be centred beyond it, where a rising gain law exceeds the end's
-    beyond = 1.0 if sonar.gain_exponent <= 2 else 16.0
-    return max(_spreading(end, sonar.gain_exponent) for end in ends) * solid_angle * beyond
+    return max(_spreading(end, sonar.gain_exponent) for end in _ends(sonar)) * solid_angle
 
 
-def _nearest(sonar: Sonar) -> float:
-    return max(sonar.range_min, sonar.bin_m)
+def _ends(sonar: Sonar) -> tuple[float, float]:
+    """Where the law of spreading and gain begins and ends to hold [m]."""
+    nearest = max(sonar.range_min, sonar.bin_m)
+    return nearest, max(4 * sonar.range_max, nearest)
 
 
 def _spreading(radius: Any, gain_exponent: int) -> Any:
