@@ -39,4 +39,4 @@ $(VENV)/.tested: $(SOURCES) $(VENV)/.installed
 	@touch $@
 
 clean:
-	rm -rf $(VENV) out build dist *.egg-info
+	rm -rf $(VENV) out/demo build dist *.egg-info

@@ -70,10 +70,22 @@ class Sonar(BaseModel):
             )
         if self.beam_layout == "sine" and self.azimuth_fov_deg > 180:
             raise ValueError(f"beam_layout sine covers at most 180 deg: got azimuth_fov_deg {self.azimuth_fov_deg:g}")
+        if self.bearing == "cone" and self.bearing_rad[-1] + self.beam_width_rad / 2 > math.radians(90) + 1e-9:
+            raise ValueError(
+                f"a cone's beams end at 90 deg: the outermost reaches {self._outermost_deg():.4g} deg; lower "
+                "azimuth_fov_deg or beam_width_deg"
+            )
+        if self.beams * self.range_bins > 2**28:
+            raise ValueError(
+                f"an image has at most {2**28:,} cells: got {self.beams * self.range_bins:,}; lower beams or range_bins"
+            )
         rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
         if rays > 2**28:
             raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower beams, rays_across or rays_per_beam")
         return self
+
+    def _outermost_deg(self) -> float:
+        return math.degrees(self.bearing_rad[-1] + self.beam_width_rad / 2)
 
     @classmethod
     def create(cls, **fields: Any) -> Self:

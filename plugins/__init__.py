@@ -53,12 +53,16 @@ class _AfterMitsuba(MetaPathFinder, Loader):
 
     def __init__(self) -> None:
         self.real: Loader | None = None
+        self.looking = False
 
     def find_spec(self, name: str, path: object = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name != "mitsuba":
+        if name != "mitsuba" or self.looking:
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
+        self.looking = True  # the real finders are asked for it
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            self.looking = False
         if spec is not None and spec.loader is not None:
             self.real, spec.loader = spec.loader, self
         return spec
@@ -71,4 +75,5 @@ class _AfterMitsuba(MetaPathFinder, Loader):
         assert self.real is not None
         module.__spec__.loader = module.__loader__ = self.real  # type: ignore[union-attr]
         self.real.exec_module(module)
+        sys.meta_path.remove(self)
         _watch_variants()

@@ -25,7 +25,8 @@ DEFAULT_REFLECTIVITY = 0.5
 DIFFUSE = {"SmoothDiffuse", "SmoothPlastic", "RoughPlastic"}
 APPROXIMATED = {"Principled", "PrincipledThin", "BlendBSDF"}
 BENT = {"BumpMap", "NormalMap"}
-WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", *BENT}
+TWO_FACED = "a different BSDF on each side"
+WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
 
 
 @dataclass
@@ -88,7 +89,7 @@ class Surfaces:
                 named["without"] += [shape.id()]
             elif kinds & APPROXIMATED:
                 named["approximated"] += [shape.id()]
-            flat = constant[index] >= 0 or all(map(_constant_on_facets, textures))
+            flat = constant[index] >= 0 or (TWO_FACED not in kinds and all(map(_constant_on_facets, textures)))
             if shape.is_mesh() and (flat or not (kinds & BENT or any(map(_by_vertex, textures)))):
                 rows[index][:2] = facet_count, corner_count
                 facets.append(_facet_rows(shape, constant[index], flat))
@@ -220,6 +221,8 @@ def _walk(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
     children = _Children()
     bsdf.traverse(children)
     kinds, textures = {bsdf.class_name()}, []
+    if bsdf.class_name() == "TwoSidedBRDF" and len({id(child) for child in children.objects}) > 1:
+        kinds.add(TWO_FACED)
     for child in children.objects:
         if isinstance(child, mi.BSDF):
             below = _walk(child)

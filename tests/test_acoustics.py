@@ -42,12 +42,24 @@ def test_physical_is_spread_by_the_square_of_the_range(exponent: int) -> None:
 @pytest.mark.parametrize("window", [(0.0, 2.0), (0.3, 0.9), (3.2, 5.6), (2.0, 100.0)])
 @pytest.mark.parametrize("exponent", range(5))
 def test_no_echo_exceeds_the_bound(exponent: int, window: tuple[float, float]) -> None:
-    """Overflow is impossible because of it; within the window it is not far from what can be."""
+    """Overflow is impossible because of it, also by the tails of footprints whose middle lies far outside the window;
+    within the window it is not far from what can be."""
     sonar = Sonar(gain_exponent=exponent, range_min=window[0], range_max=window[1])
-    found = level(echoes(sonar), sonar, np.where)
     bound = largest_level(sonar, 1e-5)
-    assert found.max() <= bound * (1 + 1e-12)
-    assert found.max() >= bound / 17
+    found = echoes(sonar)
+    assert bound / 17 <= level(found, sonar, np.where).max() <= bound * (1 + 1e-12)
+    for factor in (0.0, 1e-3, 2.0, 4.0, 1e3):
+        found.range_m[:] = factor * window[1]
+        assert level(found, sonar, np.where).max() <= bound * (1 + 1e-12)
+
+
+def test_far_beyond_the_window_the_law_is_held() -> None:
+    """Only a footprint's tail reaches in from there: from four times the window's end on the gain stays."""
+    sonar = Sonar(gain_exponent=4)
+    got = echoes(sonar, 3)
+    got.reflectivity[:] = got.cosine[:] = got.solid_angle_sr[:] = 1
+    got.range_m[:] = 4 * 5.6, 5 * 5.6, 1e6
+    np.testing.assert_allclose(level(got, sonar, np.where), (4 * 5.6) ** 2, rtol=1e-12)
 
 
 def test_nearer_than_one_bin_the_law_is_held() -> None:

@@ -74,7 +74,7 @@ def bin_in_numpy(echoes: Echoes, sonar: Sonar) -> tuple[np.ndarray, dict[str, np
         amount = (value * unit).astype(np.uint64)
         np.add.at(sums, (place[inside].astype(int), beam[inside]), amount[inside])
     else:
-        held = np.maximum(e["range_m"], max(sonar.range_min, sonar.bin_m))
+        held = np.clip(e["range_m"], max(sonar.range_min, sonar.bin_m), 4 * sonar.range_max)
         spreading = {0: 1 / (held * held), 1: 1 / held, 2: held * 0 + 1, 3: held, 4: held * held}[sonar.gain_exponent]
         value = value * e["solid_angle_sr"] * spreading * unit
         a, b = ((e[name] - sonar.range_min) * (1 / sonar.bin_m) for name in ("near_m", "far_m"))

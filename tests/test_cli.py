@@ -291,3 +291,30 @@ def test_texture_parameter_of_the_pattern() -> None:
         assert all(not np.array_equal(image, other) for other in images[index + 1 :])
     with pytest.raises(MitsonarError, match="mud"):
         load_scene("pattern", texture="mud")
+
+
+def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mitsonar.framestore import FrameStore
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (3, 1)), np.arange(3.0))
+    outputs = Outputs(NOISE_MODELS["none"])
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(FrameStore, "pack", killed)
+        run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={})
+    assert not json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
+    run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={}, resume=True)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
+    assert len(SonarFrames.load(tmp_path / "run")) == 3
+
+
+def test_echoes_are_not_replaced_by_what_is_made_of_them(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert mitsonar("render", scene, "-o", out, "--exr").returncode == 0
+    refused(mitsonar("image", out, "-o", out, "--overwrite"), "echoes", "another folder")
+    refused(mitsonar("image", out, "-o", tmp_path, "--overwrite"), "another folder")
+    assert (out / "echoes" / "000000.exr").is_file()

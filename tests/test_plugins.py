@@ -172,3 +172,11 @@ def test_a_typing_slip_is_an_error(name: str) -> None:
 
     with pytest.raises(RuntimeError, match=r"sead"):
         mi.load_dict({"type": name, "sead": 3})
+
+
+def test_asking_whether_mitsuba_is_there_does_not_lose_the_plugins() -> None:
+    run_python("""
+        import importlib.util, mitsonar
+        assert importlib.util.find_spec("mitsuba") is not None
+        mitsonar.load_scene("flat_floor")
+    """)

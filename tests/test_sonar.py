@@ -118,3 +118,11 @@ def test_replace_checks_again_and_leaves_the_original() -> None:
         sonar.replace(range_min=9.0)
     with pytest.raises(ValidationError):
         sonar.beams = 7  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    "fields", [{"azimuth_fov_deg": 180, "beam_width_deg": 10}, {"azimuth_fov_deg": 60, "beam_width_deg": 200}]
+)
+def test_a_cone_ends_at_ninety_degrees(fields: dict[str, float]) -> None:
+    with pytest.raises(MitsonarError, match="beams end at 90 deg"):
+        Sonar.create(bearing="cone", **fields)

@@ -48,6 +48,10 @@ def answered(command: Callable[P, R]) -> Callable[P, R]:
             typer.echo(f"error: {error.strerror or error}{where}; what is whole on disk stays, --resume goes on", err=True)
         except MemoryError:
             typer.echo("error: out of memory; lower beams, rays_per_beam, rays_across or range_bins of the sonar", err=True)
+        except RuntimeError as error:
+            if "memory" not in str(error):
+                raise
+            typer.echo("error: out of memory; lower --rays-per-launch, or the sonar's beams, rays or bins", err=True)
         except KeyboardInterrupt:
             typer.echo("stopped; whole frames stay on disk, --resume goes on", err=True)
             raise typer.Exit(130) from None

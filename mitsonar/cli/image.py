@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.errors import MitsonarError
 
 __all__ = ["image"]
 
@@ -31,13 +32,15 @@ def image(
     ends = numbers(window, 2, "--range")
     source = StoredEchoes(run_folder, bins=bins, window=(ends[0], ends[1]) if ends else None)
     folder = out or run_folder / "rebinned"
+    if run_folder.resolve().is_relative_to(folder.resolve()):
+        raise MitsonarError(f"-o {folder} would replace the echoes that are read: choose another folder")
     origin = {"echoes_of": str(run_folder), "echoes_recipe": source.about.get("recipe", {})}
     with progress_bar("binning", len(source.trajectory), "pings") as progress:
         report = run(
             source, source.trajectory, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress
         )
-    source.trajectory.save_tum(folder / "poses.tum")
     for sentence in report.warnings:
         warn(sentence)
     say(f"{report.frames} frames of {source.sonar.range_bins} bins in {folder}")
-    say(f"pictures: {report.pictures[0]}")
+    if report.pictures:
+        say(f"pictures: {report.pictures[0]}")

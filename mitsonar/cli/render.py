@@ -54,15 +54,15 @@ def render(
     path = _path(instrument, standing, scene, frames, start, end, trajectory)
     folder = out or Path("out") / find_scene(scene).stem
     simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
-    origin = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
+    origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
-    path.save_tum(folder / "poses.tum")
     for sentence in report.warnings:
         warn(sentence)
-    pictures = f"{report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else "")
     say(f"{report.frames} frames ({instrument.model} model, {instrument.name}) in {folder}")
-    say(f"pictures: {pictures}")
+    if report.pictures:
+        say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
 
 
 def _parameters(pairs: list[str]) -> dict[str, str]:

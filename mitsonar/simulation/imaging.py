@@ -61,14 +61,14 @@ class Simulator:
     Args:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
-        rays_per_launch: bound of a launch's memory: about 30 bytes a ray.
+        rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Raises:
         MitsonarError: no sonar given and none in the scene.
     """
 
     def __init__(self, scene: mi.Scene, sonar: Sonar | None = None, *, rays_per_launch: int = 2**23) -> None:
-        ensure_variant()
+        self.variant = ensure_variant()
         from mitsonar.simulation.scenes import sonar_in
         from mitsonar.simulation.tracing import Tracer
 
@@ -82,7 +82,7 @@ class Simulator:
         self.sonar = sonar
         self.tracer = Tracer(scene, sonar)
         self.notes = self.tracer.notes
-        self.pings_per_launch = max(1, rays_per_launch // sonar.rays)
+        self.pings_per_launch = max(1, rays_per_launch // max(sonar.rays, sonar.beams * sonar.range_bins))
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
 
     def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:

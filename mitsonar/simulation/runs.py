@@ -24,6 +24,7 @@ from mitsonar.noise import NoiseModel
 from mitsonar.plots import save_fan
 from mitsonar.simulation.echoes import Echoes, load_exr, save_exr
 from mitsonar.simulation.imaging import Pings, Tally, constant_gain, to_image
+from mitsonar.simulation.variant import ensure_variant
 from mitsonar.sonar import Sonar
 
 __all__ = ["Outputs", "Report", "Source", "StoredEchoes", "run", "scene_digest"]
@@ -34,6 +35,7 @@ class Source(Protocol):
 
     sonar: Sonar
     notes: list[str]
+    variant: str
 
     def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
         """Levels of consecutive pings, in batches."""
@@ -90,43 +92,56 @@ def run(
         progress: called with the number of frames that were added.
 
     Raises:
-        MitsonarError: the folder exists; nothing to resume; the run to resume was another one.
+        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
     """
     folder = Path(folder)
     recipe = _recipe(source, trajectory, outputs, origin)
     state = _begin(folder, recipe, overwrite=overwrite, resume=resume)
-    done, tally = 0, Tally(source.sonar)
-    store = None
-    if state["frames_done"] > 0 and not state["finished"]:
-        store = FrameStore.open(folder / "frames.zarr")
-        done, tally = int(state["frames_done"]), Tally.restore(source.sonar, state["tally"])
+    trajectory.save_tum(folder / "poses.tum")
     if not state["finished"]:
-        progress(done)
-        batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
-        if done == 0:
-            state["gain"], batches = constant_gain(batches)
-        for pings in batches:
-            frames, image = _frames_of(pings, source.sonar, trajectory, outputs.noise, float(state["gain"]))
-            store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
-            _write_pictures(folder, pings.first, frames, outputs)
-            if outputs.exr:
-                _write_echoes(folder, source, frames, pings.first)
-            store.write(pings.first, frames)
-            tally.add(pings, image)
-            write_json(
-                folder / "run.json",
-                state | {"frames_done": pings.first + len(pings), "tally": tally.state()},
-            )
-            progress(len(pings))
-        assert store is not None
-        state = read_json(folder / "run.json")
+        progress(int(state["frames_done"]))
+        store = _make_frames(source, trajectory, folder, outputs, state, progress)
+        tally = Tally.restore(source.sonar, state["tally"])
         state["warnings"] = [*source.notes, *tally.warnings(source, trajectory.poses)]
+        write_json(folder / "run.json", state)
         if len(trajectory) <= LONGEST_NPZ:
             store.pack(folder / "frames.npz")
         state["finished"] = True
         write_json(folder / "run.json", state)
     pictures = "cartesian" if outputs.cartesian else "images"
     return Report(folder, len(trajectory), sorted((folder / pictures).glob("*.png")), state["warnings"])
+
+
+def _make_frames(
+    source: Source,
+    trajectory: Trajectory,
+    folder: Path,
+    outputs: Outputs,
+    state: dict[str, Any],
+    progress: Callable[[int], None],
+) -> FrameStore:
+    """Write the frames that are missing; ``state`` and run.json follow each batch."""
+    done, tally, store = int(state["frames_done"]), Tally(source.sonar), None
+    if done > 0:
+        store, tally = FrameStore.open(folder / "frames.zarr"), Tally.restore(source.sonar, state["tally"])
+    if store is not None and done == len(trajectory):
+        return store
+    batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
+    if done == 0:
+        state["gain"], batches = constant_gain(batches)
+    for pings in batches:
+        frames, image = _frames_of(pings, source.sonar, trajectory, outputs.noise, float(state["gain"]))
+        store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
+        _write_pictures(folder, pings.first, frames, outputs)
+        if outputs.exr:
+            _write_echoes(folder, source, frames, pings.first)
+        store.write(pings.first, frames)
+        tally.add(pings, image)
+        state |= {"frames_done": pings.first + len(pings), "tally": tally.state()}
+        write_json(folder / "run.json", state)
+        progress(len(pings))
+    assert store is not None
+    return store
 
 
 class StoredEchoes:
@@ -141,6 +156,7 @@ class StoredEchoes:
     """
 
     def __init__(self, folder: str | Path, *, bins: int | None = None, window: tuple[float, float] | None = None) -> None:
+        self.variant = ensure_variant()
         self.folder = Path(folder)
         self.about = read_json(self.folder / "run.json")
         if not (self.folder / "echoes").is_dir():
@@ -158,9 +174,6 @@ class StoredEchoes:
 
     def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
         """Levels of the stored frames, one at a time; ``poses`` only tells how many."""
-        from mitsonar.simulation.variant import ensure_variant
-
-        ensure_variant()
         import drjit as dr
         import mitsuba as mi
 
@@ -195,6 +208,7 @@ def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: di
     """All that decides the bits of a run."""
     return {
         **origin,
+        "variant": source.variant,
         "sonar": source.sonar.model_dump(),
         "frames": len(trajectory),
         "poses_sha256": hashlib.sha256(np.column_stack([trajectory.poses, trajectory.time_s]).tobytes()).hexdigest(),
@@ -220,6 +234,7 @@ def _begin(folder: Path, recipe: dict[str, Any], *, overwrite: bool, resume: boo
         if (folder / "frames.npz").exists():  # killed while the store was packed, or finished
             shutil.rmtree(folder / "frames.zarr", ignore_errors=True)
             state["finished"] = True
+            write_json(folder / "run.json", state)
         return {"finished": False, "frames_done": 0, "warnings": []} | state
     if exists and not overwrite:
         raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o, or --resume, or --overwrite")

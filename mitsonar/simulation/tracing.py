@@ -81,8 +81,9 @@ class Tracer:
     def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[Any, ...]:
         """What a launch reads: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces."""
         matrices = to_world_matrices(poses)[:, :3].astype(np.float32)
-        keys = np.array([self.sensor.key(first_ping + k) for k in range(len(matrices))], np.uint32)
-        return mi.Float(matrices.ravel()), mi.UInt32(keys), self.surfaces.arrays()
+        keys = [self.sensor.key(first_ping + k) for k in range(len(matrices))]
+        # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
+        return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
     def fan(self, rays: Rays, keys: mi.UInt32) -> imaging_sonar.Fan:
         """The rays in the sensor's frame."""

@@ -12,7 +12,7 @@ __all__ = ["VARIANTS", "Backend", "backend", "ensure_variant"]
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
 """The variants that mitsonar works with; monochrome ones need less memory."""
 
-INSTALL = "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (any libllvm from 15 on will do)"
+INSTALL = "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` (or another libllvm from 17 on)"
 
 
 class Backend(NamedTuple):
