@@ -303,9 +303,10 @@ def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
 
     path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (3, 1)), np.arange(3.0))
     outputs = Outputs(NOISE_MODELS["none"])
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(FrameStore, "pack", killed)
-        run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={})
+        with pytest.raises(KeyboardInterrupt):
+            run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={})
     assert not json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
     run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={}, resume=True)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["finished"]

@@ -208,6 +208,8 @@ def test_an_empty_scene_hits_nothing() -> None:
 
 def test_two_faces_have_two_reflectivities(variant: str) -> None:
     """`twosided` with another BSDF on the back: which one counts depends on the side that the ray comes from."""
+    from mitsonar.plugins.surfaces import Surfaces
+
     both = {"type": "twosided", "front": diffuse(0.2), "back": diffuse(0.8)}
     tables = Surfaces.of(loaded := scene(floor=floor(both)))
     ray = mi.Ray3f(mi.Point3f([0.1, 0.1], [0.2, 0.2], [3, -3]), mi.Vector3f([0, 0], [0, 0], [-1, 1]))
