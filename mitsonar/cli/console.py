@@ -108,14 +108,16 @@ class _Log:
 
     def __init__(self, what: str, total: int, unit: str, every_s: float = 10.0) -> None:
         self.what, self.total, self.unit, self.every_s = what, total, unit, every_s
-        self.done, self.begun = 0, time.monotonic()
+        self.done, self.had, self.begun = 0, 0, time.monotonic()
         self.said = self.begun
 
     def __call__(self, done: int) -> None:
-        self.done += done
         now = time.monotonic()
-        if now - self.said >= self.every_s and self.done > 0:
-            rate = self.done / (now - self.begun)
+        if self.done == 0 and now - self.begun < 0.5:  # frames that a resumed run had already
+            self.had = done
+        self.done += done
+        if now - self.said >= self.every_s and self.done > self.had:
+            rate = (self.done - self.had) / (now - self.begun)
             left = (self.total - self.done) / rate
             line = f"{self.what} {self.done}/{self.total}, {rate:.1f} {self.unit}/s, {left:.0f} s left"
             typer.echo(line, err=True)
