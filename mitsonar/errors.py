@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-__all__ = ["MitsonarError", "MitsonarWarning", "nearest_names"]
+if TYPE_CHECKING:
+    from pydantic import BaseModel, ValidationError
+
+__all__ = ["MitsonarError", "MitsonarWarning", "complaint", "nearest_names"]
 
 
 class MitsonarError(ValueError):
@@ -22,3 +26,51 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
     near = [name for name in known if wrong and wrong.lower() in name.lower()]
     near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
     return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"
+
+
+def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
+    """The first of pydantic's complaints as one sentence: what, got, allowed.
+
+    Args:
+        error: what pydantic raised.
+        model: whose fields are the known keys.
+        what: what the keys belong to, in the sentence: ``sonar``.
+        see: where more is said, for the end of the sentence.
+    """
+    first = error.errors()[0]
+    where = [str(part) for part in first["loc"]]
+    key = ".".join(where)
+    if first["type"] == "extra_forbidden":
+        known = _fields_of(model, where[:-1]) or model.model_fields
+        return f"unknown {what} key {key}: {nearest_names(where[-1], known)}"
+    if first["type"] == "missing":
+        return f"{what} lacks {key}{see}"
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
+    message = first["msg"][0].lower() + first["msg"][1:]
+    return f"{what} {key}: {message}, got {first['input']!r}{see}"
+
+
+def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:
+    """The fields of a model nested in another; empty where it cannot be told."""
+    from pydantic import BaseModel
+
+    for name in where:
+        if name.isdigit():  # a place in a list
+            continue
+        field = model.model_fields.get(name)
+        nested = [kind for kind in _kinds(field.annotation if field else None) if issubclass(kind, BaseModel)]
+        if len(nested) != 1:
+            return {}
+        model = nested[0]
+    return dict(model.model_fields)
+
+
+def _kinds(annotation: object) -> list[type]:
+    """The classes in an annotation: ``list[A] | None`` holds A and NoneType."""
+    from typing import get_args
+
+    parts = get_args(annotation)
+    if parts:
+        return [kind for part in parts for kind in _kinds(part)]
+    return [annotation] if isinstance(annotation, type) else []

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Motion", "Pose", "Trajectory", "compose", "pose_from_to_world", "to_world_matrices"]
+__all__ = ["Motion", "Pose", "Trajectory", "compose", "motions", "mounted", "pose_from_to_world", "to_world_matrices"]
 
 # Mitsuba's sensor frame in the vehicle's: local x = port, local y = up, local z = forward (columns)
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -63,6 +63,29 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     x = pose.x + motion.forward * sin + motion.sideways * cos
     y = pose.y + motion.forward * cos - motion.sideways * sin
     return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
+
+
+def motions(poses: ArrayLike) -> NDArray[np.float64]:
+    """What :func:`compose` needs from each pose ``(frames, 6)`` to the next: ``(frames - 1, 3)`` sideways, forward [m], yaw
+    [rad] within -pi..pi (Almanza-Medina, eq. 3.4)."""
+    table = np.atleast_2d(np.asarray(poses, dtype=float))
+    (x, y), heading = np.diff(table[:, :2], axis=0).T, table[1:, 5]
+    sin, cos = np.sin(heading), np.cos(heading)
+    turn = np.diff(table[:, 5])
+    yaw = turn - 2 * np.pi * np.rint(turn / (2 * np.pi))
+    return np.column_stack([x * cos - y * sin, x * sin + y * cos, yaw])
+
+
+def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
+    """Poses ``(frames, 6)`` of a sonar on a vehicle at ``poses``; ``mount`` is the sonar's pose in the vehicle's axes.
+
+    A mount that only pitches keeps position, heading and roll of a level vehicle as they are, to the bit.
+    """
+    table = np.atleast_2d(np.asarray(poses, dtype=float))
+    if not any((*mount[:3], mount.roll, mount.heading)) and not table[:, 3:5].any():
+        return table + np.array([0, 0, 0, mount.pitch, 0, 0])
+    turn = vehicle_rotation(table)
+    return poses_from(table[:, :3] + turn.apply(mount[:3]), turn * vehicle_rotation(mount))
 
 
 def vehicle_rotation(poses: ArrayLike) -> Rotation:

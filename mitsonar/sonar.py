@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, complaint
 
 __all__ = ["Bearing", "Model", "Sonar"]
 
 Model = Literal["physical", "thesis"]
 Bearing = Literal["azimuth", "cone"]
+SEE = " (see `mitsonar presets --help` and docs/sonar.md)"
 
 
 class Sonar(BaseModel):
@@ -93,7 +94,7 @@ class Sonar(BaseModel):
         try:
             return cls(**fields)
         except ValidationError as error:
-            raise MitsonarError(_sentence(error, cls)) from None
+            raise MitsonarError(complaint(error, cls, "sonar", SEE)) from None
 
     def replace(self, **fields: Any) -> Self:
         """This sonar with some fields changed, checked again."""
@@ -148,15 +149,3 @@ class Sonar(BaseModel):
         half = math.radians(self.azimuth_fov_deg) / 2
         axes = place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
         return np.asarray(axes, dtype=np.float64)
-
-
-def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
-    """The first of pydantic's complaints as one sentence: what, got, allowed."""
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown sonar key {key}: {nearest_names(key, model.model_fields)}"
-    if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
-    message = first["msg"][0].lower() + first["msg"][1:]
-    return f"sonar {key}: {message}, got {first['input']!r} (see `mitsonar presets --help` and docs/sonar.md)"

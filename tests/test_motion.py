@@ -9,7 +9,16 @@ import pytest
 from helpers import axes
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import Motion, Pose, Trajectory, compose, pose_from_to_world, to_world_matrices
+from mitsonar.motion import (
+    Motion,
+    Pose,
+    Trajectory,
+    compose,
+    motions,
+    mounted,
+    pose_from_to_world,
+    to_world_matrices,
+)
 
 RIGHT_ANGLE = np.pi / 2
 
@@ -225,3 +234,43 @@ def test_tum_files_that_hold_nothing(tmp_path: Path) -> None:
     (tmp_path / "binary.tum").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(MitsonarError, match="not text"):
         Trajectory.load_tum(tmp_path / "binary.tum")
+
+
+def test_motions_invert_compose() -> None:
+    """To 1e-12, also across the heading's 360 degrees."""
+    rng = np.random.default_rng(4)
+    pose, poses, driven = Pose(3.0, -2.0, 2.5, 0.6, 0.1, np.pi - 0.01), [], []
+    poses.append(pose)
+    for _ in range(60):
+        motion = Motion(*rng.uniform(-0.02, 0.02, 2), rng.uniform(-0.02, 0.05))
+        pose = compose(pose, motion)
+        pose = pose._replace(heading=(pose.heading + np.pi) % (2 * np.pi) - np.pi)
+        poses.append(pose)
+        driven.append(motion)
+    np.testing.assert_allclose(motions(poses), driven, atol=1e-12)
+    assert np.ptp([pose.heading for pose in poses]) > 6
+
+
+def test_a_mount_is_a_pose_in_the_vehicles_axes() -> None:
+    vehicle = Pose(1.0, 2.0, 3.0, 0, 0, np.radians(30))
+    ahead = mounted(vehicle, Pose(0, 0.5, 0, np.radians(35)))[0]
+    starboard, forward, _ = axes(vehicle)
+    np.testing.assert_allclose(ahead[:3], np.array(vehicle[:3]) + 0.5 * forward, atol=1e-12)
+    np.testing.assert_allclose(ahead[3:], np.radians([35, 0, 30]), atol=1e-12)
+    sideways = Pose(*mounted(vehicle, Pose(0, 0, 0, np.radians(35), 0, RIGHT_ANGLE))[0])
+    np.testing.assert_allclose(np.degrees([sideways.pitch, sideways.heading]), [35, 120], atol=1e-9)
+    np.testing.assert_allclose(axes(sideways)[1] @ starboard, np.cos(np.radians(35)), atol=1e-12)
+    # straight down with its azimuth fore-aft: bearing grows forward, elevation to port (SPEC.md, section 2)
+    down = Pose(*mounted(vehicle, Pose(0, 0, 0, RIGHT_ANGLE, 0, -RIGHT_ANGLE))[0])
+    got = sensor_axes(down)
+    np.testing.assert_allclose(got[0], forward, atol=1e-9)
+    np.testing.assert_allclose(got[1], [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(got[2], -starboard, atol=1e-9)
+
+
+def test_a_pitched_mount_keeps_the_rest_to_the_bit() -> None:
+    table = random_poses(20)
+    table[:, 3:5] = 0
+    got = mounted(table, Pose(0, 0, 0, 0.61))
+    np.testing.assert_array_equal(got[:, [0, 1, 2, 4, 5]], table[:, [0, 1, 2, 4, 5]])
+    np.testing.assert_array_equal(got[:, 3], 0.61)

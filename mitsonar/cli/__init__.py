@@ -9,7 +9,7 @@ def main() -> None:
     """``mitsonar`` and ``python -m mitsonar``."""
     import typer
 
-    from mitsonar.cli import doctor, image, presets, render
+    from mitsonar.cli import doctor, image, presets, render, world
 
     app = typer.Typer(
         name="mitsonar",
@@ -24,4 +24,5 @@ def main() -> None:
     app.command()(presets.presets)
     app.command()(presets.scenes)
     app.command()(doctor.doctor)
+    app.add_typer(world.worlds(), name="world")
     app()

@@ -1,0 +1,1 @@
+"""Worlds: a seed becomes a Mitsuba scene and its meshes on disk."""

@@ -1,0 +1,38 @@
+"""The kinds of world by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ValidationError
+
+from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.simulation.worlds.flat_objects import FlatObjects
+from mitsonar.simulation.worlds.pattern import Pattern
+from mitsonar.simulation.worlds.rocky_field import RockyField
+from mitsonar.simulation.worlds.ship_hull import ShipHull
+from mitsonar.simulation.worlds.world import Family
+
+__all__ = ["FAMILIES", "create_family"]
+
+FAMILIES: dict[str, type[Family]] = {
+    "rocky-field": RockyField,
+    "ship-hull": ShipHull,
+    "pattern": Pattern,
+    "flat-objects": FlatObjects,
+}
+
+
+def create_family(name: str, **fields: Any) -> Family:
+    """The family of that name with these numbers; the others are the thesis's.
+
+    Raises:
+        MitsonarError: unknown name or key, or a number outside its limits.
+    """
+    if name not in FAMILIES:
+        raise MitsonarError(f"unknown world {name!r}: {nearest_names(name, FAMILIES)}")
+    family = FAMILIES[name]
+    try:
+        return family(**fields)
+    except ValidationError as error:
+        raise MitsonarError(complaint(error, family, name, f" (see `mitsonar world {name} --help`)")) from None

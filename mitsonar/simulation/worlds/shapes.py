@@ -1,0 +1,71 @@
+"""Shapes of one unit in each direction, and many copies of one as a single mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+__all__ = ["Copies", "box", "capsule", "cylinder", "place", "slab"]
+
+GRID_M = 1e-6
+"""Vertices lie on a grid of a micrometre: the last bits of a library's sine do not reach the file."""
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Copies of one shape.
+
+    Attributes:
+        vertices: ``(vertices, 3)`` [m].
+        faces: ``(faces, 3)``.
+        number: which copy each face belongs to ``(faces,)``.
+        count: how many copies.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    number: NDArray[np.int64]
+    count: int
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """The middle of each face ``(faces, 3)`` [m]."""
+        return np.asarray(self.vertices[self.faces].mean(axis=1))
+
+
+def box() -> trimesh.Trimesh:
+    """A cube, four triangles along each edge: 48."""
+    return trimesh.creation.box().subdivide()
+
+
+def slab() -> trimesh.Trimesh:
+    """A cube of 12 triangles."""
+    return trimesh.creation.box()
+
+
+def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
+    """A cylinder along z, its side cut into ``rings``."""
+    side = [(0.5, z) for z in np.linspace(-0.5, 0.5, rings + 1)]
+    return trimesh.creation.revolve([(0, -0.5), *side, (0, 0.5)], sections=sections)
+
+
+def capsule(sections: int = 12) -> trimesh.Trimesh:
+    """A capsule along z, twice as long as wide before it is squeezed to one unit: half spheres of two bands."""
+    turn = np.radians([-90, -45, 0])
+    low = np.column_stack([0.5 * np.cos(turn), (0.5 * np.sin(turn) - 0.5) / 2])
+    low[0, 0] = 0  # the pole lies on the axis
+    return trimesh.creation.revolve([*low, *(low[::-1] * (1, -1))], sections=sections)
+
+
+def place(shape: trimesh.Trimesh, size: ArrayLike, turn: Rotation, centre: ArrayLike) -> Copies:
+    """Copies of a unit shape: scaled to ``size`` ``(n, 3)`` [m], turned, moved to ``centre`` ``(n, 3)`` [m]."""
+    size, centre = np.asarray(size, dtype=float), np.asarray(centre, dtype=float)
+    count, each = len(size), len(shape.vertices)
+    placed = (np.asarray(shape.vertices) * size[:, None]) @ turn.as_matrix().transpose(0, 2, 1) + centre[:, None]
+    faces = np.asarray(shape.faces) + (np.arange(count) * each)[:, None, None]
+    vertices = np.rint(placed.reshape(-1, 3) / GRID_M) * GRID_M
+    return Copies(vertices, faces.reshape(-1, 3), np.repeat(np.arange(count), len(shape.faces)), count)

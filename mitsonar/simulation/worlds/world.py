@@ -1,0 +1,270 @@
+"""A world in memory, and as files: a Mitsuba XML scene with its meshes (PLY) and textures."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+from mitsonar.errors import MitsonarError
+
+__all__ = ["Counts", "Family", "Floor", "Interval", "Mesh", "Standpoint", "World", "draw", "shifted_grid", "stream", "whole"]
+
+
+def _rising(pair: tuple[float, float]) -> tuple[float, float]:
+    if not (np.isfinite(pair).all() and pair[0] <= pair[1]):
+        raise ValueError(f"an interval is two finite numbers low,high with low <= high: got {pair[0]:g},{pair[1]:g}")
+    return pair
+
+
+Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
+"""From low to high, both finite."""
+
+
+def _counting(pair: tuple[int, int]) -> tuple[int, int]:
+    if not 0 <= pair[0] <= pair[1] <= 10**6:
+        raise ValueError(f"a number to draw is low,high with 0 <= low <= high <= 1000000: got {pair[0]},{pair[1]}")
+    return pair
+
+
+Counts = Annotated[tuple[int, int], AfterValidator(_counting)]
+"""From low to high, both drawn too."""
+
+
+class Family(BaseModel):
+    """A kind of world: what may be chosen, and :meth:`build`, which makes one from a seed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: ClassVar[str]
+
+    @property
+    def half_m(self) -> float:
+        """Half the edge of the square, around the origin, that the world fills [m]."""
+        raise NotImplementedError
+
+    def build(self, seed: int) -> World:
+        """The world of a seed; the same bytes for the same seed."""
+        raise NotImplementedError
+
+
+def stream(seed: int, *purpose: int) -> np.random.Generator:
+    """Random numbers that belong to a seed and a purpose, whoever draws them."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *purpose])))
+
+
+def draw(rng: np.random.Generator, span: tuple[float, float], *shape: int) -> NDArray[np.float64]:
+    """Uniform numbers of an interval; only the generator's plain doubles are used, whose bits do not change."""
+    low, high = span
+    return np.asarray(low + (high - low) * rng.random(shape), dtype=np.float64)
+
+
+def whole(rng: np.random.Generator, span: tuple[int, int], *shape: int) -> Any:
+    """Whole numbers of a closed interval; one without a shape."""
+    values = span[0] + np.floor(rng.random(shape) * (span[1] + 1 - span[0])).astype(int)
+    return values if shape else int(values)
+
+
+def shifted_grid(half_m: float, a_side: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Vertices of a square grid over the field, each moved within its grid step (Almanza-Medina, 3.2.1) ``(a_side^2, 2)``
+    [m]."""
+    step = 2 * half_m / a_side
+    vertex = np.stack(np.meshgrid(*[np.arange(a_side)] * 2, indexing="ij"), -1).reshape(-1, 2) * step - half_m
+    return np.asarray(vertex + step * rng.random((a_side**2, 2)), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """One mesh of a world.
+
+    Attributes:
+        name: of the shape and its file.
+        vertices: ``(vertices, 3)`` [m].
+        faces: ``(faces, 3)``.
+        reflectivity: of each face ``(faces,)`` 0..1, where no texture gives it.
+        object_id: of each face ``(faces,)``, 1 and more; one number an object.
+        uv: of each vertex ``(vertices, 2)``, with a texture.
+        texture: file of a picture, within the world's folder, that gives the reflectivity.
+    """
+
+    name: str
+    vertices: NDArray[np.floating]
+    faces: NDArray[np.integer]
+    reflectivity: NDArray[np.floating] | None = None
+    object_id: NDArray[np.integer] | None = None
+    uv: NDArray[np.floating] | None = None
+    texture: str | None = None
+
+    def ply(self) -> bytes:
+        """The mesh as binary PLY, attributes by the names that Mitsuba reads."""
+        vertex = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
+        if self.uv is not None:
+            vertex |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
+        face = {}
+        if self.reflectivity is not None:
+            face["reflectivity_0"] = self.reflectivity
+        if self.object_id is not None:
+            face["id_0"] = self.object_id
+        head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.vertices)}"]
+        head += [f"property float {name}" for name in vertex]
+        head += [f"element face {len(self.faces)}", "property list uchar int vertex_indices"]
+        head += [f"property float {name}" for name in face]
+        points = np.empty(len(self.vertices), [(name, "<f4") for name in vertex])
+        for name, values in vertex.items():
+            points[name] = values
+        corners = np.empty(len(self.faces), [("count", "u1"), ("corners", "<i4", 3), *((name, "<f4") for name in face)])
+        corners["count"], corners["corners"] = 3, self.faces
+        for name, values in face.items():
+            corners[name] = values
+        return "\n".join([*head, "end_header", ""]).encode() + points.tobytes() + corners.tobytes()
+
+    def xml(self) -> str:
+        """The shape."""
+        if self.texture is not None:
+            reflectance = (
+                f'<texture type="bitmap" name="reflectance"><string name="filename" value={quoteattr(self.texture)}/>'
+                '<boolean name="raw" value="true"/></texture>'
+            )
+        else:
+            reflectance = (
+                '<texture type="mesh_attribute" name="reflectance"><string name="name" value="face_reflectivity"/></texture>'
+            )
+        return f"""
+    <shape type="ply" id="{self.name}">
+        <string name="filename" value="meshes/{self.name}.ply"/>
+        <boolean name="face_normals" value="true"/>
+        <bsdf type="diffuse">
+            {reflectance}
+        </bsdf>
+    </shape>"""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A square plane around the origin; ``texture`` is the XML of what gives its reflectivity."""
+
+    half_m: float
+    texture: str
+    z_m: float = 0.0
+    name: str = "seabed"
+
+    @staticmethod
+    def cells(count: int, span: tuple[float, float], seed: int) -> str:
+        """Independent cells, ``count`` along each edge, uniform within ``span``."""
+        return f"""<texture type="cell_noise" name="reflectance">
+                <float name="cells" value="{count}"/>
+                <float name="low" value="{span[0]!r}"/>
+                <float name="high" value="{span[1]!r}"/>
+                <integer name="seed" value="{seed}"/>
+            </texture>"""
+
+    def xml(self) -> str:
+        """The shape."""
+        return f"""
+    <shape type="rectangle" id="{self.name}">
+        <transform name="to_world">
+            <scale value="{self.half_m!r}"/>
+            <translate z="{self.z_m!r}"/>
+        </transform>
+        <bsdf type="diffuse">
+            {self.texture}
+        </bsdf>
+    </shape>"""
+
+
+@dataclass(frozen=True)
+class Standpoint:
+    """A sonar that stands in the world: window, origin and the point that its axis meets [m]."""
+
+    origin: tuple[float, float, float]
+    target: tuple[float, float, float]
+    window: tuple[float, float] = (3.2, 5.6)
+    preset: str = "didson300"
+
+    def xml(self) -> str:
+        """The sensor."""
+        return f"""
+    <sensor type="imaging_sonar">
+        <string name="preset" value="{self.preset}"/>
+        <float name="range_min" value="{self.window[0]:g}"/>
+        <float name="range_max" value="{self.window[1]:g}"/>
+        <transform name="to_world">
+            <lookat origin="{_numbers(self.origin)}" target="{_numbers(self.target)}" up="0, 0, 1"/>
+        </transform>
+    </sensor>"""
+
+
+@dataclass(frozen=True)
+class World:
+    """Meshes, a floor and a sonar to begin with.
+
+    Attributes:
+        about: what made it, for the file's head.
+        meshes: of the world.
+        stand: where a sonar stands.
+        floor: under them, if any.
+        pictures: files to copy into the world's folder, by their name there.
+        content: files to write into the world's folder, by their name there.
+    """
+
+    about: str
+    meshes: list[Mesh]
+    stand: Standpoint
+    floor: Floor | None = None
+    pictures: dict[str, Path] = field(default_factory=dict)
+    content: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def faces(self) -> int:
+        """Triangles of all meshes."""
+        return sum(len(mesh.faces) for mesh in self.meshes)
+
+    def xml(self) -> str:
+        """The Mitsuba scene."""
+        shapes: Iterable[Floor | Mesh] = [*([self.floor] if self.floor else []), *self.meshes]
+        about = escape(self.about).replace("--", "- -")
+        return f"""<?xml version="1.0" encoding="utf-8"?>
+<!-- {about} -->
+<scene version="3.0.0">
+    <integrator type="echo"/>
+{self.stand.xml()}
+{"".join(shape.xml() for shape in shapes)}
+</scene>
+"""
+
+    def write(self, folder: str | Path) -> Path:
+        """Write ``scene.xml``, ``meshes/`` and ``textures/``, the scene last; returns its path.
+
+        Raises:
+            MitsonarError: the folder holds something.
+        """
+        folder = Path(folder)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o")
+        part = folder.with_name(f".{folder.name}.part")  # whole or absent, as a folder too
+        shutil.rmtree(part, ignore_errors=True)
+        for below in ("meshes", "textures"):
+            (part / below).mkdir(parents=True)
+        for mesh in self.meshes:
+            (part / "meshes" / f"{mesh.name}.ply").write_bytes(mesh.ply())
+        for name, source in self.pictures.items():
+            shutil.copyfile(source, part / name)
+        for name, content in self.content.items():
+            (part / name).write_bytes(content)
+        (part / "scene.xml").write_text(self.xml(), encoding="utf-8")
+        for below in ("meshes", "textures"):
+            if not any((part / below).iterdir()):
+                (part / below).rmdir()
+        part.rename(folder)
+        return folder / "scene.xml"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:.9g}" for value in values)
