@@ -15,7 +15,7 @@ from mitsonar.sonar import Sonar
 
 __all__ = ["LABELS", "SonarFrames", "to_uint8"]
 
-LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "shadow": np.uint8}
+LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
 """Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
 
 PER_FRAME = ("image", "time_s", "poses", "height_m", *LABELS)
@@ -38,6 +38,7 @@ class SonarFrames:
         sonar: the instrument.
         elevation_rad: elevation of the strongest echo of each pixel, like ``image``, float32.
         shape_id: the shape of that echo (its place in the scene), int32.
+        object_id: the object of that echo, as its mesh numbers them (attribute ``face_id``; 0 without it), int32.
         shadow: 0 not in shadow; 1 no echo here, but echoes before and sound or echoes beyond; 2 no echo here and all
             sound of the beam was intercepted before (an object's shadow that nothing ends, or past the lit floor).
     """
@@ -53,6 +54,7 @@ class SonarFrames:
     level_scale: float = 1.0
     elevation_rad: NDArray[np.float32] | None = None
     shape_id: NDArray[np.int32] | None = None
+    object_id: NDArray[np.int32] | None = None
     shadow: NDArray[np.uint8] | None = None
     about: dict[str, Any] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""Where a cell of a sonar image lies: scan conversion from (range, bearing) to metres."""
+"""Where a cell of a sonar image lies: directions of beams, and scan conversion from (range, bearing) to metres."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from mitsonar.errors import MitsonarError
+from mitsonar.sonar import Bearing
 
-__all__ = ["CartesianImage", "to_cartesian"]
+__all__ = ["CartesianImage", "directions", "to_cartesian"]
+
+
+def directions(bearing: Bearing, bearing_rad: ArrayLike, elevation_rad: ArrayLike) -> NDArray[np.float64]:
+    """Unit vectors ``(..., 3)`` as (starboard, forward, up) of the sonar's frame, for both kinds of bearing (docs/sonar.md)."""
+    b, e = np.broadcast_arrays(np.asarray(bearing_rad, dtype=float), np.asarray(elevation_rad, dtype=float))
+    if bearing == "azimuth":
+        return np.stack([np.cos(e) * np.sin(b), np.cos(e) * np.cos(b), np.sin(e)], axis=-1)
+    return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], axis=-1)
 
 
 @dataclass(frozen=True)

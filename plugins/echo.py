@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
-from mitsonar.plugins.imaging_sonar import Fan, carried, is_imaging_sonar
+from mitsonar.plugins.imaging_sonar import Fan, is_imaging_sonar
 from mitsonar.plugins.surfaces import Surfaces
 from mitsonar.simulation.echoes import CHANNELS, Echoes
 
-__all__ = ["GRAZING", "Echo"]
+__all__ = ["GRAZING", "Echo", "steep"]
 
 GRAZING = 0.02
 """Sine of the flattest angle (1.1 deg) at which a cell's tangent plane is followed: beyond it leaves the object."""
+
+
+def steep(toward: Any) -> Any:
+    """The part of a ray along the normal, kept off 0 where the ray grazes (see :data:`GRAZING`)."""
+    return dr.select(dr.abs(toward) > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
 
 
 class Echo(ADIntegrator):
@@ -54,9 +58,8 @@ class Echo(ADIntegrator):
         valid = hit.valid
         toward = dr.dot(hit.n, ray.d)
         cosine = dr.select(dr.abs(toward) < 1, dr.abs(toward), 1)
-        steep = dr.select(cosine > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
         range_m = hit.t + skipped
-        per_radian = -range_m / steep
+        per_radian = -range_m / steep(toward)
         slope = per_radian * dr.dot(hit.n, fan.lift)
         middle = range_m + per_radian * dr.dot(hit.n, fan.side) * fan.aside
         low, high = middle + slope * fan.below, middle + slope * fan.above
@@ -80,6 +83,7 @@ class Echo(ADIntegrator):
             ny=kept(hit.n.y),
             nz=kept(hit.n.z),
             shape_id=dr.select(valid, mi.Float(hit.shape_id), -1),
+            object_id=kept(hit.object_id),
         )
 
     def aov_names(self) -> list[str]:
@@ -100,8 +104,7 @@ class Echo(ADIntegrator):
             time=sensor.shutter_open(), sample1=0.5, sample2=position, sample3=mi.Point2f(0.5)
         )
         if is_imaging_sonar(sensor):
-            fan, lines = sensor.film_fan(position), sensor.lines()
-            self._fan = replace(fan, lift=carried(lines, fan.lift), side=carried(lines, fan.side))
+            self._fan = sensor.film_fan(position).carried(sensor.lines())
         else:
             self._fan = Fan(ray.d, mi.Vector3f(0), mi.Vector3f(0), *(mi.Float(0) for _ in range(5)))
         self._origin = mi.Point3f(sensor.world_transform().translation())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -15,7 +15,7 @@ from mitsonar.plugins.place import ROUNDS
 from mitsonar.presets import sonar_from
 from mitsonar.sonar import Sonar
 
-__all__ = ["Fan", "ImagingSonar", "carried", "is_imaging_sonar"]
+__all__ = ["Fan", "ImagingSonar", "is_imaging_sonar"]
 
 
 @dataclass
@@ -41,6 +41,10 @@ class Fan:
     aside: mi.Float
     solid_angle: mi.Float
     elevation: mi.Float
+
+    def carried(self, lines: list[mi.Vector4f]) -> Fan:
+        """The same rays in the world's axes; ``lines`` are the first three rows of ``to_world``."""
+        return replace(self, **{name: carried(lines, getattr(self, name)) for name in ("d", "lift", "side")})
 
 
 class ImagingSonar(mi.Sensor):

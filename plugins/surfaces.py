@@ -31,13 +31,14 @@ WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
 
 @dataclass
 class Hit:
-    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity`` 0..1, ``shape_id``."""
+    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity`` 0..1, ``shape_id``, ``object_id``."""
 
     valid: Any
     t: Any
     n: Any
     reflectivity: Any
     shape_id: Any
+    object_id: Any
 
 
 @dataclass
@@ -54,6 +55,8 @@ class Surfaces:
         shapes: by registry index, four numbers a shape: first facet (-1: ask Mitsuba), first row in ``corners``, place of
             the shape in ``scene.shapes()``, unused.
         constant: by registry index, reflectivity of a shape that has no diffuse reflectance; negative: ask its BSDF.
+        objects: number of the object that a triangle belongs to (the mesh's attribute ``face_id``, 0 without it), one a
+            triangle; empty but for one 0 where no mesh has it.
         textured: some shape has a reflectivity that varies within a triangle.
         foreign: some shape is not in the tables.
         notes: what a user should know about the scene's BSDFs, a sentence each.
@@ -63,6 +66,7 @@ class Surfaces:
     corners: mi.Float
     shapes: mi.Int32
     constant: mi.Float
+    objects: mi.Float
     textured: bool
     foreign: bool
     notes: list[str]
@@ -76,6 +80,7 @@ class Surfaces:
         constant = [-1.0] * size
         facets: list[mi.Float] = []
         corners: list[mi.Float] = []
+        tabled: list[mi.Mesh] = []
         named: dict[str, list[str]] = {"approximated": [], "without": []}
         facet_count = corner_count = 0
         for number, shape in enumerate(shapes):
@@ -94,6 +99,7 @@ class Surfaces:
                 rows[index][:2] = facet_count, corner_count
                 facets.append(_facet_rows(shape, constant[index], flat))
                 facet_count += shape.face_count()
+                tabled.append(shape)
                 if not flat:
                     corners.append(_corner_rows(shape))
                     corner_count += shape.face_count()
@@ -102,6 +108,7 @@ class Surfaces:
             corners=dr.concat(corners) if corners else dr.zeros(mi.Float, 8),
             shapes=mi.Int32([number for row in rows for number in row]),
             constant=mi.Float(constant),
+            objects=_object_ids(tabled),
             textured=bool(corners),
             foreign=len(facets) < len(shapes),
             notes=_notes(named),
@@ -109,9 +116,9 @@ class Surfaces:
         dr.eval(tables.arrays())
         return tables
 
-    def arrays(self) -> tuple[mi.Float, mi.Float, mi.Int32, mi.Float]:
-        """The tables themselves, the inputs of a launch."""
-        return self.facets, self.corners, self.shapes, self.constant
+    def arrays(self) -> dict[str, Any]:
+        """The tables themselves, the inputs of a launch, by their names."""
+        return {name: getattr(self, name) for name in ("facets", "corners", "shapes", "constant", "objects")}
 
     def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: Any = True) -> Hit:
         """Trace rays to the nearest surface. The arrays are not evaluated: what follows joins the same kernel."""
@@ -140,7 +147,9 @@ class Surfaces:
             top = dr.reinterpret_array(mi.UInt32, found.instance)
             inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
             shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
-        return Hit(valid, found.t, normal, reflectivity, shape_id)
+        numbered = tabled & (dr.width(self.objects) > 1)
+        object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + found.prim_index, numbered)
+        return Hit(valid, found.t, normal, reflectivity, shape_id, object_id)
 
     def _on_facet(self, found: Any, ray: mi.Ray3f, normal: mi.Normal3f, first: mi.UInt32, active: mi.Bool) -> Any:
         """What a texture or BSDF asks of a point: uv, position, triangle, and the side that is seen."""
@@ -168,6 +177,18 @@ def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> mi.Float:
     else:
         own = _unit(_one_number(mesh.bsdf().eval_diffuse_reflectance(si)) if constant < 0 else mi.Float(constant))
     return dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, own))
+
+
+def _object_ids(meshes: list[mi.Mesh]) -> mi.Float:
+    """The attribute ``face_id`` of all triangles, 0 where a mesh has none; one 0 if no mesh has any."""
+    given = [bool(mesh.has_attribute("face_id")[0]) for mesh in meshes]
+    if not any(given):
+        return dr.zeros(mi.Float, 1)
+    parts = []
+    for mesh, has in zip(meshes, given, strict=True):
+        ids = mi.Float(mesh.attribute_buffer("face_id")) if has else dr.zeros(mi.Float, mesh.face_count())
+        parts.append(ids if dr.width(ids) == mesh.face_count() else dr.zeros(mi.Float, mesh.face_count()))
+    return dr.concat(parts)
 
 
 def _corner_rows(mesh: mi.Mesh) -> mi.Float:

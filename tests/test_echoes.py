@@ -34,7 +34,7 @@ def table() -> dict[str, np.ndarray]:
 def test_channels_are_the_fields() -> None:
     assert (
         *("hit", "range_m", "near_m", "far_m", "reflectivity", "cosine", "solid_angle_sr"),
-        *("x", "y", "z", "nx", "ny", "nz", "shape_id"),
+        *("x", "y", "z", "nx", "ny", "nz", "shape_id", "object_id"),
     ) == CHANNELS
 
 

@@ -31,6 +31,7 @@ def frames(**changed: Any) -> SonarFrames:
         "level_scale": 0.37,
         "elevation_rad": np.where(rng.random(SHAPE) < 0.5, np.nan, 0.1).astype(np.float32),
         "shape_id": rng.integers(-1, 5, SHAPE, dtype=np.int32),
+        "object_id": rng.integers(-1, 500, SHAPE, dtype=np.int32),
         "shadow": rng.integers(0, 3, SHAPE, dtype=np.uint8),
         "about": {"scene": "flat", "gain": 2.5},
     }

@@ -11,7 +11,6 @@ with the other sign; one running sum over the bins then gives the image.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -20,14 +19,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.simulation.acoustics import largest_level, level
+from mitsonar.simulation.acoustics import level
 from mitsonar.simulation.echoes import Echoes
+from mitsonar.simulation.views import NARROWEST, Seen, View
 from mitsonar.sonar import Sonar
 
-__all__ = ["Counts", "accumulate", "develop", "fetch", "fraction_bits", "strongest"]
-
-NARROWEST = 2.0**-6
-"""Shortest footprint [bins]: a surface seen straight on has none, and a density needs one."""
+__all__ = ["Counts", "accumulate", "develop", "fetch", "strongest"]
 
 ADD = dr.ReduceMode.Local
 """How additions meet: Dr.Jit's own choice counts on the number of threads staying the same until a launch is replayed."""
@@ -38,7 +35,10 @@ COUNTERS = 3
 
 @dataclass
 class Counts:
-    """What became of the rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed."""
+    """What became of the rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed.
+
+    Where it differs from ping to ping which rays a beam has (``View.rays_a_beam`` is None), ``inside`` is -1.
+    """
 
     inside: NDArray[np.int64]
     nearer: NDArray[np.int64]
@@ -46,40 +46,34 @@ class Counts:
     missed: NDArray[np.int64]
 
 
-def fraction_bits(sonar: Sonar) -> int:
-    """Bits below one of the fixed-point sums: all rays of a beam, each as strong as can be, stay below 2^62."""
-    cell = sonar.beam_width_rad / sonar.across * math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
-    largest = largest_level(sonar, cell) * sonar.across * sonar.rays_per_beam
-    return 62 - math.ceil(math.log2(largest if sonar.model == "thesis" else largest / NARROWEST))
-
-
 def stride(sonar: Sonar) -> int:
     """Cells of the sums a beam: bins, the one past the last, counters."""
     return sonar.range_bins + 1 + COUNTERS
 
 
-def accumulate(echoes: Echoes, line: mi.UInt32, lines: int, sonar: Sonar) -> mi.UInt64:
-    """Sums ``(lines, stride)``, flat; a line is one beam of one ping. Joins the kernel that makes the echoes.
+def accumulate(seen: Seen, ping: mi.UInt32, pings: int, view: View) -> mi.UInt64:
+    """Sums ``(pings, beams, stride)``, flat. Joins the kernel that makes the echoes.
 
     Args:
-        echoes: Dr.Jit arrays, one value a ray.
-        line: which line a ray belongs to.
-        lines: how many lines there are.
-        sonar: the instrument.
+        seen: Dr.Jit arrays, one value a ray.
+        ping: which ping of the launch a ray belongs to.
+        pings: how many there are.
+        view: whose image it is.
     """
-    exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
+    sonar, active, beams = view.sonar, seen.active, len(view.bearing_rad)
+    exact = _exact(seen.echoes)
     hit = exact.hit > 0
-    sums = dr.zeros(mi.UInt64, lines * stride(sonar))
-    start = line * stride(sonar)
-    value = level(exact, sonar, dr.select) * 2.0 ** fraction_bits(sonar)
+    sums = dr.zeros(mi.UInt64, pings * beams * stride(sonar))
+    start = (ping * beams + seen.beam) * stride(sonar)
+    value = level(exact, sonar, dr.select) * 2.0**view.bits
     if sonar.model == "thesis":
         place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
-        inside = hit & (place >= 0) & (place < sonar.range_bins)
+        inside = active & hit & (place >= 0) & (place < sonar.range_bins)
         cell = dr.select(inside, _whole(place), _counter(hit, place < 0, sonar))
-        dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.select(inside, mi.UInt64(value), 1), start + cell, mode=ADD)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, dr.select(inside, mi.UInt64(value), 1), start + cell, active, mode=ADD)
         return sums
     a, b, width = footprint(exact, sonar)
-    inside = hit & (b > 0) & (a < sonar.range_bins)
+    inside = active & hit & (b > 0) & (a < sonar.range_bins)
     a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
     first, last = _whole(a), _whole(b)
     density = value / width
@@ -88,9 +82,8 @@ def accumulate(echoes: Echoes, line: mi.UInt32, lines: int, sonar: Sonar) -> mi.
     # additions to one cell are joined: a footprint within a bin takes two, across one border three
     same, apart = inside & (last == first), inside & (last > first + 1)
     second = dr.select(same, late - left, dr.select(apart, late, late + left - whole))
-    dr.scatter_reduce(
-        dr.ReduceOp.Add, sums, dr.select(inside, dr.select(same, left, whole) - late, 1), start + cell, mode=ADD
-    )
+    begin = dr.select(inside, dr.select(same, left, whole) - late, 1)
+    dr.scatter_reduce(dr.ReduceOp.Add, sums, begin, start + cell, active, mode=ADD)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, second, start + first + 1, inside, mode=ADD)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, left - whole, start + last, apart, mode=ADD)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.UInt64(0) - left, start + last + 1, inside & ~same & (left > 0), mode=ADD)
@@ -108,29 +101,33 @@ def footprint(exact: Echoes, sonar: Sonar) -> tuple[Any, Any, Any]:
     return a, b, b - a
 
 
-def develop(sums: mi.UInt64, pings: int, sonar: Sonar) -> tuple[mi.Float, mi.UInt64]:
+def develop(sums: mi.UInt64, pings: int, view: View) -> tuple[mi.Float, mi.UInt64]:
     """Levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat, from the sums."""
-    size, lines = stride(sonar), pings * sonar.beams
-    total = sums if sonar.model == "thesis" else dr.block_prefix_sum(sums, size, exclusive=False)
+    size, lines = stride(view.sonar), pings * len(view.bearing_rad)
+    total = sums if view.sonar.model == "thesis" else dr.block_prefix_sum(sums, size, exclusive=False)
     index = dr.arange(mi.UInt32, lines * COUNTERS)
-    counters = dr.gather(mi.UInt64, sums, index % lines * size + (sonar.range_bins + 1) + index // lines)
-    return mi.Float(mi.Float64(total) * 2.0 ** -fraction_bits(sonar)), counters
+    counters = dr.gather(mi.UInt64, sums, index % lines * size + (view.sonar.range_bins + 1) + index // lines)
+    return mi.Float(mi.Float64(total) * 2.0**-view.bits), counters
 
 
-def fetch(image: mi.Float, counters: mi.UInt64, pings: int, sonar: Sonar) -> tuple[NDArray[np.float32], Counts]:
+def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple[NDArray[np.float32], Counts]:
     """Levels ``(pings, bins, beams)``, a view of beam-major memory, and counts, from what :func:`develop` gave.
 
     Turning the image round on the device takes ten times as long as converting it (scattered reads).
     """
-    levels = np.array(image, copy=False).reshape(pings, sonar.beams, stride(sonar))[:, :, : sonar.range_bins]
-    near, far, miss = np.array(counters).astype(np.int64).reshape(COUNTERS, pings, sonar.beams)
-    return levels.transpose(0, 2, 1), Counts(sonar.rays // sonar.beams - near - far - miss, near, far, miss)
+    beams = len(view.bearing_rad)
+    levels = np.array(image, copy=False).reshape(pings, beams, stride(view.sonar))[:, :, : view.sonar.range_bins]
+    near, far, miss = np.array(counters).astype(np.int64).reshape(COUNTERS, pings, beams)
+    inside = np.full_like(miss, -1) if view.rays_a_beam is None else view.rays_a_beam - near - far - miss
+    return levels.transpose(0, 2, 1), Counts(inside, near, far, miss)
 
 
-def strongest(echoes: Echoes, line: mi.UInt32, ray: mi.UInt32, lines: int, sonar: Sonar) -> mi.UInt64:
-    """For each cell ``(lines, bins)`` the strongest ray that reaches it: density in the high 32 bits, ray in the low."""
-    exact = Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
-    best = dr.zeros(mi.UInt64, lines * sonar.range_bins)
+def strongest(seen: Seen, ping: mi.UInt32, ray: mi.UInt32, pings: int, view: View) -> mi.UInt64:
+    """For each cell ``(pings, beams, bins)`` the strongest ray that reaches it: density in the high 32 bits, the ray's
+    number in its ping in the low."""
+    sonar, beams = view.sonar, len(view.bearing_rad)
+    exact = _exact(seen.echoes)
+    best = dr.zeros(mi.UInt64, pings * beams * sonar.range_bins)
     value = level(exact, sonar, dr.select)
     if sonar.model == "thesis":
         place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
@@ -138,12 +135,12 @@ def strongest(echoes: Echoes, line: mi.UInt32, ray: mi.UInt32, lines: int, sonar
     else:
         a, b, width = footprint(exact, sonar)
         value = value / width
-    inside = (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
+    inside = seen.active & (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
     a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
     strength: Any = dr.reinterpret_array(mi.UInt32, mi.Float(value))
     # a level below float32's smallest still beats an empty cell
     key = (mi.UInt64(dr.select(strength > 0, strength, 1)) << 32) | mi.UInt64(ray)
-    start, bin_, end = line * sonar.range_bins, _whole(a), _whole(dr.ceil(b))
+    start, bin_, end = (ping * beams + seen.beam) * sonar.range_bins, _whole(a), _whole(dr.ceil(b))
 
     def step(bin_: mi.UInt32) -> tuple[mi.UInt32]:
         dr.scatter_reduce(dr.ReduceOp.Max, best, key, start + bin_, inside & (bin_ < end))
@@ -151,6 +148,11 @@ def strongest(echoes: Echoes, line: mi.UInt32, ray: mi.UInt32, lines: int, sonar
 
     dr.while_loop((bin_,), lambda bin_: inside & (bin_ < end), step)
     return best
+
+
+def _exact(echoes: Echoes) -> Echoes:
+    """In double precision, as NumPy computes it."""
+    return Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
 
 
 def _counter(hit: mi.Bool, near: mi.Bool, sonar: Sonar) -> mi.UInt32:

@@ -30,6 +30,7 @@ class Echoes:
         x, y, z: point hit in the world [m].
         nx, ny, nz: geometric normal there.
         shape_id: place of the shape in the scene.
+        object_id: number of the object within its mesh (the mesh's attribute ``face_id``), 0 where it has none.
     """
 
     hit: Any
@@ -46,6 +47,7 @@ class Echoes:
     ny: Any
     nz: Any
     shape_id: Any
+    object_id: Any
 
     def outside(self, sonar: Sonar) -> tuple[float, float] | None:
         """Nearest and farthest return outside the sonar's window [m]; None where all lie inside. NumPy arrays only."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.simulation.binning import Counts
+    from mitsonar.simulation.views import View
 
 __all__ = ["Pings", "Simulator", "Tally", "constant_gain"]
 
@@ -40,15 +41,15 @@ class Pings:
     Attributes:
         first: number of the first.
         levels: ``(pings, bins, beams)`` float32, before gain.
-        height_m: ``(pings,)``.
         counts: what became of the rays.
-        labels: ``elevation_rad``, ``shape_id``, ``shadow``, like ``levels``, where asked for.
+        height_m: ``(pings,)``.
+        labels: ``elevation_rad``, ``shape_id``, ``object_id``, ``shadow``, like ``levels``, where asked for.
     """
 
     first: int
     levels: NDArray[np.float32]
-    height_m: NDArray[np.float64]
     counts: Counts
+    height_m: NDArray[np.float64]
     labels: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -61,16 +62,25 @@ class Simulator:
     Args:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
+        views: makes the images of a ping from its echoes; default: one, of all of them.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Raises:
         MitsonarError: no sonar given and none in the scene.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar | None = None, *, rays_per_launch: int = 2**23) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: Sonar | None = None,
+        *,
+        views: Sequence[View] | None = None,
+        rays_per_launch: int = 2**23,
+    ) -> None:
         self.variant = ensure_variant()
         from mitsonar.simulation.scenes import sonar_in
         from mitsonar.simulation.tracing import Tracer
+        from mitsonar.simulation.views import Whole
 
         if sonar is None:
             found = sonar_in(scene)
@@ -82,14 +92,23 @@ class Simulator:
         self.sonar = sonar
         self.tracer = Tracer(scene, sonar)
         self.notes = self.tracer.notes
-        self.pings_per_launch = max(1, rays_per_launch // max(sonar.rays, sonar.beams * sonar.range_bins))
+        self.views: Sequence[View] = [Whole(sonar)] if views is None else views
+        cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
+        self.pings_per_launch = max(1, rays_per_launch // max(sonar.rays, cells))
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
 
     def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
-        """Levels of consecutive pings, in batches; ping ``first + k`` draws its own jitter whatever the batches are.
+        """Levels of consecutive pings in the first view; see :meth:`looks`."""
+        for looks in self.looks(poses, first=first, labels=labels):
+            yield looks[0]
+
+    def looks(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[list[Pings]]:
+        """Levels of consecutive pings, in batches, one of each view.
+
+        Ping ``first + k`` draws its own jitter whatever the batches are.
 
         Args:
-            poses: ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad].
+            poses: of the sonar ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad].
             first: number of the first ping.
             labels: per-pixel truth as well.
         """
@@ -99,20 +118,24 @@ class Simulator:
         for start in range(0, len(table), self.pings_per_launch):
             yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
 
-    def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> Pings:
+    def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[Pings]:
         from mitsonar.simulation import binning
 
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._compile(*key)
         inputs = self.tracer.inputs(poses, first)
+        tables = [view.tables(poses) for view in self.views]
         with _garbage_stays():
-            image, counters, height, truth = self._launches[key](self.tracer.scene, *inputs)
-        levels, counts = binning.fetch(image, counters, len(poses), self.sonar)
-        pings = Pings(first, levels, np.array(height, dtype=float), counts)
-        if labels:
-            pings.labels = labels_of(pings, truth, self.sonar)
-        return pings
+            height, made = self._launches[key](self.tracer.scene, *inputs, tables)
+        height_m = np.array(height, dtype=float)
+        looks = []
+        for view, (image, counters, truth) in zip(self.views, made, strict=True):
+            pings = Pings(first, *binning.fetch(image, counters, len(poses), view), height_m)
+            if labels:
+                pings.labels = labels_of(pings, truth, self.sonar.rays)
+            looks.append(pings)
+        return looks
 
     def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
         """The fused launch, traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python."""
@@ -124,16 +147,29 @@ class Simulator:
         tracer, sonar = self.tracer, self.sonar
 
         @dr.freeze
-        def launch(index: Any, scene: Any, rows: Any, keys: Any, tables: Any) -> Any:
+        def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any) -> Any:
             rays = Rays(sonar, index)
-            echoes = tracer.echoes(rays, scene, rows, keys, tables)
-            lines = pings * sonar.beams
-            sums = accumulate(echoes, rays.line, lines, sonar)
-            frame = *develop(sums, pings, sonar), tracer.height_m(scene, rows)
-            if not labels:
-                return *frame, None
-            best = strongest(echoes, rays.line, rays.ray, lines, sonar)
-            return *frame, (best, tracer.fan(rays, keys).elevation, echoes.shape_id)
+            ray, fan = tracer.rays_of(rays, rows, keys)
+            echoes = tracer.echoes(scene, ray, fan, surfaces)
+            looks = [view.see(scene, rays, fan, echoes, own) for view, own in zip(self.views, tables, strict=True)]
+            sums = [accumulate(seen, rays.ping, pings, view) for seen, view in zip(looks, self.views, strict=True)]
+            truths: list[Any] = [None] * len(looks)
+            if labels:
+                truths = [
+                    (
+                        strongest(seen, rays.ping, rays.ray, pings, view),
+                        seen.elevation,
+                        seen.echoes.shape_id,
+                        seen.echoes.object_id,
+                    )
+                    for seen, view in zip(looks, self.views, strict=True)
+                ]
+            dr.eval(sums, truths)  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
+            made = [
+                (*develop(total, pings, view), truth)
+                for total, view, truth in zip(sums, self.views, truths, strict=True)
+            ]
+            return tracer.height_m(scene, rows), made
 
         return partial(launch, Rays.numbered(sonar, pings))
 
@@ -229,17 +265,21 @@ def to_image(pings: Pings, gain: float) -> NDArray[np.float32]:
     return np.clip(pings.levels * np.float32(gain), 0, 1)
 
 
-def labels_of(pings: Pings, truth: Any, sonar: Sonar) -> dict[str, NDArray[Any]]:
-    """Label maps of a batch (see :class:`mitsonar.frames.SonarFrames`), from the strongest ray of each cell."""
-    best, elevation, shape_id = truth
-    shape = (len(pings), sonar.beams, sonar.range_bins)
-    winner = np.array(best).reshape(shape).transpose(0, 2, 1)
+def labels_of(pings: Pings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
+    """Label maps of a batch (see :class:`mitsonar.frames.SonarFrames`), from the strongest ray of each cell.
+
+    ``rays`` is how many a ping has.
+    """
+    best, elevation, shape_id, object_id = truth
+    frames, bins, beams = pings.levels.shape
+    winner = np.array(best).reshape(frames, beams, bins).transpose(0, 2, 1)
     filled = (winner > 0) & (pings.levels > 0)
-    ray = (winner & 0xFFFFFFFF).astype(np.int64) + np.arange(len(pings))[:, None, None] * sonar.rays
+    ray = (winner & 0xFFFFFFFF).astype(np.int64) + np.arange(frames)[:, None, None] * rays
     ray = np.where(filled, ray, 0)
     return {
         "elevation_rad": np.where(filled, np.array(elevation)[ray], np.float32(np.nan)),
         "shape_id": np.where(filled, np.array(shape_id)[ray], -1).astype(np.int32),
+        "object_id": np.where(filled, np.array(object_id)[ray], -1).astype(np.int32),
         "shadow": shadow(pings),
     }
 

@@ -178,17 +178,19 @@ class StoredEchoes:
         import mitsuba as mi
 
         from mitsonar.simulation.binning import accumulate, develop, fetch
+        from mitsonar.simulation.views import Seen, Whole
 
         if labels:
             raise MitsonarError("labels need the scene: render with --labels")
+        view = Whole(self.sonar)
         pixel = dr.arange(mi.UInt32, self.traced.rays)
         beam = pixel % self.traced.columns // self.traced.across
         for number in range(first, first + len(np.atleast_2d(poses))):
             stored = self.film_echoes(poses, number)
             echoes = Echoes(**{name: mi.Float(value) for name, value in vars(stored).items()})
-            sums = accumulate(echoes, beam, self.sonar.beams, self.sonar)
-            levels, counts = fetch(*develop(sums, 1, self.sonar), 1, self.sonar)
-            yield Pings(number, levels, self.height_m[number : number + 1], counts)
+            sums = accumulate(Seen(echoes, beam, True, None), mi.UInt32(0), 1, view)
+            levels, counts = fetch(*develop(sums, 1, view), 1, view)
+            yield Pings(number, levels, counts, self.height_m[number : number + 1])
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """The echoes of one frame's EXR."""

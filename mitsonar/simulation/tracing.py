@@ -27,7 +27,7 @@ class Rays:
         ray: number of the ray in its ping.
         column: ray across, ``beam * across + k``.
         row: ray over elevation, 0 the highest.
-        line: ``ping * beams + beam``.
+        beam: the sonar's beam that the ray belongs to.
         film: pixel of the ray on the sensor's film.
 
     Args:
@@ -40,7 +40,7 @@ class Rays:
         self.ping, self.ray = index // sonar.rays, index % sonar.rays
         strip, place = self.ray // (wide * sonar.rays_per_beam), self.ray % (wide * sonar.rays_per_beam)
         self.column, self.row = strip * wide + place % wide, place // wide
-        self.line = self.ping * sonar.beams + self.column // sonar.across
+        self.beam = self.column // sonar.across
         self.film = self.row * sonar.columns + self.column
 
     @staticmethod
@@ -85,24 +85,22 @@ class Tracer:
         # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
         return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
-    def fan(self, rays: Rays, keys: mi.UInt32) -> imaging_sonar.Fan:
-        """The rays in the sensor's frame."""
-        return self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
-
-    def echoes(self, rays: Rays, scene: mi.Scene, rows: mi.Float, keys: mi.UInt32, tables: tuple[Any, ...]) -> Echoes:
-        """Echoes of a launch, not evaluated yet."""
-        known = replace(self.surfaces, **dict(zip(("facets", "corners", "shapes", "constant"), tables, strict=True)))
-        fan = self.fan(rays, keys)
+    def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, imaging_sonar.Fan]:
+        """The rays in the world, and their fan with its directions in world axes."""
+        fan = self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
         lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
-        carried = imaging_sonar.carried
-        ray = mi.Ray3f(mi.Point3f(*(line.w for line in lines)), carried(lines, fan.d))
-        fan = replace(fan, lift=carried(lines, fan.lift), side=carried(lines, fan.side))
-        return echo.Echo.measure(scene, known, ray, fan)
+        fan = fan.carried(lines)
+        return mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d), fan
+
+    def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar.Fan, tables: dict[str, Any]) -> Echoes:
+        """Echoes of :meth:`rays_of`, not evaluated yet."""
+        return echo.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan)
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """One ping's echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
         rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
-        traced = self.echoes(rays, self.scene, *self.inputs(np.reshape(pose, (1, 6)), ping))
+        rows, keys, tables = self.inputs(np.reshape(pose, (1, 6)), ping)
+        traced = self.echoes(self.scene, *self.rays_of(rays, rows, keys), tables)
         values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
         for name, target in values.items():
             dr.scatter(target, getattr(traced, name), rays.film)
