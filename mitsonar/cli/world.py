@@ -81,7 +81,10 @@ def _option(key: str, field: FieldInfo) -> inspect.Parameter:
     places = ",".join("N" * len(get_args(field.annotation))) if get_origin(field.annotation) is tuple else None
     option = typer.Option(f"--{key.replace('_', '-')}", help=text, show_default=False, metavar=places)
     return inspect.Parameter(
-        key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind | None, option]  # type: ignore[valid-type]
+        key,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=Annotated[kind | None, option],  # type: ignore[valid-type]
     )
 
 
@@ -98,7 +101,9 @@ def _pair(value: Any, field: FieldInfo, key: str) -> Any:
     kinds = get_args(field.annotation)
     given = numbers(value, len(kinds), f"--{key.replace('_', '-')}")
     assert given is not None
-    return tuple(int(number) if kind is int and number == int(number) else number for kind, number in zip(kinds, given, strict=True))
+    return tuple(
+        int(number) if kind is int and number == int(number) else number for kind, number in zip(kinds, given, strict=True)
+    )
 
 
 @answered

@@ -166,8 +166,7 @@ class Simulator:
                 ]
             dr.eval(sums, truths)  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
             made = [
-                (*develop(total, pings, view), truth)
-                for total, view, truth in zip(sums, self.views, truths, strict=True)
+                (*develop(total, pings, view), truth) for total, view, truth in zip(sums, self.views, truths, strict=True)
             ]
             return tracer.height_m(scene, rows), made
 

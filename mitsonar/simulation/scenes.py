@@ -59,7 +59,8 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
 
     try:
         texts: dict[str, Any] = {key: str(value) for key, value in parameters.items()}
-        scene = mi.load_file(str(path), optimize=False, **texts)  # merged meshes would lose their ids
+        # merged meshes would lose their ids; in parallel, one load in some 150 failed on a good file, and none is faster
+        scene = mi.load_file(str(path), optimize=False, parallel=False, **texts)
     except Exception as error:
         raise MitsonarError(f"cannot load scene {path}: {_reason(error)}") from error
     if not isinstance(scene, mi.Scene):

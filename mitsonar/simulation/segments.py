@@ -6,6 +6,7 @@ a mount of pitch 90 and heading -90 deg.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,7 +70,7 @@ class Segment:
         self.bearing_rad = sonar.bearing_rad[beams]
         self.rays_a_beam: NDArray[np.int64] | None = counts[beams].astype(np.int64)
         self.bits = fraction_bits(sonar, sonar.rays // sonar.beams)
-        self._tables = self._on_device(member)
+        self.member = member
 
     def _member(self) -> NDArray[np.bool_]:
         """Which pixels of the film belong to it ``(rays_per_beam * columns,)``."""
@@ -101,18 +102,18 @@ class Segment:
         nearest = max(float((edge @ axis).max()) for edge in border)
         return np.asarray(directions(sonar.bearing, bearing, elevation) @ axis >= nearest)
 
-    @staticmethod
-    def _on_device(member: NDArray[np.bool_]) -> dict[str, Any]:
+    @cached_property
+    def _on_device(self) -> dict[str, Any]:
         import drjit as dr
         import mitsuba as mi
 
-        table = mi.Bool(member)
+        table = mi.Bool(self.member)
         dr.make_opaque(table)
         return {"member": table}
 
     def tables(self, poses: ArrayLike) -> dict[str, Any]:
         """Which pixels of the film belong to it."""
-        return self._tables
+        return self._on_device
 
     def see(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: dict[str, Any]) -> Seen:
         """The rays of the portion, beams counted from its own first."""

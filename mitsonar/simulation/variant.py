@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError, nearest_names
 
-__all__ = ["VARIANTS", "Backend", "backend", "ensure_variant"]
+__all__ = ["VARIANTS", "Backend", "backend", "ensure_variant", "release_memory", "use_threads"]
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
 """The variants that mitsonar works with; monochrome ones need less memory."""
@@ -53,6 +54,22 @@ def backend() -> Backend:
     import drjit as dr
 
     return Backend(variant, tuple(dr.detail.llvm_version()) if variant.startswith("llvm") else None)
+
+
+def use_threads(count: int) -> None:
+    """How many threads the renderer has; to be said before anything is rendered."""
+    import drjit as dr
+
+    if dr.thread_count() != count:
+        dr.set_thread_count(count)
+
+
+def release_memory() -> None:
+    """Give back what scenes that nobody holds any more have left: they are cycles of objects, and Dr.Jit keeps memory."""
+    import drjit as dr
+
+    gc.collect()
+    dr.flush_malloc_cache()
 
 
 def _backends() -> tuple[bool, bool]:

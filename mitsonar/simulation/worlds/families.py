@@ -10,6 +10,7 @@ from mitsonar.errors import MitsonarError, complaint, nearest_names
 from mitsonar.simulation.worlds.flat_objects import FlatObjects
 from mitsonar.simulation.worlds.pattern import Pattern
 from mitsonar.simulation.worlds.rocky_field import RockyField
+from mitsonar.simulation.worlds.scene_file import SceneFile
 from mitsonar.simulation.worlds.ship_hull import ShipHull
 from mitsonar.simulation.worlds.world import Family
 
@@ -24,14 +25,15 @@ FAMILIES: dict[str, type[Family]] = {
 
 
 def create_family(name: str, **fields: Any) -> Family:
-    """The family of that name with these numbers; the others are the thesis's.
+    """The family of that name with these numbers, the others the thesis's; or ``scene``, a file of the user's own.
 
     Raises:
         MitsonarError: unknown name or key, or a number outside its limits.
     """
-    if name not in FAMILIES:
-        raise MitsonarError(f"unknown world {name!r}: {nearest_names(name, FAMILIES)}")
-    family = FAMILIES[name]
+    known = {**FAMILIES, "scene": SceneFile}
+    if name not in known:
+        raise MitsonarError(f"unknown world {name!r}: {nearest_names(name, known)}")
+    family = known[name]
     try:
         return family(**fields)
     except ValidationError as error:

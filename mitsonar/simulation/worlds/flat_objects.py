@@ -41,7 +41,9 @@ class FlatObjects(Family):
     objects: Counts = Field((2000, 5000), description="number of rectangles, drawn; ellipses likewise")
     rectangles: int | None = Field(None, ge=0, le=10**6, description="rectangles, instead of a draw")
     ellipses: int | None = Field(None, ge=0, le=10**6, description="ellipses, instead of a draw")
-    thickness_m: float = Field(0.001, gt=0, le=100, description="height over the seabed [m]; 0.1 in one of the thesis's tests")
+    thickness_m: float = Field(
+        0.001, gt=0, le=100, description="height over the seabed [m]; 0.1 in one of the thesis's tests"
+    )
     side_m: Interval = Field((0.2, 1.0), description="length and width [m]")
     object_reflectivity: Interval = Field((0.0, 1.0), description="uniform reflectivity of an object")
 
@@ -53,17 +55,13 @@ class FlatObjects(Family):
         """The field of a seed."""
         kinds = (("rectangles", slab(), self.rectangles), ("ellipses", cylinder(24, 1), self.ellipses))
         streams = [stream(seed, 1, number) for number in range(len(kinds))]
-        counts = [
-            whole(rng, self.objects) if kind[2] is None else kind[2] for rng, kind in zip(streams, kinds, strict=True)
-        ]
+        counts = [whole(rng, self.objects) if kind[2] is None else kind[2] for rng, kind in zip(streams, kinds, strict=True)]
         places = [draw(rng, (-self.half_m, self.half_m), n, 2) for rng, n in zip(streams, counts, strict=True)]
         sides = [draw(rng, self.side_m, n, 2) for rng, n in zip(streams, counts, strict=True)]
         height = self.thickness_m + STEP_M * _levels(np.concatenate(places), np.concatenate(sides))
         meshes: list[Mesh] = []
         ends = np.cumsum(counts)
-        for (name, shape, _), rng, count, end, middle, side in zip(
-            kinds, streams, counts, ends, places, sides, strict=True
-        ):
+        for (name, shape, _), rng, count, end, middle, side in zip(kinds, streams, counts, ends, places, sides, strict=True):
             if count > 0:
                 tall = height[end - count : end]
                 turn = Rotation.from_euler("z", draw(rng, (0, np.pi), count, 1))

@@ -109,7 +109,9 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
     if not path.is_file():
         raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
     if path.suffix.lower() not in FORMATS:
-        raise MitsonarError(f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}")
+        raise MitsonarError(
+            f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}"
+        )
     try:
         scene = trimesh.load_scene(path, process=False)
         found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]

@@ -54,6 +54,10 @@ class Family(BaseModel):
         """The world of a seed; the same bytes for the same seed."""
         raise NotImplementedError
 
+    def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
+        """Write the world of a seed into a new folder; the XML file, and the parameters to load it with."""
+        return self.build(seed).write(folder), {}
+
 
 def stream(seed: int, *purpose: int) -> np.random.Generator:
     """Random numbers that belong to a seed and a purpose, whoever draws them."""

@@ -1,0 +1,166 @@
+"""Making a data set: shard by shard, by one process or many; what is whole is never made twice, whatever was killed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mitsonar.dataset.place import Place
+from mitsonar.dataset.plan import Plan, scenes_of
+from mitsonar.dataset.recipe import Recipe
+from mitsonar.dataset.rendering import calibrate
+from mitsonar.dataset.store import DECIDING, DataStore, versions
+from mitsonar.dataset.workers import made_by
+from mitsonar.errors import MitsonarError
+from mitsonar.simulation.variant import ensure_variant
+
+__all__ = ["Made", "make"]
+
+
+@dataclass(frozen=True)
+class Made:
+    """What making a data set did.
+
+    Attributes:
+        url: where it lies.
+        frames: of the data set.
+        made: shards that were written now.
+        shards: of the data set.
+        warnings: a sentence each.
+    """
+
+    url: str
+    frames: int
+    made: int
+    shards: int
+    warnings: list[str]
+
+
+def make(
+    recipe: Recipe,
+    url: str,
+    *,
+    sequences: int | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    verify: bool = False,
+    begun: Callable[[int, int], None] = lambda frames, done: None,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Made:
+    """Make a data set, or go on with one that was broken off; the result is the same bit for bit.
+
+    Args:
+        recipe: what it is.
+        url: folder or URL of the store.
+        sequences: only so many of the recipe's sequences.
+        workers: processes on this machine; one renders in this process, with all its threads.
+        scheduler: address of a dask scheduler that runs already; its workers render instead.
+        verify: compare what is there with its digests, not only sizes, and make again what differs.
+        begun: called with the frames of the data set and those that are there already.
+        progress: called with the number of frames that were added.
+
+    Raises:
+        MitsonarError: the store is another data set, is written by somebody else, or was begun with other versions.
+    """
+    place = Place(url)
+    if place.local and place.exists() and "zarr.json" not in place.sizes():
+        raise MitsonarError(f"{url} is there and is no Zarr store: it is kept as it is; choose another -o")
+    with place.locked():
+        variant = ensure_variant()
+        store = _begun_or_new(place, recipe, sequences, variant)
+        _clear_parts(place)
+        todo = store.missing(verify=verify)
+        if todo:
+            store.unfinish()
+        remaining = _frames(store, todo)
+        begun(len(store), len(store) - remaining)
+        if todo:
+            for shard in made_by(store, todo, workers=workers, scheduler=scheduler):
+                progress(_frames(store, [shard]))
+        store.finish()
+        return Made(place.url, len(store), len(todo), store.shards, _warnings(store))
+
+
+def _begun_or_new(place: Place, recipe: Recipe, sequences: int | None, variant: str) -> DataStore:
+    """The store that is there, if it is the same data set, or a new one."""
+    count = recipe.sequences if sequences is None else sequences
+    scenes = scenes_of(recipe, count)
+    files = place.sizes()
+    if "zarr.json" in files:
+        store = DataStore.open(place, write=True, unfinished=True)
+        _check_same(store, recipe, count, variant)
+        if store.ready:
+            return store
+        gain = float(store.about["gain"])
+    else:
+        gain = calibrate(recipe, scenes[0])
+    about = {"gain": gain, "level_scale": 1 / gain, "variant": variant, "versions": versions()}
+    return DataStore.create(place, recipe, Plan.of(recipe, count), about)
+
+
+def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) -> None:
+    """The store was begun as this recipe, with these versions.
+
+    Raises:
+        MitsonarError: it was not; what differs is named.
+    """
+    about = store.about
+    wanted = recipe.model_dump(mode="json")
+    other = [name for name in wanted if wanted[name] != about["recipe"].get(name)]
+    if int(about["sequences"]) != sequences:
+        other.append(f"sequences ({about['sequences']} there, {sequences} asked)")
+    if other:
+        raise MitsonarError(
+            f"{store.place.url} holds another data set, it differs in {', '.join(other)}: make it with the recipe and options "
+            "that it was begun with (`mitsonar dataset info` prints them), or choose another -o"
+        )
+    if about["variant"] != variant:
+        raise MitsonarError(
+            f"{store.place.url} was begun with {about['variant']}, this is {variant}, which differs in the last bits: set "
+            f"MITSONAR_VARIANT={about['variant']}, or choose another -o"
+        )
+    now = versions()
+    changed = [
+        f"{name} {about['versions'].get(name)} (now {now[name]})"
+        for name in DECIDING
+        if about["versions"].get(name) != now[name]
+    ]
+    if changed and not store.finished:
+        raise MitsonarError(
+            f"{store.place.url} was begun with {', '.join(changed)}: the rest would differ from it; finish it with these "
+            "versions, or choose another -o"
+        )
+
+
+def _clear_parts(place: Place) -> None:
+    """Remove what a killed writer left half written; files get their name only when they are whole."""
+    if place.local:
+        for name in place.sizes():
+            if name.endswith(".partial"):
+                place.remove(name)
+
+
+def _frames(store: DataStore, shards: list[int]) -> int:
+    return sum(store.frames_of(shard).stop - store.frames_of(shard).start for shard in shards)
+
+
+def _warnings(store: DataStore) -> list[str]:
+    """What the user should know of a finished data set."""
+    sentences = []
+    dropped, saturated = (store.read(name).astype(np.int64) for name in ("dropped", "saturated"))
+    recipe = store.recipe
+    if dropped.any():
+        rays = recipe.instrument.rays
+        sentences.append(
+            f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside the window "
+            f"{recipe.instrument.range_min:g}..{recipe.instrument.range_max:g} m and were dropped, as the window says"
+        )
+    pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in recipe.views)
+    if saturated.mean() > 0.01 * pixels:
+        sentences.append(
+            f"{100 * saturated.mean() / pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set on the first "
+            "20 frames, is too high for the rest"
+        )
+    return sentences

@@ -1,0 +1,264 @@
+"""Where the vehicle is in every frame of a data set: sequences of pings at a constant rate, jumps between them, runs.
+
+Everything here is a function of recipe, seed, scene and sequence: whoever plans gets the same numbers, and the sequences of
+a small data set are the first ones of each scene of a large one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from mitsonar.dataset.recipe import Flight, Recipe
+from mitsonar.errors import MitsonarError
+from mitsonar.geometry import directions
+from mitsonar.motion import Motion, Pose, compose, motions, mounted, vehicle_rotation
+from mitsonar.simulation.worlds.world import Family, stream
+from mitsonar.sonar import Sonar
+
+__all__ = ["Plan", "Scene", "Sequence", "footprint", "scenes_of", "sequences_of"]
+
+FEWEST_SEQUENCES = 10
+"""Sequences of a scene before a small data set opens another: worlds cost more than frames."""
+
+CANDIDATES = 64
+TRIES = 200
+
+FLIGHT, WORLD = 3, 4
+"""Purposes of random numbers (see worlds.world.stream)."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scene of a data set: its number, its group in the recipe, the seed of its world, how many sequences it has."""
+
+    number: int
+    group: int
+    seed: int
+    sequences: int
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Pings of one sequence: poses ``(pings, 6)`` [m, rad] of the vehicle."""
+
+    vehicle: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All frames of a data set, in the order in which they are stored.
+
+    Attributes:
+        scenes: those that have frames.
+        scene: number of the scene of each frame ``(frames,)``.
+        sequence: number of the sequence of each frame, counted over the data set ``(frames,)``.
+        time_s: since the sequence began ``(frames,)``.
+        vehicle: poses of the vehicle ``(frames, 6)``.
+        poses: of the sonar ``(frames, 6)``.
+        motion: sideways, forward [m], yaw [rad] to the next frame of the sequence ``(frames, 3)``; nan for its last.
+    """
+
+    scenes: list[Scene]
+    scene: NDArray[np.int32]
+    sequence: NDArray[np.int32]
+    time_s: NDArray[np.float64]
+    vehicle: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    motion: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.scene)
+
+    @classmethod
+    def of(cls, recipe: Recipe, sequences: int | None = None) -> Plan:
+        """The plan of a recipe, or of its first ``sequences`` sequences.
+
+        Raises:
+            MitsonarError: more sequences than the recipe has, none, or a footprint that fits no scene.
+        """
+        scenes = scenes_of(recipe, recipe.sequences if sequences is None else sequences)
+        flown = [(scene, one) for scene in scenes for one in _first(sequences_of(recipe, scene), scene.sequences)]
+        lengths = [len(one.vehicle) for _, one in flown]
+        vehicle = np.concatenate([one.vehicle for _, one in flown])
+        motion = np.full((len(vehicle), 3), np.nan)
+        last = np.cumsum(lengths) - 1
+        inner = np.setdiff1d(np.arange(len(vehicle)), last)
+        motion[inner] = motions(vehicle)[inner]
+        step = np.concatenate([np.arange(length) for length in lengths])
+        return cls(
+            scenes=scenes,
+            scene=np.repeat([scene.number for scene, _ in flown], lengths).astype(np.int32),
+            sequence=np.repeat(np.arange(len(flown)), lengths).astype(np.int32),
+            time_s=step / recipe.instrument.frame_rate_hz,
+            vehicle=vehicle,
+            poses=mounted(vehicle, recipe.mount.pose),
+            motion=motion,
+        )
+
+
+def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
+    """The scenes that ``sequences`` sequences are spread over, in proportion to the recipe's own numbers.
+
+    Raises:
+        MitsonarError: none, or more than the recipe has.
+    """
+    if not 1 <= sequences <= recipe.sequences:
+        raise MitsonarError(
+            f"the recipe {recipe.name} has {recipe.sequences:,} sequences: got {sequences:,}; give 1 to as many, or raise "
+            "scenes.sequences in a recipe of your own"
+        )
+    groups = [group for group, part in enumerate(recipe.scenes) for _ in range(part.count)]
+    own = np.array([recipe.scenes[group].sequences for group in groups])
+    opened = len(own) if sequences == own.sum() else int(np.clip(sequences // FEWEST_SEQUENCES, 1, len(own)))
+    while own[:opened].sum() < sequences:  # small scenes may not hold ten
+        opened += 1
+    exact = sequences * np.cumsum(own[:opened]) / own[:opened].sum()
+    counts = np.diff(np.floor(exact + 1e-9).astype(int), prepend=0)
+    return [
+        Scene(number, groups[number], world_seed(recipe.seed, number), int(count))
+        for number, count in enumerate(counts)
+        if count
+    ]
+
+
+def world_seed(seed: int, scene: int) -> int:
+    """The seed of a scene's world."""
+    return int(np.random.SeedSequence([seed, WORLD, scene]).generate_state(1)[0])
+
+
+def _first(sequences: Iterator[Sequence], count: int) -> list[Sequence]:
+    return [next(sequences) for _ in range(count)]
+
+
+def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
+    """The sequences of a scene, one after the other; random flights have no end.
+
+    Raises:
+        MitsonarError: the footprint does not fit the scene.
+    """
+    flight = recipe.flight
+    if flight.kind == "runs":
+        for name in flight.runs:
+            yield Sequence(run_poses(name, flight.heights[0]))
+        return
+    family = recipe.family(scene.group)
+    number, last = 0, None
+    while True:
+        rng = stream(recipe.seed, FLIGHT, scene.number, number)
+        vehicle = _sequence(recipe, family, rng, last)
+        yield Sequence(vehicle)
+        number, last = number + 1, vehicle[-1]
+
+
+def _sequence(
+    recipe: Recipe, family: Family, rng: np.random.Generator, last: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """The next sequence ``(pings, 6)``: motion first, then places until one keeps all footprints inside."""
+    flight, half = recipe.flight, family.half_m
+    low, high = flight.heights
+    draws = rng.random(4)
+    height = low + (high - low) * float(draws[0])
+    largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, math.radians(flight.yaw_deg)])
+    motion = Motion(*(largest * (2 * draws[1:] - 1)))
+    corners = _corners(recipe, height, _drive(Pose(0, 0, height), motion, flight.pings))
+    for _ in range(TRIES):
+        place = _places(flight, half, rng, last)
+        heading = np.pi * (2 * rng.random(CANDIDATES) - 1)
+        sin, cos = np.sin(heading)[:, None], np.cos(heading)[:, None]
+        x, y = corners.T[0] * cos + corners.T[1] * sin, corners.T[1] * cos - corners.T[0] * sin
+        outermost = np.maximum(np.abs(x + place[:, :1]), np.abs(y + place[:, 1:])).max(axis=1)
+        found = int((outermost <= half).argmax())
+        if outermost[found] <= half:
+            start = Pose(float(place[found, 0]), float(place[found, 1]), height, 0, 0, float(heading[found]))
+            return _drive(start, motion, flight.pings)
+    raise MitsonarError(
+        f"no place for a sequence found in {TRIES * CANDIDATES:,} tries: its footprint reaches "
+        f"{np.hypot(*corners.T).max():.3g} m from the vehicle, the scene {half:g} m from its middle, jumps "
+        f"{flight.jump_m or 'anywhere'}; use a larger scene, smaller jumps, a nearer range_max or a lower height"
+    )
+
+
+def _corners(recipe: Recipe, height: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The vehicle and the corners of its footprint ``(n, 2)`` [m] in all pings, about the first and in its axes."""
+    reach = footprint(recipe.instrument, recipe.mount.pose, height, recipe.flight.footprint_fov_deg)
+    sin, cos = np.sin(driven[:, 5:]), np.cos(driven[:, 5:])
+    x = driven[:, :1] + reach.T[0] * cos + reach.T[1] * sin
+    y = driven[:, 1:2] + reach.T[1] * cos - reach.T[0] * sin
+    return np.concatenate([np.column_stack([x.ravel(), y.ravel()]), driven[:, :2]])
+
+
+def _places(
+    flight: Flight, half_m: float, rng: np.random.Generator, last: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Candidates for the next place ``(n, 2)``: anywhere, or a jump away in x and in y."""
+    draws = rng.random((2, CANDIDATES, 2))
+    if last is None or flight.jump_m is None:
+        return np.asarray(half_m * (2 * draws[0] - 1), dtype=np.float64)
+    low, high = flight.jump_m
+    return np.asarray(last[:2] + np.where(draws[1] < 0.5, -1, 1) * (low + (high - low) * draws[0]), dtype=np.float64)
+
+
+def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
+    """Poses at a constant rate (eq. 3.4)."""
+    poses = [start]
+    for _ in range(pings - 1):
+        poses.append(compose(poses[-1], motion))
+    return np.array(poses)
+
+
+@lru_cache(maxsize=8)
+def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None) -> NDArray[np.float64]:
+    """Corners of what a sonar can see of the ground z = 0, from a vehicle at ``height`` ``(n, 2)`` starboard, forward [m].
+
+    Rays that meet the ground beyond the window's end, or never, count as far as that end allows.
+    """
+    azimuth, elevation = fov_deg or (sonar.azimuth_fov_deg, sonar.elevation_fov_deg)
+    outer = max(math.radians(azimuth) / 2, sonar.bearing_rad[-1] + sonar.beam_width_rad / 2 if fov_deg is None else 0)
+    b, e = np.meshgrid(np.linspace(-outer, outer, 13), np.radians(np.linspace(-elevation, elevation, 13)) / 2)
+    local = directions(sonar.bearing, b.ravel(), e.ravel())
+    eye = mounted(Pose(0, 0, height), mount)[0]
+    world = vehicle_rotation(eye).apply(local)
+    above = eye[2]
+    if above <= 0 or above >= sonar.range_max:
+        raise MitsonarError(
+            f"the sonar sees no ground: it is {above:g} m over it, range_max is {sonar.range_max:g} m; lower height_m or "
+            "raise range_max"
+        )
+    across = math.sqrt(sonar.range_max**2 - above**2)
+    level = np.hypot(world[:, 0], world[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground = np.where(world[:, 2] < 0, above * level / -world[:, 2], np.inf)
+    distance = np.minimum(ground, across)
+    unit = world[:, :2] / np.maximum(level, 1e-12)[:, None]
+    points = eye[:2] + unit * distance[:, None]
+    return np.asarray(points[ConvexHull(points).vertices])
+
+
+def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
+    """A run of Almanza-Medina, 2.3, over the pattern: poses of the vehicle ``(frames, 6)``.
+
+    ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250 over
+    5 m to starboard. ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward. ``turn``: 300 frames over 120 deg on the
+    spot, the T ahead half-way.
+    """
+    x, y = -2.5, -4.85
+    match name:
+        case "legs":
+            corners = np.array([(x, y), (x + 5, y), (x + 5, y + 1.2), (x, y + 1.2), (x, y + 2.3), (x + 5, y + 2.3)])
+            counts = (250, 100, 250, 100, 250)
+            legs = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(corners, corners[1:], counts, strict=False)]
+            legs[0] = np.linspace(corners[0], corners[1], counts[0])
+            place, heading = np.concatenate(legs), np.zeros(sum(counts))
+        case "diagonal":
+            place, heading = np.linspace((x, y), (x + 5, y + 2.3), 300), np.zeros(300)
+        case _:
+            place, heading = np.tile([0.0, -4.2], (300, 1)), np.radians(np.linspace(-60, 60, 300))
+    rest = np.column_stack([np.full(len(place), height_m), np.zeros((len(place), 2)), heading])
+    return np.column_stack([place, rest])

@@ -1,0 +1,121 @@
+"""A scene of a recipe becomes pixels: what both the store and training with rendered frames are filled from."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.dataset.plan import Scene, sequences_of
+from mitsonar.dataset.recipe import Recipe
+from mitsonar.dataset.store import PER_FRAME, array_names, pixel_type
+from mitsonar.errors import MitsonarError
+from mitsonar.frames import to_uint8
+from mitsonar.motion import mounted
+from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, constant_gain
+from mitsonar.simulation.scenes import load_scene
+from mitsonar.simulation.variant import release_memory
+
+__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate"]
+
+FRAMES_A_SCENE = 10_000_000
+"""Pings are numbered by scene times this, plus their place in it: jitter does not depend on the size of the data set."""
+
+
+class SceneRenderer:
+    """One scene, built, loaded, and ready to render.
+
+    Args:
+        recipe: of the data set.
+        scene: which of its scenes.
+    """
+
+    def __init__(self, recipe: Recipe, scene: Scene) -> None:
+        self.recipe, self.scene = recipe, scene
+        with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
+            path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
+            loaded = load_scene(path, **parameters)
+        self.simulator = Simulator(loaded, recipe.instrument, views=recipe.views)
+
+    def looks(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[Pings]]:
+        """Levels of frames ``first``, ``first + 1`` ... of the scene, in batches, a part for each view."""
+        return self.simulator.looks(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)
+
+    def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, NDArray[Any]]:
+        """What is stored of frames of the scene: kind and view -> values ``(frames, ...)``; see ``store.array_names``.
+
+        Args:
+            poses: of the sonar ``(frames, 6)``.
+            first: number of the first in the scene.
+            gain: of the data set.
+        """
+        values = self._empty(len(poses))
+        for looks in self.looks(poses, first, labels=bool(self.recipe.labels)):
+            start = looks[0].first - (self.scene.number * FRAMES_A_SCENE + first)
+            self._fill({name: array[start : start + len(looks[0])] for name, array in values.items()}, looks, gain)
+        return values
+
+    def _empty(self, frames: int) -> dict[str, NDArray[Any]]:
+        """Arrays to fill."""
+        views = {view.name: view for view in self.recipe.views}
+        values = {name: np.zeros(frames, dtype=kind) for name, kind in PER_FRAME.items()}
+        for name, (kind, view_name) in array_names(self.recipe).items():
+            view = views[view_name]
+            beams = () if kind in ("vector", "nonzero") else (len(view.bearing_rad),)
+            values[name] = np.empty((frames, view.sonar.range_bins, *beams), dtype=pixel_type(kind, self.recipe))
+        return values
+
+    def _fill(self, values: dict[str, NDArray[Any]], looks: list[Pings], gain: float) -> None:
+        """What is stored of one batch."""
+        values["height_m"][:] = looks[0].height_m
+        for view, pings in zip(self.simulator.views, looks, strict=True):
+            suffix = f"_{view.name}" if len(looks) > 1 else ""
+            values["dropped"] += (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
+            for number, levels in enumerate(pings.levels):  # one by one: a frame fits the cache, a batch does not
+                image = np.minimum(levels * np.float32(gain), np.float32(1))
+                values["saturated"][number] += np.count_nonzero(image >= 1)
+                if f"image{suffix}" in values:
+                    values[f"image{suffix}"][number] = to_uint8(image) if self.recipe.pixel == "uint8" else image
+                if f"vector{suffix}" in values:
+                    values[f"vector{suffix}"][number] = image.sum(axis=1, dtype=np.float64)
+                    values[f"nonzero{suffix}"][number] = np.count_nonzero(image, axis=1)
+            for label in self.recipe.labels:
+                values[f"{label}{suffix}"][:] = pings.labels[label]
+
+
+def calibrate(recipe: Recipe, scene: Scene) -> float:
+    """The gain of a data set: the 99.9th percentile of all pixels of the first 20 frames of its first scene becomes 0.9.
+
+    The frames are those of the recipe, however few of them are made.
+
+    Raises:
+        MitsonarError: these frames are empty.
+    """
+    poses = []
+    for sequence in sequences_of(recipe, scene):
+        poses.append(mounted(sequence.vehicle, recipe.mount.pose))
+        if sum(map(len, poses)) >= CALIBRATION_FRAMES:
+            break
+    table = np.concatenate(poses)[:CALIBRATION_FRAMES]
+    renderer = SceneRenderer(recipe, scene)
+    batches = list(renderer.looks(table, 0))
+    del renderer
+    release_memory()
+    if not any(pings.levels.any() for looks in batches for pings in looks):
+        raise MitsonarError(
+            "the first frames are empty: no ray met anything within the window; check height_m, mount and range_min, range_max"
+        )
+    return constant_gain([_joined(batches)])[0]
+
+
+def _joined(batches: list[list[Pings]]) -> Pings:
+    """All views of all frames, as if they were frames of one column: the gain is one constant for all."""
+    first = batches[0][0]
+    frames = []
+    for looks in batches:
+        frames += [np.concatenate([pings.levels[k].ravel() for pings in looks]) for k in range(len(looks[0]))]
+    return Pings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)

@@ -1,0 +1,416 @@
+"""A data set on disk or in object storage: one Zarr v3 group, written shard by shard (docs/dataset.md)."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec, ZstdCodec
+
+from mitsonar.dataset.place import Place
+from mitsonar.dataset.plan import Plan, Scene
+from mitsonar.dataset.recipe import Recipe, recipe_from
+from mitsonar.errors import MitsonarError
+from mitsonar.frames import LABELS
+
+__all__ = ["DECIDING", "FORMAT", "PER_FRAME", "DataStore", "array_names", "pixel_type", "versions"]
+
+FORMAT = 1
+"""Version of what docs/dataset.md describes."""
+
+SHARD_BYTES = 32 * 2**20
+"""Pixels of a shard, about: what a worker holds, and what a kill may cost."""
+
+SEAL = "seal"
+
+DECIDING = ("mitsonar", "mitsuba", "drjit")
+"""Packages whose versions decide pixels."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How frames are cut into files.
+
+    Attributes:
+        chunk: frames that are compressed together: a sequence, where sequences are short.
+        shard: frames of one file, the unit of work.
+    """
+
+    chunk: int
+    shard: int
+
+    @classmethod
+    def of(cls, recipe: Recipe, plan: Plan) -> Layout:
+        """Chunks that hold whole short sequences; shards of some 32 MiB, of one scene if possible."""
+        pings = recipe.flight.pings if recipe.flight.kind == "random" else 10
+        chunk = pings if pings <= 10 else 10
+        size = 1 if recipe.pixel == "uint8" else 4
+        each = sum(len(view.bearing_rad) * view.sonar.range_bins * size for view in recipe.views)
+        each += len(recipe.labels) * 4 * each // size
+        scenes = np.bincount(plan.scene)
+        wanted = max(1, min(SHARD_BYTES // each, int(scenes.max())) // chunk)
+        # where scenes allow it, shards end with them: a shard of two scenes loads both
+        whole = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
+        aligned = max((n for n in range(1, wanted + 1) if whole % n == 0), default=1) if whole else 1
+        return cls(chunk, chunk * (aligned if 3 * aligned >= wanted else wanted))
+
+
+def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
+    """What is stored of each view: the array's name -> (kind, view); names end with the view's where there are several."""
+    names = {}
+    for view in recipe.views:
+        kinds = [*recipe.kinds, *(["nonzero"] if "vector" in recipe.kinds else []), *recipe.labels]
+        for kind in kinds:
+            names[kind if len(recipe.views) == 1 else f"{kind}_{view.name}"] = (kind, view.name)
+    return names
+
+
+PER_FRAME = {"height_m": np.float64, "dropped": np.uint32, "saturated": np.uint32}
+"""What rendering tells of each frame."""
+
+
+class DataStore:
+    """One data set. :meth:`create` makes an empty one, :meth:`open` finds one that is there.
+
+    Attributes:
+        place: where it lies.
+        group: the Zarr group.
+        recipe: what it is.
+    """
+
+    def __init__(self, place: Place, group: zarr.Group) -> None:
+        self.place, self.group = place, group
+        self.recipe = recipe_from(dict(group.attrs["recipe"]))  # type: ignore[call-overload]
+
+    @classmethod
+    def create(cls, place: Place, recipe: Recipe, plan: Plan, about: dict[str, Any]) -> DataStore:
+        """An empty store with all that is known before rendering; what an earlier try left is written anew.
+
+        ``about`` is kept in the attributes; it holds at least ``gain``.
+        """
+        layout = Layout.of(recipe, plan)
+        group = zarr.open_group(place.store(write=True), mode="a", zarr_format=3)
+        attributes = {
+            "format": FORMAT,
+            "kind": "mitsonar data set",
+            "recipe": recipe.model_dump(mode="json"),
+            "frames": len(plan),
+            "sequences": int(plan.sequence[-1]) + 1,
+            "chunk_frames": layout.chunk,
+            "shard_frames": layout.shard,
+            "sonar": recipe.instrument.model_dump(),
+            "views": {view.name: view.sonar.model_dump() for view in recipe.views},
+            "level": "linear",
+            "scenes": [vars(scene) for scene in plan.scenes],
+            "ready": False,
+            "finished": False,
+            **about,
+        }
+        group.attrs.put(attributes)
+        store = cls(place, group)
+        store._create_arrays(plan, layout)
+        group.attrs.put(attributes | {"ready": True})
+        return store
+
+    @classmethod
+    def open(cls, url: str | Path | Place, *, write: bool = False, unfinished: bool = False) -> DataStore:
+        """The store at a path or URL.
+
+        Args:
+            url: path or URL.
+            write: shards will be written.
+            unfinished: one that is not finished will do.
+
+        Raises:
+            MitsonarError: nothing there, not a data set of mitsonar, or one that is not finished.
+        """
+        place = url if isinstance(url, Place) else Place(url)
+        try:
+            group = zarr.open_group(place.store(write=write), mode="r+" if write else "r", zarr_format=3)
+            attributes = dict(group.attrs)
+            ours = attributes.get("kind") == "mitsonar data set"
+            known = attributes.get("format")
+        except Exception as error:  # a damaged file or a storage that does not answer: whatever it leads to
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise MitsonarError(f"no data set at {place.url}: {reason}; give what `mitsonar dataset make` wrote") from None
+        if not ours:
+            raise MitsonarError(f"{place.url} is a Zarr group but no data set of mitsonar")
+        if known != FORMAT:
+            raise MitsonarError(
+                f"{place.url} has format {known}, this mitsonar reads {FORMAT}: use the version that made it"
+            )
+        store = cls(place, group)
+        if not unfinished and not store.finished:
+            raise MitsonarError(
+                f"{place.url} is not finished: run the same `mitsonar dataset make` again, it goes on where it stopped"
+            )
+        return store
+
+    # ---------------------------------------------------------------- what it holds
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """The attributes."""
+        return dict(self.group.attrs)
+
+    @property
+    def ready(self) -> bool:
+        """Whether all arrays were made."""
+        return bool(self.group.attrs.get("ready"))
+
+    @property
+    def finished(self) -> bool:
+        """Whether every shard was written."""
+        return bool(self.group.attrs.get("finished"))
+
+    def __len__(self) -> int:
+        return int(self.group.attrs["frames"])  # type: ignore[arg-type]
+
+    @cached_property
+    def scenes(self) -> dict[int, Scene]:
+        """The scenes by number."""
+        return {int(fields["number"]): Scene(**fields) for fields in self.about["scenes"]}
+
+    def array(self, name: str) -> zarr.Array:
+        """An array by its name."""
+        found = self.group[name]
+        assert isinstance(found, zarr.Array)
+        return found
+
+    def read(self, name: str, index: Any = ...) -> NDArray[Any]:
+        """Values of an array.
+
+        Raises:
+            MitsonarError: bytes are damaged.
+        """
+        try:
+            return np.asarray(self.array(name)[index])
+        except KeyError:
+            raise MitsonarError(f"{self.place.url} lacks the array {name}: it is damaged; make it again") from None
+        except (ValueError, RuntimeError, OSError) as error:
+            reason = " ".join(str(error).split())[:160]
+            raise MitsonarError(
+                f"{self.place.url}: {name} is damaged ({reason}); `mitsonar dataset check` tells where, `dataset make --verify` "
+                "mends it"
+            ) from None
+
+    # ---------------------------------------------------------------- shards
+
+    @property
+    def shard_frames(self) -> int:
+        """Frames of a shard."""
+        return int(self.group.attrs["shard_frames"])  # type: ignore[arg-type]
+
+    @property
+    def shards(self) -> int:
+        """How many there are."""
+        return -(-len(self) // self.shard_frames)
+
+    def frames_of(self, shard: int) -> slice:
+        """The frames of a shard."""
+        return slice(shard * self.shard_frames, min((shard + 1) * self.shard_frames, len(self)))
+
+    @cached_property
+    def rendered(self) -> list[str]:
+        """Arrays that are written shard by shard."""
+        return [*array_names(self.recipe), *PER_FRAME]
+
+    def key(self, name: str, shard: int) -> str:
+        """The file of one array and shard."""
+        array = self.array(name)
+        return f"{name}/{array.metadata.encode_chunk_key((shard, *(0,) * (array.ndim - 1)))}"  # type: ignore[union-attr]
+
+    def write_shard(self, shard: int, values: dict[str, NDArray[Any]]) -> None:
+        """Write all arrays of a shard, then its seal: sizes and digests of the files."""
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            for name in self.rendered:
+                self.array(name)[self.frames_of(shard)] = values[name]
+        self.seal(shard)
+
+    def seal(self, shard: int) -> None:
+        """Record sizes and digests of a shard's files, as they are: the shard is done."""
+        contents = [self.place.read(self.key(name, shard)) for name in self.rendered]
+        rows = [(len(content), digest(content)) for content in contents]
+        self.array(SEAL)[shard] = np.array(rows, dtype=np.uint64)
+
+    def seals(self) -> NDArray[np.uint64]:
+        """Sizes and digests ``(shards, arrays, 2)``; zeros where a shard is not done."""
+        return np.asarray(self.read(SEAL), dtype=np.uint64)
+
+    def missing(self, *, verify: bool = False) -> list[int]:
+        """Shards that are not written, or not as they were written; what reads whole but lacks its seal gets one.
+
+        Args:
+            verify: compare digests too, which reads everything; otherwise sizes.
+        """
+        sizes, seals = self.place.sizes(), self.seals()
+        lacking = []
+        for shard in range(self.shards):
+            keys = [self.key(name, shard) for name in self.rendered]
+            found = np.array([sizes.get(key, -1) for key in keys])
+            if (found < 0).any():
+                lacking.append(shard)
+            elif not seals[shard].any():  # stopped between the last file and the seal
+                if self._reads_whole(shard):
+                    self.seal(shard)
+                else:
+                    lacking.append(shard)
+            elif (found != seals[shard, :, 0]).any() or (verify and self.damaged(shard, seals[shard])):
+                lacking.append(shard)
+        return lacking
+
+    def damaged(self, shard: int, seal: NDArray[np.uint64]) -> list[str]:
+        """Files of a shard that are not what was sealed."""
+        wrong = []
+        for name, (_, wanted) in zip(self.rendered, seal, strict=True):
+            try:
+                content = self.place.read(self.key(name, shard))
+            except OSError:
+                content = b""
+            if digest(content) != int(wanted):
+                wrong.append(self.key(name, shard))
+        return wrong
+
+    def _reads_whole(self, shard: int) -> bool:
+        """Whether all checksums within the files hold."""
+        try:
+            for name in self.rendered:
+                self.read(name, self.frames_of(shard))
+        except MitsonarError:
+            return False
+        return True
+
+    def finish(self) -> None:
+        """Mark it as finished: every shard is there."""
+        self.group.attrs["finished"] = True
+
+    def unfinish(self) -> None:
+        """Mark it as not finished: shards will be written again."""
+        if self.finished:
+            self.group.attrs["finished"] = False
+
+    # ---------------------------------------------------------------- making the arrays
+
+    def _create_arrays(self, plan: Plan, layout: Layout) -> None:
+        views = {view.name: view for view in self.recipe.views}
+        several = len(views) > 1
+        for name, (kind, view_name) in array_names(self.recipe).items():
+            view = views[view_name]
+            beam = f"beam_{view_name}" if several else "beam"
+            shape: tuple[int, ...] = (len(plan), view.sonar.range_bins)
+            dims: tuple[str, ...] = ("frame", "range")
+            if kind not in ("vector", "nonzero"):
+                shape, dims = (*shape, len(view.bearing_rad)), (*dims, beam)
+            self._array(name, shape, dims, pixel_type(kind, self.recipe), layout, TEXTS[kind].format(view_name))
+        for view_name, view in views.items():
+            suffix = f"_{view_name}" if several else ""
+            self._known(f"bearing_rad{suffix}", view.bearing_rad, (f"beam{suffix}",), TEXTS["bearing_rad"])
+        self._known("range_m", self.recipe.views[0].sonar.range_m, ("range",), TEXTS["range_m"])
+        for name, kind_of in PER_FRAME.items():
+            self._array(name, (len(plan),), ("frame",), np.dtype(kind_of), Layout(layout.shard, 0), TEXTS[name])
+        known = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s, "scene": plan.scene}
+        known["sequence"] = plan.sequence
+        if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
+            known["vehicle_pose"] = plan.vehicle
+        inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",)}
+        for name, values in known.items():
+            self._known(name, values, ("frame", *inner.get(name, ())), TEXTS[name])
+        shape = (self.shards, len(self.rendered), 2)
+        seal = self.group.create_array(
+            SEAL, shape=shape, chunks=(1, *shape[1:]), dtype="uint64", compressors=None, fill_value=0, overwrite=True
+        )
+        seal.attrs.put({"about": TEXTS[SEAL], "arrays": self.rendered})
+
+    def _array(
+        self, name: str, shape: tuple[int, ...], dims: tuple[str, ...], kind: np.dtype[Any], layout: Layout, text: str
+    ) -> None:
+        """An array that is rendered: shards of compressed chunks with checksums (or plain chunks where a shard is 0)."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # checksums of v3 are not in every reader
+            self.group.create_array(
+                name,
+                shape=shape,
+                chunks=(layout.chunk, *shape[1:]),
+                shards=(layout.shard, *shape[1:]) if layout.shard else None,
+                dtype=kind,
+                fill_value=0,
+                compressors=[ZstdCodec(level=1), Crc32cCodec()],
+                dimension_names=dims,
+                attributes={"about": text},
+                overwrite=True,
+            )
+
+    def _known(self, name: str, values: NDArray[Any], dims: tuple[str, ...], text: str) -> None:
+        """An array whose values are known from the start, in one piece."""
+        array = self.group.create_array(
+            name,
+            shape=values.shape,
+            chunks=values.shape,
+            dtype=values.dtype,
+            fill_value=0,
+            dimension_names=dims,
+            attributes={"about": text},
+            overwrite=True,
+        )
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            array[...] = values
+
+
+def digest(content: bytes) -> int:
+    """64 bits of BLAKE2b."""
+    return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
+
+
+def versions() -> dict[str, str]:
+    """Versions of what decides the values."""
+    found = {}
+    for package in ("mitsonar", "mitsuba", "drjit", "numpy", "zarr"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed as a package"
+    return found
+
+
+def pixel_type(kind: str, recipe: Recipe) -> np.dtype[Any]:
+    """The type of an array of this kind."""
+    match kind:
+        case "image":
+            return np.dtype(recipe.pixel)
+        case "vector":
+            return np.dtype(np.float32)
+        case "nonzero":
+            return np.dtype(np.uint32)
+        case _:
+            return np.dtype(LABELS[kind])
+
+
+TEXTS = {
+    "image": "{}: level times gain, 0..255 (or 0..1), row 0 nearest, column 0 most to port; zero means no echo",
+    "vector": "{}: sum over the beams of the image in 0..1",
+    "nonzero": "{}: number of beams with an echo, from which a vector's noise is drawn",
+    "elevation_rad": "{}: elevation of the strongest echo; nan without echo",
+    "shape_id": "{}: place in the scene of the shape of the strongest echo; -1 without echo",
+    "object_id": "{}: object of the strongest echo, as its mesh numbers them; 0 for none, -1 without echo",
+    "shadow": "{}: 0 not in shadow, 1 dark with sound or echoes beyond, 2 dark with all sound intercepted before",
+    "bearing_rad": "bearing of each beam's axis [rad], starboard positive",
+    "range_m": "centre of each range bin [m]",
+    "height_m": "height of the sonar over what is straight below it [m]; nan where nothing is",
+    "dropped": "returns of the frame that lie outside the window and were dropped",
+    "saturated": "pixels of the frame at the maximum",
+    "pose": "sonar: x, y, z [m], pitch, roll, heading [rad]",
+    "vehicle_pose": "vehicle: x, y, z [m], pitch, roll, heading [rad]; motion is the vehicle's",
+    "motion": "to the next frame of the sequence: sideways, forward [m], yaw [rad]; nan for its last",
+    "time_s": "since the sequence began [s]",
+    "scene": "number of the scene",
+    "sequence": "number of the sequence",
+    SEAL: "bytes and BLAKE2b-64 of each file of a shard, written when the shard is done",
+}

@@ -1,0 +1,182 @@
+"""Who makes the shards: this process, processes beside it, or the workers of a dask scheduler anywhere."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from mitsonar.dataset.shards import forget, make_shard
+from mitsonar.dataset.store import DECIDING, DataStore, versions
+from mitsonar.errors import MitsonarError
+from mitsonar.simulation.variant import use_threads
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+__all__ = ["Queue", "made_by"]
+
+AHEAD = 2
+"""Shards that a worker is given at a time: one that it makes, one that waits."""
+
+ASK_S = 1.0
+"""How often the scheduler is asked who is there."""
+
+SILENCE_S = 120.0
+"""How long there may be no worker at all."""
+
+
+def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
+    """Make the shards; their numbers, as they get done.
+
+    Args:
+        store: where they belong.
+        todo: their numbers.
+        workers: 1, this process with all its threads; more, so many processes here, one thread each.
+        scheduler: address of a dask scheduler that runs already; its workers instead.
+
+    Raises:
+        MitsonarError: no scheduler there, no worker left, a worker that was lost again and again, or what a worker says.
+    """
+    if scheduler is None and workers <= 1:
+        try:
+            for shard in todo:
+                yield make_shard(store.place.root if store.place.local else store.place.url, shard)
+        finally:
+            forget()
+    else:
+        with _client(workers, scheduler) as client:
+            yield from _hand_out(client, store, Queue(store, todo))
+
+
+@contextlib.contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
+    """A client of the scheduler; a local one starts its workers by spawn, one thread each."""
+    import logging
+
+    import dask
+    from distributed import Client, LocalCluster
+
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout="10s", set_as_default=False)
+        except (OSError, ValueError) as error:
+            reason = " ".join(str(error).split())[:160]
+            raise MitsonarError(
+                f"no dask scheduler at {scheduler}: {reason}; start one with `dask scheduler` and give the address it prints"
+            ) from None
+        with client:
+            yield client
+        return
+    settings = {
+        "distributed.worker.multiprocessing-method": "spawn",
+        "distributed.comm.timeouts.connect": "60s",
+        # dask lets workers return memory at each release, which doubles the time of NumPy here, and samples their stacks
+        "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": "1"},
+        "distributed.worker.profile.enabled": False,
+    }
+    quiet = logging.CRITICAL  # what a user should know of a lost worker, we say
+    with (
+        dask.config.set(settings),
+        LocalCluster(
+            n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address=None, silence_logs=quiet
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+class Queue:
+    """Shards that wait: a worker is given those of the scene that it has, then of a scene that nobody has."""
+
+    def __init__(self, store: DataStore, todo: list[int]) -> None:
+        scene_of = store.read("scene")
+        self.waiting: dict[int, deque[int]] = {}
+        for shard in todo:
+            self.waiting.setdefault(int(scene_of[store.frames_of(shard).start]), deque()).append(shard)
+        self.has: dict[str, int] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self.waiting)
+
+    def next(self, worker: str) -> int:
+        """The next shard for a worker."""
+        scene = self.has.get(worker, -1)
+        if scene not in self.waiting:
+            free = [number for number in self.waiting if number not in self.has.values()]
+            scene = free[0] if free else max(self.waiting, key=lambda number: len(self.waiting[number]))
+        self.has[worker] = scene
+        shard = self.waiting[scene].popleft()
+        if not self.waiting[scene]:
+            del self.waiting[scene]
+        return shard
+
+
+def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
+    """Keep every worker supplied until all shards are made."""
+    url = store.place.root if store.place.local else store.place.url
+    given: dict[Future, tuple[str, int]] = {}
+    asked, heard, alive = 0.0, time.monotonic(), []
+    try:
+        while queue or given:
+            if time.monotonic() - asked > ASK_S:
+                alive, asked = list(client.ncores()), time.monotonic()
+            if alive:
+                heard = time.monotonic()
+            elif time.monotonic() - heard > SILENCE_S:
+                raise MitsonarError(
+                    f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`; what is "
+                    "whole stays, the same command goes on"
+                )
+            for worker in alive:
+                while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
+                    shard = queue.next(worker)
+                    # where a worker is lost, dask gives its shards to another
+                    future = client.submit(_work, url, shard, workers=[worker], allow_other_workers=True, pure=False)
+                    given[future] = worker, shard
+            done = [future for future in given if future.done()]
+            for future in done:
+                yield _result(future, given.pop(future)[1])
+            if not done:
+                time.sleep(0.1)
+    finally:
+        with contextlib.suppress(Exception):
+            client.cancel(list(given))
+
+
+def _result(future: Future, shard: int) -> int:
+    """The shard that was made, or what went wrong."""
+    from distributed import KilledWorker
+
+    if future.status == "finished":
+        return shard
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        raise MitsonarError(
+            f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole stays, the "
+            "same command goes on"
+        )
+    raise error if isinstance(error, BaseException) else MitsonarError(f"shard {shard} was {future.status}")
+
+
+def _work(url: str, shard: int) -> int:
+    """One shard, in a dask worker: as many threads of the ray tracer as the worker has.
+
+    Raises:
+        MitsonarError: this worker does not see the store, or has other versions.
+    """
+    from distributed import get_worker
+
+    use_threads(get_worker().state.nthreads)
+    _check_versions(url)
+    return make_shard(url, shard)
+
+
+def _check_versions(url: str) -> None:
+    there, here = DataStore.open(url, unfinished=True).about["versions"], versions()
+    other = [f"{name} {here[name]} instead of {there[name]}" for name in DECIDING if there[name] != here[name]]
+    if other:
+        raise MitsonarError(f"the worker on {socket.gethostname()} has {', '.join(other)}: install the same everywhere")
