@@ -45,6 +45,9 @@ class NoiseModel(BaseModel):
         xp = array_namespace(image)
         if self.is_none:
             return xp.clip(image, 0.0, 1.0)
+        if image.shape[0] > 1 and str(device(image)) == "cpu":  # what one frame needs stays in the cache
+            one = [self.apply(image[k : k + 1, ...], seed=seed, frames=frames[k : k + 1]) for k in range(image.shape[0])]
+            return xp.concat(one, axis=0)
         first, second = uniform(image.shape, seed=seed, frames=frames, like=image)
         radius = xp.sqrt(-2.0 * xp.log(first))
         gaussian = self.mean + self.std * radius * xp.cos(2.0 * math.pi * second)
@@ -53,6 +56,51 @@ class NoiseModel(BaseModel):
         # libraries differ in the last bit of log and cos: a grid of 2^-30 far above it hides that
         noisy = xp.round(xp.clip(noisy, 0.0, 1.0) * 2.0**30) * 2.0**-30
         return xp.astype(noisy, xp.float32)
+
+    def apply_sum(self, vector: Any, nonzero: Any, cells: int, *, seed: int, frames: Any) -> Any:
+        """Noisy sums over the beams, drawn from the law of the sum (its mean and variance, as a Gaussian), float32.
+
+        The noise of single pixels, :meth:`apply`, summed over a row of the image, has the same mean and variance as long as
+        echoes do not reach 1, where they would be clipped.
+
+        Args:
+            vector: sums of images in 0..1 ``(frames, bins)``, NumPy or torch.
+            nonzero: how many pixels of each row hold an echo, like ``vector``.
+            cells: pixels of a row.
+            seed: seed of the noise.
+            frames: number of each frame ``(frames,)``, an integer array of the same kind.
+        """
+        xp = array_namespace(vector)
+        if self.is_none:
+            return xp.astype(vector, xp.float32)
+        first, second = uniform((*vector.shape, 1), seed=seed, frames=frames, like=vector)
+        gaussian = xp.sqrt(-2.0 * xp.log(first[..., 0])) * xp.cos(2.0 * math.pi * second[..., 0])
+        echoes = xp.astype(nonzero, xp.float64)
+        empty_mean, empty_variance = _clipped_gaussian(self.mean, self.std)
+        echo_mean, echo_variance = math.sqrt(math.pi / 2) * self.scale, (2 - math.pi / 2) * self.scale**2
+        mean = echoes * echo_mean + (cells - echoes) * empty_mean
+        std = xp.sqrt(echoes * echo_variance + (cells - echoes) * empty_variance)
+        noisy = xp.clip(xp.astype(vector, xp.float64) + mean + std * gaussian, 0.0, None)
+        noisy = xp.round(noisy * 2.0**24) * 2.0**-24  # hides the last bits in which libraries differ
+        return xp.astype(noisy, xp.float32)
+
+
+def _clipped_gaussian(mean: float, std: float) -> tuple[float, float]:
+    """Mean and variance of a Gaussian clipped to 0..1."""
+    if std == 0:
+        return mean, 0.0
+
+    def density(x: float) -> float:
+        return math.exp(-x * x / 2) / math.sqrt(2 * math.pi)
+
+    def below(x: float) -> float:
+        return math.erf(x / math.sqrt(2)) / 2 + 0.5
+
+    low, high = -mean / std, (1 - mean) / std
+    inside = below(high) - below(low)
+    first = mean * inside + std * (density(low) - density(high)) + 1 - below(high)
+    second = (mean**2 + std**2) * inside + std * (mean * density(low) - (1 + mean) * density(high)) + 1 - below(high)
+    return first, second - first**2
 
 
 NOISE_MODELS = {
@@ -80,10 +128,8 @@ def uniform(shape: tuple[int, int, int], *, seed: int, frames: Any, like: Any) -
 
 
 def _multiply(value: Any, factor: int) -> Any:
-    """``value * factor`` modulo 2^32 without leaving int64's positive half."""
-    low = value & 0xFFFF
-    high = value >> 16
-    return (low * factor + ((high * (factor & 0xFFFF)) << 16)) & MASK
+    """``value * factor`` modulo 2^32: int64 arrays wrap, which leaves the low bits right."""
+    return (value * factor) & MASK
 
 
 def _mix(value: Any, key: Any) -> Any:

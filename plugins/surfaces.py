@@ -31,7 +31,7 @@ WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
 
 @dataclass
 class Hit:
-    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity`` 0..1, ``shape_id``, ``object_id``."""
+    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity`` 0..1, shape and object."""
 
     valid: Any
     t: Any

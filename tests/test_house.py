@@ -19,10 +19,13 @@ STAGES = (
     "simulation.echoes",
     *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")),
     *(f"simulation.worlds.{name}" for name in ("shapes", "perlin", "world")),
-    *(f"simulation.worlds.{name}" for name in ("rocky_field", "ship_hull", "pattern", "flat_objects", "user_mesh")),
+    *(f"simulation.worlds.{name}" for name in ("rocky_field", "ship_hull", "pattern", "flat_objects")),
+    *(f"simulation.worlds.{name}" for name in ("user_mesh", "scene_file")),
     "simulation.worlds.families",
     *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "tracing", "views", "segments", "bistatic")),
     *(f"simulation.{name}" for name in ("binning", "imaging", "runs")),
+    *(f"dataset.{name}" for name in ("recipe", "plan", "place", "store", "rendering", "shards", "workers", "generate")),
+    *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered")),
     "cli",
     "__main__",
 )
@@ -82,7 +85,7 @@ def stage(name: str) -> int:
     return STAGES.index("cli" if name.split(".")[0] == "cli" else name)
 
 
-PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "scenes"}
+PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "scenes"}
 """Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
 

@@ -9,7 +9,7 @@ def main() -> None:
     """``mitsonar`` and ``python -m mitsonar``."""
     import typer
 
-    from mitsonar.cli import doctor, image, presets, render, world
+    from mitsonar.cli import dataset, doctor, image, presets, render, world
 
     app = typer.Typer(
         name="mitsonar",
@@ -25,4 +25,5 @@ def main() -> None:
     app.command()(presets.scenes)
     app.command()(doctor.doctor)
     app.add_typer(world.worlds(), name="world")
+    app.add_typer(dataset.datasets(), name="dataset")
     app()

@@ -113,8 +113,8 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
         other.append(f"sequences ({about['sequences']} there, {sequences} asked)")
     if other:
         raise MitsonarError(
-            f"{store.place.url} holds another data set, it differs in {', '.join(other)}: make it with the recipe and options "
-            "that it was begun with (`mitsonar dataset info` prints them), or choose another -o"
+            f"{store.place.url} holds another data set, it differs in {', '.join(other)}: make it with the recipe and "
+            "options that it was begun with (`mitsonar dataset info --recipe` prints it), or choose another -o"
         )
     if about["variant"] != variant:
         raise MitsonarError(
@@ -154,13 +154,13 @@ def _warnings(store: DataStore) -> list[str]:
     if dropped.any():
         rays = recipe.instrument.rays
         sentences.append(
-            f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside the window "
-            f"{recipe.instrument.range_min:g}..{recipe.instrument.range_max:g} m and were dropped, as the window says"
+            f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside the "
+            f"window {recipe.instrument.range_min:g}..{recipe.instrument.range_max:g} m and were dropped, as the window says"
         )
     pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in recipe.views)
     if saturated.mean() > 0.01 * pixels:
         sentences.append(
-            f"{100 * saturated.mean() / pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set on the first "
-            "20 frames, is too high for the rest"
+            f"{100 * saturated.mean() / pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set on the "
+            "first 20 frames, is too high for the rest"
         )
     return sentences

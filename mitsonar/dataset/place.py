@@ -17,6 +17,7 @@ from typing import Any
 import zarr
 from fsspec.core import url_to_fs
 from fsspec.implementations.local import LocalFileSystem
+from zarr.abc.store import Store
 
 from mitsonar.errors import MitsonarError
 
@@ -50,7 +51,7 @@ class Place:
             ) from None
         self.local = isinstance(self.fs, LocalFileSystem)
 
-    def store(self, *, write: bool = False) -> zarr.abc.store.Store:
+    def store(self, *, write: bool = False) -> Store:
         """The Zarr store here."""
         if self.local:
             return zarr.storage.LocalStore(self.root, read_only=not write)
@@ -151,6 +152,6 @@ class Place:
         if owner != besides and age < STALE_S:
             host, process, *_ = [*owner.split(), "?"]
             raise MitsonarError(
-                f"{self.url} is being written by process {process} on {host} (last sign {age:.0f} s ago): wait for it to end, "
-                f"or, if it was killed, {STALE_S - age:.0f} s; nothing was changed"
+                f"{self.url} is being written by process {process} on {host} (last sign {age:.0f} s ago): wait for it to "
+                f"end, or, if it was killed, {STALE_S - age:.0f} s; nothing was changed"
             )

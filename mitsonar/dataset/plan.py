@@ -244,9 +244,9 @@ def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, fl
 def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
     """A run of Almanza-Medina, 2.3, over the pattern: poses of the vehicle ``(frames, 6)``.
 
-    ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250 over
-    5 m to starboard. ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward. ``turn``: 300 frames over 120 deg on the
-    spot, the T ahead half-way.
+    ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250
+    over 5 m to starboard. ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward. ``turn``: 300 frames over 120 deg on
+    the spot, the T ahead half-way.
     """
     x, y = -2.5, -4.85
     match name:

@@ -21,10 +21,7 @@ from mitsonar.simulation.worlds.families import create_family
 from mitsonar.simulation.worlds.world import Family, Interval
 from mitsonar.sonar import Sonar
 
-__all__ = ["RUNS", "Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "shipped_recipes"]
-
-RUNS = ("legs", "diagonal", "turn")
-"""The three runs of Almanza-Medina, 2.3, over the pattern."""
+__all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "shipped_recipes"]
 
 
 class _Part(BaseModel):
@@ -87,7 +84,7 @@ class Flight(_Part):
         None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
     )
     runs: list[Literal["legs", "diagonal", "turn"]] = Field(
-        default_factory=lambda: list(RUNS), min_length=1, description="runs of each scene"
+        default=["legs", "diagonal", "turn"], min_length=1, description="runs of each scene"
     )
 
     @property

@@ -107,7 +107,8 @@ def calibrate(recipe: Recipe, scene: Scene) -> float:
     release_memory()
     if not any(pings.levels.any() for looks in batches for pings in looks):
         raise MitsonarError(
-            "the first frames are empty: no ray met anything within the window; check height_m, mount and range_min, range_max"
+            "the first frames are empty: no ray met anything within the window; check height_m, mount, range_min and "
+            "range_max"
         )
     return constant_gain([_joined(batches)])[0]
 

@@ -88,7 +88,8 @@ class DataStore:
 
     def __init__(self, place: Place, group: zarr.Group) -> None:
         self.place, self.group = place, group
-        self.recipe = recipe_from(dict(group.attrs["recipe"]))  # type: ignore[call-overload]
+        self._arrays: dict[str, zarr.Array] = {}
+        self.recipe = recipe_from(dict(group.attrs["recipe"]))  # type: ignore[arg-type, call-overload]
 
     @classmethod
     def create(cls, place: Place, recipe: Recipe, plan: Plan, about: dict[str, Any]) -> DataStore:
@@ -181,9 +182,11 @@ class DataStore:
 
     def array(self, name: str) -> zarr.Array:
         """An array by its name."""
-        found = self.group[name]
-        assert isinstance(found, zarr.Array)
-        return found
+        if name not in self._arrays:  # the group would read its metadata again each time
+            found = self.group[name]
+            assert isinstance(found, zarr.Array)
+            self._arrays[name] = found
+        return self._arrays[name]
 
     def read(self, name: str, index: Any = ...) -> NDArray[Any]:
         """Values of an array.
@@ -198,8 +201,8 @@ class DataStore:
         except (ValueError, RuntimeError, OSError) as error:
             reason = " ".join(str(error).split())[:160]
             raise MitsonarError(
-                f"{self.place.url}: {name} is damaged ({reason}); `mitsonar dataset check` tells where, `dataset make --verify` "
-                "mends it"
+                f"{self.place.url}: {name} is damaged ({reason}); `mitsonar dataset check` tells where, "
+                "`mitsonar dataset make --verify` mends it"
             ) from None
 
     # ---------------------------------------------------------------- shards
@@ -316,7 +319,12 @@ class DataStore:
         self._known("range_m", self.recipe.views[0].sonar.range_m, ("range",), TEXTS["range_m"])
         for name, kind_of in PER_FRAME.items():
             self._array(name, (len(plan),), ("frame",), np.dtype(kind_of), Layout(layout.shard, 0), TEXTS[name])
-        known = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s, "scene": plan.scene}
+        known: dict[str, NDArray[Any]] = {
+            "pose": plan.poses,
+            "motion": plan.motion,
+            "time_s": plan.time_s,
+            "scene": plan.scene,
+        }
         known["sequence"] = plan.sequence
         if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
             known["vehicle_pose"] = plan.vehicle

@@ -156,8 +156,8 @@ def _result(future: Future, shard: int) -> int:
     error = future.exception()
     if isinstance(error, KilledWorker):
         raise MitsonarError(
-            f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole stays, the "
-            "same command goes on"
+            f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole stays, "
+            "the same command goes on"
         )
     raise error if isinstance(error, BaseException) else MitsonarError(f"shard {shard} was {future.status}")
 

@@ -71,8 +71,8 @@ class Receiver:
         across = transmitter.columns / transmitter.azimuth_fov_deg * sonar.azimuth_fov_deg / sonar.beams
         if across < FEWEST_ACROSS * (1 - 1e-9) or not transmitter.jittered:
             raise MitsonarError(
-                f"receiver {name}: the transmitter needs {FEWEST_ACROSS} jittered columns of rays across a receiver's beam, or "
-                f"stripes appear: got {across:.3g}, jitter {transmitter.jittered}; raise its beams (thesis) or rays_across"
+                f"receiver {name}: the transmitter needs {FEWEST_ACROSS} jittered columns of rays across a receiver's beam, "
+                f"or stripes appear: got {across:.3g}, jitter {transmitter.jittered}; raise beams (thesis) or rays_across"
             )
         if math.dist(self.offset[:3], (0, 0, 0)) / 2 >= max(sonar.range_min, sonar.bin_m) and sonar.model == "physical":
             raise MitsonarError(f"receiver {name}: range_min must exceed half its distance from the transmitter")
@@ -90,6 +90,7 @@ class Receiver:
         import mitsuba as mi
 
         lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
+        u: Any
         point, normal = mi.Point3f(echoes.x, echoes.y, echoes.z), mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
         way = mi.Vector3f(*(p - line.w for p, line in zip(point, lines, strict=True)))
         distance = dr.norm(way)

@@ -30,7 +30,7 @@ def create_family(name: str, **fields: Any) -> Family:
     Raises:
         MitsonarError: unknown name or key, or a number outside its limits.
     """
-    known = {**FAMILIES, "scene": SceneFile}
+    known: dict[str, type[Family]] = {**FAMILIES, "scene": SceneFile}
     if name not in known:
         raise MitsonarError(f"unknown world {name!r}: {nearest_names(name, known)}")
     family = known[name]

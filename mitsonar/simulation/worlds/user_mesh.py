@@ -184,7 +184,8 @@ def _merge(
     groups: dict[bytes | None, list[tuple[int, _Piece]]] = {}
     for number, piece in enumerate(pieces, start=1):
         groups.setdefault(piece.picture, []).append((number, piece))
-    meshes, content = [], {}
+    meshes: list[Mesh] = []
+    content: dict[str, bytes] = {}
     for picture, members in groups.items():
         vertices = np.concatenate([piece.vertices @ turn.T - shift for _, piece in members])
         first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])

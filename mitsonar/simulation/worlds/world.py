@@ -111,7 +111,7 @@ class Mesh:
         vertex = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
         if self.uv is not None:
             vertex |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
-        face = {}
+        face: dict[str, NDArray[Any]] = {}
         if self.reflectivity is not None:
             face["reflectivity_0"] = self.reflectivity
         if self.object_id is not None:

@@ -1,0 +1,291 @@
+"""A data set as torch reads it: pairs (or more) of consecutive frames with their labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader, Dataset
+
+from mitsonar.dataset.arrangement import Labels, arrangement_of
+from mitsonar.dataset.recipe import Recipe, Split
+from mitsonar.dataset.store import DataStore, array_names
+from mitsonar.errors import MitsonarError
+from mitsonar.frames import SonarFrames
+from mitsonar.noise import NoiseModel
+
+__all__ = ["Samples", "SonarPairs", "deal"]
+
+PARTS = ("train", "validation", "test")
+
+SEED_STEP = 1_000_003
+"""Between the noise seeds of two epochs: more than any number of views."""
+
+
+class Samples:
+    """What stored and rendered samples share: how raw frames become inputs and labels.
+
+    Attributes:
+        recipe: of the data set.
+        frames: of a sample.
+        arrange: from frames to inputs.
+        labels: from targets to labels and back.
+        seed: of noise and splits.
+        epoch: changes the noise; see :meth:`set_epoch`.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        *,
+        frames: int | None = None,
+        views: list[str] | None = None,
+        kind: str | None = None,
+        layout: str = "side",
+        coordinates: str = "polar",
+        cartesian_rows: int = 512,
+        noise: str | NoiseModel = "none",
+        labels: str = "raw",
+        seed: int = 0,
+    ) -> None:
+        self.recipe = recipe
+        self.frames = recipe.frames if frames is None else frames
+        if self.frames < 1:
+            raise MitsonarError(f"frames must be at least 1: got {frames}")
+        self.arrange = arrangement_of(
+            recipe,
+            views=views,
+            kind=kind,
+            layout=layout,
+            coordinates=coordinates,
+            noise=noise,
+            cartesian_rows=cartesian_rows,
+        )
+        self.labels = Labels.of(labels, recipe, self.frames)
+        self.seed, self.epoch = seed, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Another epoch draws other noise."""
+        self.epoch = epoch
+
+    def finished(self, batch: dict[str, torch.Tensor], device: torch.device | str | None = None) -> tuple[Any, torch.Tensor]:
+        """Inputs and labels of a batch of raw samples; noise and layout are made on ``device``."""
+        moved = {name: values.to(device, non_blocking=True) for name, values in batch.items()}
+        inputs = self.arrange(moved, moved["frames"], self.seed + SEED_STEP * self.epoch)
+        return inputs, moved["label"]
+
+    def one(self, sample: dict[str, Any]) -> tuple[Any, torch.Tensor]:
+        """Input and label of one raw sample."""
+        batch = {name: torch.as_tensor(values)[None] for name, values in sample.items()}
+        inputs, label = self.finished(batch)
+        return (tuple(part[0] for part in inputs) if isinstance(inputs, tuple) else inputs[0]), label[0]
+
+
+class SonarPairs(Dataset[Any], Samples):
+    """Samples of a data set's store, each ``frames`` consecutive frames with the motion between them.
+
+    ``pairs[i]`` is ``(input, label)``, float32 tensors, ready for ``torch.utils.data.DataLoader``; :meth:`loader` does the
+    same with noise and layout made on the device of the batch.
+
+    Args:
+        url: path or URL of the store.
+        part: ``train``, ``validation``, ``test``, or ``all``.
+        split: ``sequence`` (the thesis's: 95 % and 5 % of the sequences), ``scene`` (80, 10 and 10 % of the scenes: worlds
+            that training never saw), or a :class:`~mitsonar.dataset.recipe.Split`; default: the recipe's own.
+        frames: of a sample; 1 gives heights as labels; default: the recipe's.
+        views: which views; default: all.
+        kind: ``image`` or ``vector``; default: what is stored.
+        layout: ``side``, ``stack`` or ``channels``; see :class:`~mitsonar.dataset.arrangement.Arrangement`.
+        coordinates: ``polar``, ``cartesian`` or ``both`` (then the input is a pair).
+        cartesian_rows: pixels of a fan in the forward direction.
+        noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model.
+        labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` goes back.
+        seed: of noise and split.
+        one_a_sequence: only one sample of each sequence, for independent tests.
+
+    Raises:
+        MitsonarError: no finished data set there, words that are not known, a part without frames.
+    """
+
+    def __init__(
+        self,
+        url: str | Path,
+        *,
+        part: str = "train",
+        split: str | Split | None = None,
+        one_a_sequence: bool = False,
+        **arrangement: Any,
+    ) -> None:
+        self.store = DataStore.open(url)
+        Samples.__init__(self, self.store.recipe, **arrangement)
+        self.split = _split(split, self.recipe)
+        self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
+        self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
+        self.first = self._samples(deal(self.scene, self.sequence, self.split, part, self.seed), one_a_sequence)
+        if not len(self.first):
+            raise MitsonarError(
+                f"{self.store.place.url} has no sample of {self.frames} frames in part {part!r}: its sequences have "
+                f"{np.bincount(self.sequence).max()} frames; ask for fewer frames, or another part"
+            )
+
+    def _samples(self, mine: NDArray[np.bool_], one_a_sequence: bool) -> NDArray[np.int64]:
+        """The first frame of each sample: its sequence goes on for as many frames as it needs."""
+        last = len(self.sequence) - self.frames
+        first = np.arange(last + 1)
+        whole = mine[: last + 1] & (self.sequence[first] == self.sequence[first + self.frames - 1])
+        first = first[whole]
+        if one_a_sequence:
+            rank = np.random.default_rng([self.seed, 5]).permutation(len(first))
+            order = np.lexsort((rank, self.sequence[first]))
+            first = np.sort(first[order][np.unique(self.sequence[first][order], return_index=True)[1]])
+        return first
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def __getitem__(self, index: int) -> tuple[Any, torch.Tensor]:
+        return self.one(self.raw(index))
+
+    def frame_numbers(self, index: int) -> slice:
+        """The frames of a sample, as numbered in the store."""
+        first = int(self.first[index])
+        return slice(first, first + self.frames)
+
+    def target(self, index: int) -> NDArray[np.float64]:
+        """The mean motion from frame to frame (sideways m, forward m, yaw rad); of one frame its height over z = 0 [m]."""
+        here = self.frame_numbers(index)
+        if self.frames == 1:
+            return self.pose[here, 2]
+        return np.asarray(self.motion[here.start : here.stop - 1].mean(axis=0))
+
+    def raw(self, index: int) -> dict[str, Any]:
+        """A sample as it is stored: frames by view, their numbers, and the label; :meth:`finished` makes a batch of them."""
+        here = self.frame_numbers(index)
+        sample: dict[str, Any] = {
+            "frames": np.arange(here.start, here.stop),
+            "label": self.labels.encode(self.target(index)),
+        }
+        for name, (kind, view) in array_names(self.recipe).items():
+            if view in self.arrange.views and kind == self.stored_kind:
+                sample[view] = self.store.read(name, here)
+            elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
+                sample[f"nonzero_{view}"] = self.store.read(name, here).astype(np.int32)
+        return sample
+
+    @property
+    def stored_kind(self) -> str:
+        """What is read: images also where vectors are wanted and not stored."""
+        return self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
+
+    def sonar_frames(self, index: int) -> SonarFrames:
+        """A sample as frames, with noise, for estimators: image, poses, heights (one view)."""
+        if len(self.arrange.views) > 1 or self.arrange.kind != "image":
+            raise MitsonarError(f"frames hold images of one view: choose one of {', '.join(self.arrange.views)}")
+        here, (name,) = self.frame_numbers(index), self.arrange.views
+        view = next(view for view in self.recipe.views if view.name == name)
+        sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
+        image = self.arrange._noisy(sample, name, sample["frames"], self.seed + SEED_STEP * self.epoch)[0]
+        return SonarFrames(
+            image=np.asarray(image),
+            range_m=view.sonar.range_m,
+            bearing_rad=view.bearing_rad,
+            time_s=self.store.read("time_s")[here],
+            sonar=view.sonar,
+            poses=self.pose[here],
+            height_m=self.store.read("height_m")[here],
+            level_scale=float(self.store.about["level_scale"]),
+        )
+
+    def loader(
+        self,
+        batch_size: int,
+        *,
+        device: torch.device | str | None = None,
+        shuffle: bool = True,
+        workers: int = 0,
+        drop_last: bool = False,
+    ) -> Iterator[tuple[Any, torch.Tensor]]:
+        """Batches of one epoch on a device; their order is a function of seed and epoch."""
+        order = torch.Generator().manual_seed(self.seed + SEED_STEP * self.epoch)
+        batches = DataLoader(
+            _Raw(self),
+            batch_size=batch_size,
+            shuffle=shuffle,
+            generator=order,
+            num_workers=workers,
+            drop_last=drop_last,
+            pin_memory=device is not None and torch.device(device).type == "cuda",
+            multiprocessing_context="spawn" if workers else None,
+        )
+        for batch in batches:
+            yield self.finished(batch, device)
+
+
+@dataclass(frozen=True)
+class _Raw(Dataset[Any]):
+    """The raw samples, for workers that only read."""
+
+    pairs: SonarPairs
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        return self.pairs.raw(index)
+
+
+def _split(split: str | Split | None, recipe: Recipe) -> Split:
+    if isinstance(split, Split):
+        return split
+    match split:
+        case None:
+            return recipe.split
+        case "sequence":
+            return recipe.split if recipe.split.by == "sequence" else Split()
+        case "scene":
+            return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
+        case _:
+            raise MitsonarError(f"split must be sequence or scene: got {split!r}")
+
+
+def deal(scene: NDArray[np.int32], sequence: NDArray[np.int32], split: Split, part: str, seed: int) -> NDArray[np.bool_]:
+    """Which frames ``(frames,)`` belong to a part; sequences, or scenes with all that is in them, are dealt out at random.
+
+    Raises:
+        MitsonarError: unknown part, a part that the split has not, fewer scenes or sequences than parts.
+    """
+    if part == "all":
+        return np.ones(len(scene), dtype=bool)
+    if part not in PARTS:
+        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}")
+    shares = np.array([getattr(split, name) for name in PARTS])
+    if shares[PARTS.index(part)] == 0:
+        raise MitsonarError(f"the split by {split.by} has no {part} part: {_said(split)}; give another split")
+    owner = scene if split.by == "scene" else sequence
+    numbers = np.unique(owner)
+    counts = _counts(len(numbers), shares)
+    if (counts[shares > 0] == 0).any():
+        raise MitsonarError(
+            f"{len(numbers)} {split.by}s cannot be split into {_said(split)}: make more, or give another split"
+        )
+    dealt = numbers[np.random.default_rng([seed, 6]).permutation(len(numbers))]
+    ends = np.cumsum(counts)
+    place = PARTS.index(part)
+    return np.isin(owner, dealt[ends[place] - counts[place] : ends[place]])
+
+
+def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """How many of ``total`` each part gets: by its share, at least one where it has any."""
+    counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
+    largest = int(shares.argmax())
+    counts[largest] = total - (counts.sum() - counts[largest])
+    return np.maximum(counts, 0)
+
+
+def _said(split: Split) -> str:
+    return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)

@@ -1,0 +1,172 @@
+"""Samples rendered while a network trains, never stored: other worlds and other motions as long as it asks."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+
+from mitsonar.dataset.pairs import Samples
+from mitsonar.dataset.plan import Scene, scenes_of, sequences_of, world_seed
+from mitsonar.dataset.recipe import Recipe, load_recipe
+from mitsonar.dataset.rendering import SceneRenderer, calibrate
+from mitsonar.errors import MitsonarError
+from mitsonar.motion import motions, mounted
+from mitsonar.simulation.variant import ensure_variant, release_memory, use_threads
+
+__all__ = ["RenderedPairs"]
+
+
+class RenderedPairs(IterableDataset[Any], Samples):
+    """Endless samples of a recipe's kind; with another seed than the recipe's no world or flight is that of its data set.
+
+    Iterating gives ``(input, label)`` as :class:`~mitsonar.dataset.pairs.SonarPairs` does; :meth:`loader` gives batches with
+    noise and layout made on their device. Each worker of a ``DataLoader`` renders worlds of its own; workers must be started
+    by spawn, since the ray tracer does not survive a fork: ``DataLoader(pairs, num_workers=2,
+    multiprocessing_context="spawn")``.
+
+    Args:
+        recipe: a recipe, its name, or a YAML file.
+        seed: of worlds, flights, jitter and noise.
+        length: samples of an epoch over all workers; None: no end.
+        sequences_a_world: sequences before the next world is built.
+        buffer: samples among which the next is drawn.
+        gain: of the pixels; default: that of the recipe's own data set, which is computed first.
+        arrangement: as for ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
+
+    Raises:
+        MitsonarError: unknown recipe or words; workers that were forked.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe | str | Path,
+        *,
+        seed: int,
+        length: int | None = None,
+        sequences_a_world: int = 1000,
+        buffer: int = 500,
+        gain: float | None = None,
+        **arrangement: Any,
+    ) -> None:
+        recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
+        Samples.__init__(self, recipe, seed=seed, **arrangement)
+        if recipe.flight.kind != "random":
+            raise MitsonarError("frames are rendered in training for random flights only: runs have an end, make a data set")
+        if self.frames > recipe.flight.pings:
+            raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
+        self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
+
+    def __iter__(self) -> Iterator[tuple[Any, torch.Tensor]]:
+        for sample in self.raw():
+            yield self.one(sample)
+
+    def raw(self) -> Iterator[dict[str, Any]]:
+        """Raw samples of this worker; :meth:`~mitsonar.dataset.pairs.Samples.finished` makes inputs of a batch of them."""
+        worker, workers = self._ready()
+        gain = self.gain
+        if gain is None:
+            gain = calibrate(self.recipe, scenes_of(self.recipe, self.recipe.sequences)[0])
+        rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
+        left = None if self.length is None else self.length // workers + (worker < self.length % workers)
+        waiting: list[dict[str, Any]] = []
+        for sample in self._rendered(worker, workers, gain):
+            if left is not None and left <= 0:
+                return
+            waiting.append(sample)
+            if len(waiting) >= (self.buffer if left is None else min(self.buffer, left)):
+                place = int(rng.integers(len(waiting)))
+                waiting[place], waiting[-1] = waiting[-1], waiting[place]
+                yield waiting.pop()
+                left = None if left is None else left - 1
+
+    def loader(
+        self, batch_size: int, *, device: torch.device | str | None = None, workers: int = 0
+    ) -> Iterator[tuple[Any, torch.Tensor]]:
+        """Batches on a device."""
+        batches = DataLoader(
+            _Raw(self),
+            batch_size=batch_size,
+            num_workers=workers,
+            pin_memory=device is not None and torch.device(device).type == "cuda",
+            multiprocessing_context="spawn" if workers else None,
+        )
+        for batch in batches:
+            yield self.finished(batch, device)
+
+    def _ready(self) -> tuple[int, int]:
+        """Number of this worker and how many there are; the renderer is set up for it."""
+        info = get_worker_info()
+        if info is None:
+            ensure_variant()
+            return 0, 1
+        if "drjit" in sys.modules and multiprocessing.current_process().name.startswith("Fork"):
+            raise MitsonarError(
+                "this worker was forked after the ray tracer had started, which is unsafe: give the DataLoader "
+                'multiprocessing_context="spawn", or use RenderedPairs.loader'
+            )
+        ensure_variant()
+        use_threads(1)
+        return info.id, info.num_workers
+
+    def _rendered(self, worker: int, workers: int, gain: float) -> Iterator[dict[str, Any]]:
+        """Samples in the order in which they are rendered, world after world."""
+        recipe = self.recipe.model_copy(update={"seed": self.seed})
+        weights = np.array([group.count * group.sequences for group in recipe.scenes], dtype=float)
+        number = worker + self.epoch * 10**6 * workers
+        while True:
+            rng = np.random.default_rng([self.seed, 8, number])
+            group = int(rng.choice(len(weights), p=weights / weights.sum()))
+            scene = Scene(number, group, world_seed(self.seed, number), self.sequences_a_world)
+            release_memory()
+            yield from self._of_world(SceneRenderer(recipe, scene), gain)
+            number += workers
+
+    def _of_world(self, renderer: SceneRenderer, gain: float) -> Iterator[dict[str, Any]]:
+        """Samples of one world, as many sequences a launch as fit."""
+        recipe, pings = renderer.recipe, renderer.recipe.flight.pings
+        together = max(1, renderer.simulator.pings_per_launch // pings)
+        sequences = sequences_of(recipe, renderer.scene)
+        for start in range(0, self.sequences_a_world, together):
+            flown = [next(sequences).vehicle for _ in range(min(together, self.sequences_a_world - start))]
+            poses = mounted(np.concatenate(flown), recipe.mount.pose)
+            values = renderer.frames(poses, start * pings, gain)
+            for k, vehicle in enumerate(flown):
+                for first in range(pings - self.frames + 1):
+                    yield self._sample(values, vehicle, k * pings, first, renderer.scene.number * 2**24 + start * pings)
+
+    def _sample(self, values: dict[str, Any], vehicle: Any, begin: int, first: int, number: int) -> dict[str, Any]:
+        """One sample of a batch of frames."""
+        here = slice(begin + first, begin + first + self.frames)
+        if self.frames == 1:
+            target = vehicle[first : first + 1, 2]
+        else:
+            target = motions(vehicle[first : first + self.frames]).mean(axis=0)
+        sample: dict[str, Any] = {
+            "frames": np.arange(here.start, here.stop) + number,
+            "label": self.labels.encode(target),
+        }
+        several = len(self.recipe.views) > 1
+        for view in self.arrange.views:
+            suffix = f"_{view}" if several else ""
+            stored = self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
+            sample[view] = values[f"{stored}{suffix}"][here].copy()
+            if stored == "vector":
+                sample[f"nonzero_{view}"] = values[f"nonzero{suffix}"][here].astype(np.int32)
+        return sample
+
+
+class _Raw(IterableDataset[Any]):
+    """The raw samples, for workers that only render."""
+
+    def __init__(self, pairs: RenderedPairs) -> None:
+        self.pairs = pairs
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return self.pairs.raw()
