@@ -46,7 +46,8 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
     if first["type"] == "missing":
         return f"{what} lacks {key}{see}"
     if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
+        said = str(first["ctx"]["error"])
+        return f"{what} {key}: {said}" if where else said
     message = first["msg"][0].lower() + first["msg"][1:]
     return f"{what} {key}: {message}, got {first['input']!r}{see}"
 

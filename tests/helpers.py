@@ -200,3 +200,44 @@ def run_python(script: str, *, block: tuple[str, ...] = (), **environment: str) 
     )
     assert done.returncode == 0, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done.stdout
+
+
+# ---------------------------------------------------------------- data sets
+
+TINY: dict[str, Any] = {
+    "name": "tiny",
+    "world": {"family": "rocky-field", "size_m": 20.0, "a_side": [6, 10]},
+    "scenes": [{"count": 3, "sequences": 10}],
+    "sonar": {
+        "preset": "didson300",
+        "model": "thesis",
+        "bearing": "azimuth",
+        "gain_exponent": 0,
+        "beams": 12,
+        "rays_per_beam": 60,
+        "range_bins": 40,
+    },
+    "mount": {"pitch_deg": 35.0},
+}
+"""A recipe that takes seconds: three small scenes of ten sequences."""
+
+
+def tiny_recipe(**changes: Any) -> Any:
+    """The tiny recipe with some keys changed; dots between levels become ``__``."""
+    import copy
+
+    from mitsonar.dataset.recipe import recipe_from
+
+    fields = copy.deepcopy(TINY)
+    for key, value in changes.items():
+        *levels, last = key.split("__")
+        inner = fields
+        for level in levels:
+            inner = inner.setdefault(level, {})
+        inner[last] = value
+    return recipe_from(fields)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """All files below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

@@ -186,7 +186,7 @@ def _merge(
         groups.setdefault(piece.picture, []).append((number, piece))
     meshes: list[Mesh] = []
     content: dict[str, bytes] = {}
-    for picture, members in groups.items():
+    for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # the plain ones first
         vertices = np.concatenate([piece.vertices @ turn.T - shift for _, piece in members])
         first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
         faces = np.concatenate([piece.faces + start for (_, piece), start in zip(members, first, strict=False)])
