@@ -55,7 +55,8 @@ def test_segments_add_up_to_the_whole(model: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "starboard", "forward"), [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1), ("c1", 1, 1), ("c3", -1, -1)]
+    ("name", "starboard", "forward"),
+    [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1), ("c1", 1, 1), ("c3", -1, -1)],
 )
 def test_quadrants_look_where_their_names_say(name: str, starboard: int, forward: int) -> None:
     """Fore-starboard is the first, then clockwise: a ball off to one side of the vehicle is in that one alone."""
@@ -180,7 +181,6 @@ def test_footprints_fill_the_bins_of_a_floor_evenly() -> None:
     inner[:, :1] = inner[:, -1:] = False
     relative = few[inner] / many[inner] - 1
     assert np.sqrt((relative**2).mean()) < 0.05
-    points, _ = pair("thesis", Pose(0.5, 0, 0), rays_per_beam=300)
     assert abs(few.sum() / many.sum() - 1) < 2e-3
 
 
@@ -224,5 +224,7 @@ def test_views_agree_with_themselves_whatever_else_is_traced() -> None:
     world = scene(floor=floor(diffuse({"type": "cell_noise", "cells": 4000})))
     poses = mounted([[0.1 * k, 0, 2.5, 0, 0, 0.1 * k] for k in range(5)], DOWN)
     alone = levels(Simulator(world, sonar, views=[Segment(sonar, "q3")]), poses)["q3"]
-    many = levels(Simulator(world, sonar, views=[Segment(sonar, n) for n in SEGMENTS], rays_per_launch=sonar.rays * 2), poses)
+    many = levels(
+        Simulator(world, sonar, views=[Segment(sonar, n) for n in SEGMENTS], rays_per_launch=sonar.rays * 2), poses
+    )
     np.testing.assert_array_equal(alone, many["q3"])

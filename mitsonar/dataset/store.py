@@ -235,6 +235,7 @@ class DataStore:
         """Write all arrays of a shard, then its seal: sizes and digests of the files."""
         with zarr.config.set({"array.write_empty_chunks": True}):
             for name in self.rendered:
+                self.place.remove(self.key(name, shard))  # Zarr would read a damaged shard before it writes over it
                 self.array(name)[self.frames_of(shard)] = values[name]
         self.seal(shard)
 
@@ -333,7 +334,14 @@ class DataStore:
             self._known(name, values, ("frame", *inner.get(name, ())), TEXTS[name])
         shape = (self.shards, len(self.rendered), 2)
         seal = self.group.create_array(
-            SEAL, shape=shape, chunks=(1, *shape[1:]), dtype="uint64", compressors=None, fill_value=0, overwrite=True
+            SEAL,
+            shape=shape,
+            chunks=(1, *shape[1:]),
+            dtype="uint64",
+            compressors=None,
+            fill_value=0,
+            overwrite=True,
+            dimension_names=("shard", "stored", "two"),
         )
         seal.attrs.put({"about": TEXTS[SEAL], "arrays": self.rendered})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -24,6 +24,9 @@ AHEAD = 2
 
 ASK_S = 1.0
 """How often the scheduler is asked who is there."""
+
+LOSSES = 3
+"""How often workers may be lost with the same shard."""
 
 SILENCE_S = 120.0
 """How long there may be no worker at all."""
@@ -94,10 +97,12 @@ class Queue:
 
     def __init__(self, store: DataStore, todo: list[int]) -> None:
         scene_of = store.read("scene")
+        self.scene = {shard: int(scene_of[store.frames_of(shard).start]) for shard in todo}
         self.waiting: dict[int, deque[int]] = {}
         for shard in todo:
-            self.waiting.setdefault(int(scene_of[store.frames_of(shard).start]), deque()).append(shard)
+            self.waiting.setdefault(self.scene[shard], deque()).append(shard)
         self.has: dict[str, int] = {}
+        self.lost: Counter[int] = Counter()
 
     def __bool__(self) -> bool:
         return bool(self.waiting)
@@ -114,6 +119,24 @@ class Queue:
             del self.waiting[scene]
         return shard
 
+    def give_back(self, shard: int) -> None:
+        """A worker was lost with this shard: another makes it.
+
+        Raises:
+            MitsonarError: it was lost too often.
+        """
+        self.lost[shard] += 1
+        if self.lost[shard] > LOSSES:
+            raise MitsonarError(
+                f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole "
+                "stays, the same command goes on"
+            )
+        self.waiting.setdefault(self.scene[shard], deque()).appendleft(shard)
+
+    def forget(self, alive: list[str]) -> None:
+        """Workers that are gone hold no scene."""
+        self.has = {worker: scene for worker, scene in self.has.items() if worker in alive}
+
 
 def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
     """Keep every worker supplied until all shards are made."""
@@ -124,6 +147,11 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
         while queue or given:
             if time.monotonic() - asked > ASK_S:
                 alive, asked = list(client.ncores()), time.monotonic()
+                queue.forget(alive)
+                # dask itself leaves a task waiting for ever that was meant for a worker which is gone
+                for future in [future for future, (worker, _) in given.items() if worker not in alive]:
+                    queue.give_back(given.pop(future)[1])
+                    future.cancel()
             if alive:
                 heard = time.monotonic()
             elif time.monotonic() - heard > SILENCE_S:
@@ -134,12 +162,16 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
             for worker in alive:
                 while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
                     shard = queue.next(worker)
-                    # where a worker is lost, dask gives its shards to another
-                    future = client.submit(_work, url, shard, workers=[worker], allow_other_workers=True, pure=False)
-                    given[future] = worker, shard
+                    given[client.submit(_work, url, shard, workers=[worker], pure=False)] = worker, shard
             done = [future for future in given if future.done()]
             for future in done:
-                yield _result(future, given.pop(future)[1])
+                shard = given.pop(future)[1]
+                if future.status == "finished":
+                    yield shard
+                elif future.status == "error" and not _is_lost(future):
+                    raise future.exception()  # type: ignore[misc]
+                else:
+                    queue.give_back(shard)
             if not done:
                 time.sleep(0.1)
     finally:
@@ -147,19 +179,11 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
             client.cancel(list(given))
 
 
-def _result(future: Future, shard: int) -> int:
-    """The shard that was made, or what went wrong."""
+def _is_lost(future: Future) -> bool:
+    """Whether the worker died, not the work failed."""
     from distributed import KilledWorker
 
-    if future.status == "finished":
-        return shard
-    error = future.exception()
-    if isinstance(error, KilledWorker):
-        raise MitsonarError(
-            f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole stays, "
-            "the same command goes on"
-        )
-    raise error if isinstance(error, BaseException) else MitsonarError(f"shard {shard} was {future.status}")
+    return isinstance(future.exception(), KilledWorker)
 
 
 def _work(url: str, shard: int) -> int:
