@@ -80,12 +80,15 @@ def test_no_footprint_leaves_its_scene(name: str, sequences: int) -> None:
 
 
 def test_footprint_of_a_level_floor() -> None:
-    """SPEC.md, section 2: the axis beam meets the floor at 3.74 to 5.33 m, edge beams up to 5.54 m."""
-    sonar = load_recipe("rocky-field").instrument
-    reach = footprint(sonar, Pose(0, 0, 0, np.radians(35)), 2.5)
-    slant = np.hypot(np.hypot(*reach.T), 2.5)
-    assert slant.max() == pytest.approx(5.54, abs=0.01)
-    assert np.hypot(reach[:, 1].min(), 2.5) == pytest.approx(3.74, abs=0.01)
+    """Its corners in closed form; SPEC.md, section 2: edge beams meet the floor at up to 5.54 m."""
+    sonar, height, pitch = load_recipe("rocky-field").instrument, 2.5, np.radians(35)
+    reach = footprint(sonar, Pose(0, 0, 0, pitch), height)
+    slant = np.sort(np.hypot(np.hypot(*reach.T), height))
+    edge = max(np.radians(sonar.azimuth_fov_deg) / 2, sonar.bearing_rad[-1] + sonar.beam_width_rad / 2)
+    e = np.radians(np.array([-1, 1]) * sonar.elevation_fov_deg / 2)
+    corners = height / (np.cos(e) * np.cos(edge) * np.sin(pitch) - np.sin(e) * np.cos(pitch))
+    np.testing.assert_allclose(slant, np.repeat(corners, 2), rtol=1e-12)
+    assert slant[-1] == pytest.approx(5.54, abs=0.01)
     with pytest.raises(MitsonarError, match="sees no ground"):
         footprint(sonar, Pose(0, 0, 0, np.radians(35)), 6.0)
 
