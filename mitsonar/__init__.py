@@ -12,6 +12,10 @@ from typing import TYPE_CHECKING, Any
 from mitsonar import plugins
 
 if TYPE_CHECKING:
+    from mitsonar.dataset.pairs import SonarPairs
+    from mitsonar.dataset.recipe import load_recipe
+    from mitsonar.dataset.rendered import RenderedPairs
+    from mitsonar.dataset.store import DataStore
     from mitsonar.errors import MitsonarError, MitsonarWarning
     from mitsonar.frames import SonarFrames
     from mitsonar.motion import Motion, Pose, Trajectory
@@ -25,32 +29,40 @@ __version__ = "0.1.0"
 
 __all__ = [
     "PRESETS",
+    "DataStore",
     "MitsonarError",
     "MitsonarWarning",
     "Motion",
     "NoiseModel",
     "Pose",
+    "RenderedPairs",
     "Simulator",
     "Sonar",
     "SonarFrames",
+    "SonarPairs",
     "Trajectory",
     "load_noise",
+    "load_recipe",
     "load_scene",
     "load_sonar",
 ]
 
 _HOME = {
     "PRESETS": "presets",
+    "DataStore": "dataset.store",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
     "Motion": "motion",
     "NoiseModel": "noise",
     "Pose": "motion",
+    "RenderedPairs": "dataset.rendered",
     "Simulator": "simulation.imaging",
     "Sonar": "sonar",
     "SonarFrames": "frames",
+    "SonarPairs": "dataset.pairs",
     "Trajectory": "motion",
     "load_noise": "noise",
+    "load_recipe": "dataset.recipe",
     "load_scene": "simulation.scenes",
     "load_sonar": "presets",
 }

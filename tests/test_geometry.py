@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry import to_cartesian
+from mitsonar.geometry import cartesian_map, to_cartesian
 from mitsonar.sonar import Sonar
 
 
@@ -52,3 +52,19 @@ def test_wrong_shapes_and_orders_are_refused() -> None:
         to_cartesian(np.zeros((3, 2)), [1, 2], [0, 1, 2])
     with pytest.raises(MitsonarError, match="rise"):
         to_cartesian(np.zeros((2, 2)), [2, 1], [0, 1])
+
+
+@pytest.mark.learn
+def test_torch_converts_the_same() -> None:
+    """One map for many images, on NumPy and torch: the same sums of four products."""
+    import torch
+
+    sonar = Sonar(azimuth_fov_deg=60, beams=20, range_bins=40)
+    images = np.random.default_rng(2).random((3, 2, 40, 20), dtype=np.float32)
+    conversion = cartesian_map(sonar.range_m, sonar.bearing_rad, 50)
+    fans = conversion.apply(images)
+    np.testing.assert_array_equal(conversion.apply(torch.from_numpy(images)).numpy(), fans)
+    for one in range(3):
+        wanted = to_cartesian(images[one, 1], sonar.range_m, sonar.bearing_rad, rows=50)
+        np.testing.assert_allclose(fans[one, 1], np.nan_to_num(wanted.image), atol=1e-6)
+        assert wanted.extent == conversion.extent

@@ -195,6 +195,20 @@ def test_rendering_works_without_torch() -> None:
     run_python(script, block=("torch",))
 
 
+def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:
+    script = f"""
+        import sys
+        sys.path.insert(0, {str(ROOT / "tests")!r})
+        from helpers import tiny_recipe
+        from mitsonar.dataset.check import check
+        from mitsonar.dataset.generate import make
+        from mitsonar.dataset.store import DataStore
+        make(tiny_recipe(), {str(tmp_path / "tiny.zarr")!r}, sequences=2)
+        assert check(DataStore.open({str(tmp_path / "tiny.zarr")!r})) == []
+    """
+    run_python(script, block=("torch",))
+
+
 # ---------------------------------------------------------------- what is packaged
 
 
@@ -219,4 +233,6 @@ def test_package_data_names_every_shipped_file() -> None:
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.scenes"] for path in scenes.glob(pattern)}
     shipped = {path for path in scenes.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
     assert shipped == named
+    recipes = set((ROOT / "mitsonar" / "dataset").glob(SETUPTOOLS["package-data"]["mitsonar.dataset"][0]))
+    assert len(recipes) == 11
     assert (ROOT / "mitsonar" / "py.typed").is_file()

@@ -159,6 +159,40 @@ def test_torch_draws_the_same(name: str) -> None:
     np.testing.assert_array_equal(got.numpy(), wanted)
 
 
+# ---------------------------------------------------------------- sums over the beams
+
+
+@pytest.mark.parametrize("name", ["low", "high"])
+@pytest.mark.parametrize("echoes", [0, 24, 96])
+def test_sums_have_the_mean_and_variance_of_summed_pixels(name: str, echoes: int) -> None:
+    """Two routes to one law: noise drawn for the sum, and drawn for 96 pixels and added up."""
+    model = NOISE_MODELS[name]
+    image = np.zeros((16, 512, 96), np.float32)
+    image[..., :echoes] = 0.05
+    vector, nonzero = image.sum(axis=-1), np.full((16, 512), echoes)
+    order = np.arange(16)
+    added = model.apply(image, seed=3, frames=order).sum(axis=-1, dtype=float).ravel()
+    drawn = model.apply_sum(vector, nonzero, 96, seed=8, frames=order).ravel().astype(float)
+    z = (drawn.mean() - added.mean()) / np.hypot(drawn.std(), added.std()) * np.sqrt(drawn.size)
+    assert abs(z) < Z, f"means {drawn.mean():.5f} and {added.mean():.5f}: z = {z:.1f}"
+    z = np.log(drawn.std() / added.std()) * np.sqrt(drawn.size)
+    assert abs(z) < Z, f"standard deviations {drawn.std():.5f} and {added.std():.5f}: z = {z:.1f}"
+    assert drawn.min() >= 0
+
+
+@pytest.mark.learn
+def test_torch_draws_the_same_sums() -> None:
+    import torch
+
+    rng = np.random.default_rng(7)
+    vector, nonzero, order = rng.random((4, 64), dtype=np.float32) * 20, rng.integers(0, 97, (4, 64)), np.arange(4)
+    wanted = HIGH.apply_sum(vector, nonzero, 96, seed=5, frames=order)
+    got = HIGH.apply_sum(*map(torch.from_numpy, (vector, nonzero)), 96, seed=5, frames=torch.from_numpy(order))
+    np.testing.assert_array_equal(got.numpy(), wanted)
+    assert wanted.dtype == np.float32
+    np.testing.assert_array_equal(NOISE_MODELS["none"].apply_sum(vector, nonzero, 96, seed=5, frames=order), vector)
+
+
 # ---------------------------------------------------------------- from text
 
 

@@ -35,8 +35,8 @@ class Samples:
         frames: of a sample.
         arrange: from frames to inputs.
         labels: from targets to labels and back.
-        seed: of noise and splits.
-        epoch: changes the noise; see :meth:`set_epoch`.
+        seed: of noise and order.
+        epoch: changes both; see :meth:`set_epoch`.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Samples:
         self.seed, self.epoch = seed, 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Another epoch draws other noise."""
+        """Another epoch draws other noise, and another order in :meth:`SonarPairs.loader`."""
         self.epoch = epoch
 
     def finished(self, batch: dict[str, torch.Tensor], device: torch.device | str | None = None) -> tuple[Any, torch.Tensor]:
@@ -105,7 +105,7 @@ class SonarPairs(Dataset[Any], Samples):
         cartesian_rows: pixels of a fan in the forward direction.
         noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model.
         labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` goes back.
-        seed: of noise and split.
+        seed: of noise and order; the split has its own (``Split.seed``), so that another seed never mixes its parts.
         one_a_sequence: only one sample of each sequence, for independent tests.
 
     Raises:
@@ -126,7 +126,7 @@ class SonarPairs(Dataset[Any], Samples):
         self.split = _split(split, self.recipe)
         self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
         self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
-        self.first = self._samples(deal(self.scene, self.sequence, self.split, part, self.seed), one_a_sequence)
+        self.first = self._samples(deal(self.scene, self.sequence, self.split, part), one_a_sequence)
         if not len(self.first):
             raise MitsonarError(
                 f"{self.store.place.url} has no sample of {self.frames} frames in part {part!r}: its sequences have "
@@ -253,7 +253,7 @@ def _split(split: str | Split | None, recipe: Recipe) -> Split:
             raise MitsonarError(f"split must be sequence or scene: got {split!r}")
 
 
-def deal(scene: NDArray[np.int32], sequence: NDArray[np.int32], split: Split, part: str, seed: int) -> NDArray[np.bool_]:
+def deal(scene: NDArray[np.int32], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
     """Which frames ``(frames,)`` belong to a part; sequences, or scenes with all that is in them, are dealt out at random.
 
     Raises:
@@ -273,7 +273,7 @@ def deal(scene: NDArray[np.int32], sequence: NDArray[np.int32], split: Split, pa
         raise MitsonarError(
             f"{len(numbers)} {split.by}s cannot be split into {_said(split)}: make more, or give another split"
         )
-    dealt = numbers[np.random.default_rng([seed, 6]).permutation(len(numbers))]
+    dealt = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
     ends = np.cumsum(counts)
     place = PARTS.index(part)
     return np.isin(owner, dealt[ends[place] - counts[place] : ends[place]])

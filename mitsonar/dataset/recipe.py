@@ -100,6 +100,7 @@ class Split(_Part):
     train: float = Field(0.95, ge=0, le=1)
     validation: float = Field(0.05, ge=0, le=1)
     test: float = Field(0.0, ge=0, le=1)
+    seed: int = Field(0, ge=0, lt=2**31, description="of the draw; readers of one data set must agree on it")
 
     @model_validator(mode="after")
     def _whole(self) -> Self:

@@ -24,7 +24,7 @@ __all__ = ["RenderedPairs"]
 
 
 class RenderedPairs(IterableDataset[Any], Samples):
-    """Endless samples of a recipe's kind; with another seed than the recipe's no world or flight is that of its data set.
+    """Endless samples of a recipe's kind, whose worlds and flights are in no data set that ``dataset make`` writes.
 
     Iterating gives ``(input, label)`` as :class:`~mitsonar.dataset.pairs.SonarPairs` does; :meth:`loader` gives batches with
     noise and layout made on their device. Each worker of a ``DataLoader`` renders worlds of its own; workers must be started
@@ -39,6 +39,9 @@ class RenderedPairs(IterableDataset[Any], Samples):
         buffer: samples among which the next is drawn.
         gain: of the pixels; default: that of the recipe's own data set, which is computed first.
         arrangement: as for ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
+
+    Attributes:
+        worlds: the recipe with the seed that its worlds, flights and jitter have here.
 
     Raises:
         MitsonarError: unknown recipe or words; workers that were forked.
@@ -61,6 +64,8 @@ class RenderedPairs(IterableDataset[Any], Samples):
             raise MitsonarError("frames are rendered in training for random flights only: runs have an end, make a data set")
         if self.frames > recipe.flight.pings:
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
+        own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
+        self.worlds = recipe.model_copy(update={"seed": own_seed})
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
     def __iter__(self) -> Iterator[tuple[Any, torch.Tensor]]:
@@ -117,15 +122,14 @@ class RenderedPairs(IterableDataset[Any], Samples):
 
     def _rendered(self, worker: int, workers: int, gain: float) -> Iterator[dict[str, Any]]:
         """Samples in the order in which they are rendered, world after world."""
-        recipe = self.recipe.model_copy(update={"seed": self.seed})
-        weights = np.array([group.count * group.sequences for group in recipe.scenes], dtype=float)
+        weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
         number = worker + self.epoch * 10**6 * workers
         while True:
             rng = np.random.default_rng([self.seed, 8, number])
             group = int(rng.choice(len(weights), p=weights / weights.sum()))
-            scene = Scene(number, group, world_seed(self.seed, number), self.sequences_a_world)
+            scene = Scene(number, group, world_seed(self.worlds.seed, number), self.sequences_a_world)
             release_memory()
-            yield from self._of_world(SceneRenderer(recipe, scene), gain)
+            yield from self._of_world(SceneRenderer(self.worlds, scene), gain)
             number += workers
 
     def _of_world(self, renderer: SceneRenderer, gain: float) -> Iterator[dict[str, Any]]:
@@ -133,13 +137,14 @@ class RenderedPairs(IterableDataset[Any], Samples):
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
         together = max(1, renderer.simulator.pings_per_launch // pings)
         sequences = sequences_of(recipe, renderer.scene)
+        before = renderer.scene.number * self.sequences_a_world * pings
         for start in range(0, self.sequences_a_world, together):
             flown = [next(sequences).vehicle for _ in range(min(together, self.sequences_a_world - start))]
             poses = mounted(np.concatenate(flown), recipe.mount.pose)
             values = renderer.frames(poses, start * pings, gain)
             for k, vehicle in enumerate(flown):
                 for first in range(pings - self.frames + 1):
-                    yield self._sample(values, vehicle, k * pings, first, renderer.scene.number * 2**24 + start * pings)
+                    yield self._sample(values, vehicle, k * pings, first, before + start * pings)
 
     def _sample(self, values: dict[str, Any], vehicle: Any, begin: int, first: int, number: int) -> dict[str, Any]:
         """One sample of a batch of frames."""
