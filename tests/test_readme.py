@@ -13,7 +13,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PYTHON = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+FOR_TORCH = [block for block in BLOCKS if "Pairs" in block]
+PYTHON = [block for block in BLOCKS if block not in FOR_TORCH]
 COMMANDS = [
     shlex.split(line, comments=True)
     for block in re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
@@ -22,22 +24,30 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("code", PYTHON, ids=range(len(PYTHON)))
-def test_python_blocks_run(code: str, tmp_path: Path) -> None:
+def run(command: list[str], folder: Path) -> str:
+    done = subprocess.run([sys.executable, *command], capture_output=True, text=True, cwd=folder, timeout=300)
+    assert done.returncode == 0, (command, done.stderr)
+    return done.stdout
+
+
+def test_commands_and_python_blocks_run_in_order(tmp_path: Path) -> None:
+    """In a folder that holds the scenes, as a checkout does; blocks may use what commands have made."""
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
-
-
-def test_commands_run_in_order(tmp_path: Path) -> None:
-    assert len(COMMANDS) >= 6
+    assert len(COMMANDS) >= 12
     for command in COMMANDS:
         # few frames are enough to see that a command works
-        fewer = ["--frames", "2"] if "--trajectory" in command else []
-        full = [sys.executable, "-m", *command, *fewer]
-        done = subprocess.run(full, capture_output=True, text=True, cwd=tmp_path, timeout=300)
-        assert done.returncode == 0, (command, done.stderr)
+        run(["-m", *command, *(["--frames", "2"] if "--trajectory" in command else [])], tmp_path)
+    for code in PYTHON:
+        assert run(["-c", code], tmp_path)
+
+
+@pytest.mark.learn
+def test_blocks_for_torch_run(tmp_path: Path) -> None:
+    """Those that read the data set of the commands."""
+    make = next(command for command in COMMANDS if command[1:3] == ["dataset", "make"])
+    run(["-m", *make], tmp_path)
+    for code in FOR_TORCH:
+        assert run(["-c", code], tmp_path)
 
 
 def test_links_and_pictures_exist() -> None:

@@ -1,0 +1,264 @@
+"""How fast data sets are made and read: worlds, rendering, compression and writing included.
+
+    python benchmarks/bench_dataset.py [--json] [--quick] [--only make,rendered,read,field]
+
+`make` runs `mitsonar dataset make` as a user would, for two sizes that build the same 30 worlds; the difference of the two
+gives the time of a further frame, and with it the time of 200,000 (said so in the table). Memory is the sum over the command
+and its workers (proportional set size: shared pages count once), sampled twice a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+SIZES = (1_000, 3_000)
+"""Sequences of five frames: 5,000 and 15,000 frames."""
+
+THESIS_FRAMES = 200_000
+GIB = 2.0**30
+
+
+def main() -> None:
+    """Print the tables, or everything as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print for programs")
+    parser.add_argument("--quick", action="store_true", help="a tenth of the frames")
+    parser.add_argument("--only", default="make,rendered,read,field", help="which parts, with commas between")
+    parser.add_argument("--rendered", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--field", nargs=1, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.rendered:
+        recipe, workers, samples = args.rendered
+        return print(json.dumps(rendered(recipe, int(workers), int(samples))))
+    if args.field:
+        return print(json.dumps(largest_field(Path(args.field[0]))))
+    parts = args.only.split(",")
+    share = 10 if args.quick else 1
+    result: dict[str, Any] = {"machine": machine(), "make": [], "rendered": [], "read": []}
+    with tempfile.TemporaryDirectory(prefix="bench-dataset-") as folder:
+        made = Path(folder) / "read.zarr"
+        for recipe in ("rocky-field", "rocky-field-physical"):
+            for workers in (1, 2) if "make" in parts else ():
+                result["make"].append(note(making(recipe, workers, [size // share for size in SIZES], Path(folder))))
+        for recipe in ("rocky-field", "rocky-field-physical"):
+            for workers in (0, 2) if "rendered" in parts else ():
+                samples = str(12_000 // share)
+                result["rendered"].append(note(in_a_process("--rendered", recipe, str(workers), samples)))
+        if "read" in parts:
+            command(["dataset", "make", "rocky-field", "--sequences", "400", "-o", str(made)])
+            result["read"] = [note(row) for row in reading(made)]
+        if "field" in parts:
+            result["field"] = note(in_a_process("--field", str(Path(folder) / "field")))
+    print(json.dumps(result, indent=2) if args.json else tables(result))
+
+
+def note(what: Any) -> Any:
+    """Progress, out of the way of what is printed."""
+    print(what, file=sys.stderr, flush=True)
+    return what
+
+
+def machine() -> dict[str, Any]:
+    """What it ran on."""
+    names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
+    return {
+        "cpu": names[0] if names else platform.machine(),
+        "cores": len(os.sched_getaffinity(0)),
+        "mitsuba": version("mitsuba"),
+        "torch": version("torch"),
+        "zarr": version("zarr"),
+        "date": date.today().isoformat(),
+    }
+
+
+def command(words: list[str]) -> None:
+    """Run a command of mitsonar to its end."""
+    subprocess.run(
+        [sys.executable, "-m", "mitsonar", *words], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+def in_a_process(*words: str) -> Any:
+    """What this script, started anew, prints: its memory is its own then."""
+    out = subprocess.run([sys.executable, __file__, *words], check=True, capture_output=True, text=True).stdout
+    return json.loads(out.splitlines()[-1])
+
+
+def memory(process: psutil.Process) -> float:
+    """GiB of a process and its children."""
+    total = 0
+    for one in [process, *process.children(recursive=True)]:
+        try:
+            total += one.memory_full_info().pss
+        except psutil.Error:  # it has just ended
+            continue
+    return total / GIB
+
+
+# ---------------------------------------------------------------- parts
+
+
+def making(recipe: str, workers: int, sizes: list[int], folder: Path) -> dict[str, Any]:
+    """Seconds, memory and bytes of the command, for two sizes; what a frame more costs."""
+    seconds, peaks = [], []
+    for size in sizes:
+        url = folder / f"{recipe}-{workers}-{size}.zarr"
+        words = ["dataset", "make", recipe, "--sequences", str(size), "--workers", str(workers), "-o", str(url)]
+        start, samples = time.perf_counter(), []
+        run = psutil.Popen([sys.executable, "-m", "mitsonar", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while run.poll() is None:
+            samples.append(memory(run))
+            time.sleep(0.5)
+        if run.returncode:
+            raise SystemExit(f"mitsonar {' '.join(words)} failed: run it by hand")
+        seconds.append(time.perf_counter() - start)
+        peaks.append((max(samples), max(samples[len(samples) // 4 : len(samples) // 2]), max(samples[-len(samples) // 4 :])))
+        stored = sum(path.stat().st_size for path in url.rglob("*") if path.is_file())
+    frames = [5 * size for size in sizes]
+    each = (seconds[1] - seconds[0]) / (frames[1] - frames[0])
+    return {
+        "recipe": recipe,
+        "workers": workers,
+        "frames": frames[1],
+        "seconds": seconds[1],
+        "images a second": frames[1] / seconds[1],
+        "images a second, once running": 1 / each,
+        "minutes for 200,000, extrapolated": (seconds[1] + (THESIS_FRAMES - frames[1]) * each) / 60,
+        "peak GiB": peaks[1][0],
+        "GiB in the second and in the last quarter": peaks[1][1:],
+        "bytes an image": stored / frames[1],
+    }
+
+
+def rendered(recipe: str, workers: int, samples: int) -> dict[str, Any]:
+    """Samples a second that training would get, over some worlds; when the first comes, a buffer of others is there."""
+    from mitsonar import RenderedPairs
+
+    pairs = RenderedPairs(recipe, seed=1, length=samples, gain=1.0 if recipe == "rocky-field" else 0.05)
+    process, peak, taken = psutil.Process(), 0.0, 0
+    begun = first = time.perf_counter()
+    for number, (_, label) in enumerate(pairs.loader(50, workers=workers)):
+        if number == 0:
+            first = time.perf_counter()
+        taken += len(label)
+        if number % 20 == 1:
+            peak = max(peak, memory(process))
+    return {
+        "recipe": recipe,
+        "workers": workers,
+        "samples": taken,
+        "pairs a second": taken / (time.perf_counter() - begun),
+        "pairs a second, once running": (taken - 50 - pairs.buffer * max(workers, 1)) / (time.perf_counter() - first),
+        "peak GiB": peak,
+    }
+
+
+def reading(url: Path) -> Iterator[dict[str, Any]]:
+    """Samples a second out of a store, in batches of 50, arrangements taking turns."""
+    import torch
+
+    from mitsonar import SonarPairs
+
+    torch.set_num_threads(2)
+    kinds: dict[str, dict[str, Any]] = {
+        "polar, no noise": {},
+        "polar, high noise": {"noise": "high"},
+        "Cartesian, no noise": {"coordinates": "cartesian"},
+        "vectors, high noise": {"kind": "vector", "noise": "high"},
+    }
+    sets = {name: SonarPairs(url, part="all", **words) for name, words in kinds.items()}
+    times: dict[str, list[float]] = {name: [] for name in sets}
+    for _ in range(5):
+        for name, pairs in sets.items():
+            start = time.perf_counter()
+            for batch, _ in enumerate(pairs.loader(50)):
+                if batch == 7:
+                    break
+            times[name].append((time.perf_counter() - start) / 400)
+    for name, values in times.items():
+        yield {"arrangement": name, "pairs a second": 1 / float(np.median(values[1:]))}
+
+
+def largest_field(folder: Path) -> dict[str, Any]:
+    """Seconds to build, write and load 130 x 130 rocks of each kind, and the memory of it all."""
+    from mitsonar.simulation.scenes import load_scene
+    from mitsonar.simulation.worlds.rocky_field import RockyField
+
+    start = time.perf_counter()
+    world = RockyField(size_m=50, a_side=(130, 130)).build(0)
+    built = time.perf_counter()
+    path = world.write(folder)
+    written, triangles = time.perf_counter(), world.faces
+    load_scene(path)
+    loaded = time.perf_counter()
+    status = Path("/proc/self/status").read_text()
+    peak = int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 2**20
+    return {
+        "triangles": triangles,
+        "build s": built - start,
+        "write s": written - built,
+        "load s": loaded - written,
+        "peak GiB": peak,
+    }
+
+
+def tables(result: dict[str, Any]) -> str:
+    """The same in Markdown."""
+    m = result["machine"]
+    lines = [f"{m['cpu']}, {m['cores']} cores; Mitsuba {m['mitsuba']}, Zarr {m['zarr']}, torch {m['torch']}, {m['date']}"]
+    if result["make"]:
+        lines += [
+            "",
+            "| recipe | workers | frames | s, all included | images/s | images/s once running | 200,000, extrapolated "
+            "| peak GiB | 2nd and last quarter | bytes an image |",
+            "|---" * 10 + "|",
+        ]
+    for row in result["make"]:
+        early, late = row["GiB in the second and in the last quarter"]
+        cells = [
+            f"{row['recipe']} | {row['workers']} | {row['frames']:,} | {row['seconds']:.0f} | {row['images a second']:.0f}",
+            f"{row['images a second, once running']:.0f} | {row['minutes for 200,000, extrapolated']:.1f} min",
+            f"{row['peak GiB']:.2f} | {early:.2f}, {late:.2f} | {row['bytes an image']:,.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    if result["rendered"]:
+        lines += [
+            "",
+            "| `RenderedPairs` | workers | samples | pairs/s, all included | once running | peak GiB |",
+            "|---" * 6 + "|",
+        ]
+    for row in result["rendered"]:
+        lines.append(
+            f"| {row['recipe']} | {row['workers'] or 'in the process'} | {row['samples']:,} | {row['pairs a second']:.0f} "
+            f"| {row['pairs a second, once running']:.0f} | {row['peak GiB']:.2f} |"
+        )
+    if result["read"]:
+        lines += ["", "| `SonarPairs`, one process | pairs/s |", "|---|---|"]
+    lines += [f"| {row['arrangement']} | {row['pairs a second']:.0f} |" for row in result["read"]]
+    if "field" in result:
+        f = result["field"]
+        lines += [
+            "",
+            f"Largest rocky field, 3 x 130 x 130 rocks, {f['triangles']:,} triangles: built in {f['build s']:.1f} s, "
+            f"written in {f['write s']:.1f} s, loaded in {f['load s']:.1f} s, {f['peak GiB']:.2f} GiB at most.",
+        ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

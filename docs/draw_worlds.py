@@ -1,0 +1,90 @@
+"""Draws docs/gallery/worlds.png: each world from above, lit from the side, and as the sonar that stands in it sees it.
+
+python docs/draw_worlds.py
+"""
+
+from __future__ import annotations
+
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mitsonar
+from mitsonar.geometry import to_cartesian
+from mitsonar.motion import Pose
+from mitsonar.simulation.scenes import sonar_in
+from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.worlds.families import create_family
+
+SHOWN = {
+    "rocky-field": ({}, 4.0),
+    "ship-hull": ({}, 4.0),
+    "pattern": ({}, 6.0),
+    "flat-objects": ({}, 4.0),
+}
+"""Options of each family, and half the edge of what is drawn from above [m]."""
+
+
+def from_above(scene: Any, middle: tuple[float, float], half_m: float) -> np.ndarray:
+    """A photograph, as if the water were clear; north is up."""
+    import mitsuba as mi
+
+    sun = {"type": "directional", "direction": [0.8, -0.5, -0.7], "irradiance": {"type": "uniform", "value": 3.0}}
+    sky = {"type": "constant", "radiance": {"type": "uniform", "value": 0.25}}
+    x, y = middle
+    look = mi.ScalarTransform4f().look_at(origin=[x, y, 20], target=[x, y, 0], up=[0, 1, 0])
+    camera = mi.load_dict(
+        {
+            "type": "orthographic",
+            "to_world": look @ mi.ScalarTransform4f().scale([half_m, half_m, 1]),
+            "film": {"type": "hdrfilm", "width": 700, "height": 700, "pixel_format": "luminance"},
+        }
+    )
+    shapes = {f"shape{number}": shape for number, shape in enumerate(scene.shapes())}
+    lit = mi.load_dict({"type": "scene", "sun": sun, "sky": sky, **shapes})
+    picture = np.array(mi.render(lit, sensor=camera, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=64))
+    return np.clip(picture[..., 0], 0, 1) ** (1 / 2.2)
+
+
+def footprint_outline(sonar: mitsonar.Sonar, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """Where the window lies on the ground."""
+    edge = np.radians(sonar.azimuth_fov_deg) / 2
+    near, far = (np.sqrt(max(r**2 - pose.z**2, 0)) for r in (sonar.range_min, sonar.range_max))
+    bearing = np.linspace(-edge, edge, 40)
+    r = np.r_[np.full(40, near), np.full(40, far), near]
+    b = np.r_[bearing, bearing[::-1], bearing[0]] + pose.heading
+    return pose.x + r * np.sin(b), pose.y + r * np.cos(b)
+
+
+def main() -> None:
+    """Draw and write the picture."""
+    ensure_variant()
+    warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
+    figure, axes = plt.subplots(2, len(SHOWN), figsize=(4 * len(SHOWN), 8.2), layout="constrained")
+    for (name, (options, half_m)), (above, below) in zip(SHOWN.items(), axes.T, strict=True):
+        with tempfile.TemporaryDirectory() as folder:
+            world = create_family(name, **options).build(1)
+            scene = mitsonar.load_scene(world.write(Path(folder) / "world"))
+        found = sonar_in(scene)
+        assert found is not None
+        sonar, pose = found
+        frames = mitsonar.Simulator(scene, sonar).render([pose])
+        x, y = footprint_outline(sonar, pose)
+        middle = (float(x.mean()), float(y.mean())) if half_m < 6 else (0.0, 0.0)
+        extent = (middle[0] - half_m, middle[0] + half_m, middle[1] - half_m, middle[1] + half_m)
+        above.imshow(from_above(scene, middle, half_m), cmap="gray", extent=extent, vmin=0, vmax=1)
+        above.plot(x, y, color="tab:orange", lw=1)
+        above.plot(pose.x, pose.y, "o", color="tab:orange", ms=5)
+        above.set(title=name, xlim=extent[:2], ylim=extent[2:], xlabel="x, m", ylabel="y, m")
+        fan = to_cartesian(frames.image[0], frames.range_m, frames.bearing_rad)
+        below.imshow(fan.image, extent=fan.extent, cmap="copper", vmin=0, vmax=1)
+        below.set(facecolor="black", xlabel="starboard, m", ylabel="ahead, m")
+    figure.savefig(Path(__file__).parent / "gallery" / "worlds.png", dpi=70)
+
+
+if __name__ == "__main__":
+    main()
