@@ -21,6 +21,7 @@ lint: $(VENV)/.tested
 bench: $(VENV)/.tested
 	$(PIP) -e '.[bench]'
 	$(VENV)/bin/python benchmarks/bench_render.py
+	$(VENV)/bin/python benchmarks/bench_dataset.py
 
 system:
 	@.ci/system_libraries

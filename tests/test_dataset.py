@@ -24,6 +24,7 @@ from mitsonar.dataset.rendering import FRAMES_A_SCENE, SceneRenderer, calibrate
 from mitsonar.dataset.shards import forget, make_shard
 from mitsonar.dataset.sheet import info, sheet_figure
 from mitsonar.dataset.store import DataStore, array_names
+from mitsonar.dataset.workers import Queue
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import to_uint8
 from mitsonar.motion import mounted
@@ -231,6 +232,37 @@ def command(folder: Path, *options: object, recipe: dict[str, Any] | None = None
 
 def run(arguments: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(arguments, capture_output=True, text=True, env={**os.environ, **environment}, timeout=300)
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3, 7])
+def test_workers_go_on_where_they_are(workers: int) -> None:
+    """Every shard is handed out once, and a worker seldom leaves its stretch: elsewhere it must load a scene."""
+    queue = Queue(list(range(100)))
+    rng = np.random.default_rng(workers)
+    speed = rng.uniform(0.5, 2, workers)
+    ready = np.zeros(workers)
+    made: dict[str, list[int]] = {str(number): [] for number in range(workers)}
+    while queue:
+        number = int(ready.argmin())
+        made[str(number)].append(queue.next(str(number)))
+        ready[number] += rng.uniform(0.8, 1.2) / speed[number]
+    assert sorted(shard for mine in made.values() for shard in mine) == list(range(100))
+    moves = sum(int((np.diff(mine) != 1).sum()) for mine in made.values())
+    assert moves <= 4 * (workers - 1)
+
+
+def test_shards_of_a_lost_worker_are_handed_out_again() -> None:
+    queue = Queue([0, 1, 2])
+    assert [queue.next("a"), queue.next("b")] == [0, 2]
+    queue.forget(["b"])
+    queue.give_back(0)
+    assert [queue.next("b"), queue.next("b")] == [0, 1]
+    assert not queue
+    for _ in range(2):
+        queue.give_back(1)
+    queue.give_back(1)
+    with pytest.raises(MitsonarError, match="again and again at shard 1"):
+        queue.give_back(1)
 
 
 def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from mitsonar.dataset.shards import forget, make_shard
 from mitsonar.dataset.store import DECIDING, DataStore, versions
@@ -52,7 +54,7 @@ def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: s
             forget()
     else:
         with _client(workers, scheduler) as client:
-            yield from _hand_out(client, store, Queue(store, todo))
+            yield from _hand_out(client, store, Queue(todo))
 
 
 @contextlib.contextmanager
@@ -93,15 +95,15 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 
 class Queue:
-    """Shards that wait: a worker is given those of the scene that it has, then of a scene that nobody has."""
+    """Shards that wait: a worker goes on where it is, whose scene it has; where it cannot, it begins a stretch of its own.
 
-    def __init__(self, store: DataStore, todo: list[int]) -> None:
-        scene_of = store.read("scene")
-        self.scene = {shard: int(scene_of[store.frames_of(shard).start]) for shard in todo}
-        self.waiting: dict[int, deque[int]] = {}
-        for shard in todo:
-            self.waiting.setdefault(self.scene[shard], deque()).append(shard)
-        self.has: dict[str, int] = {}
+    Args:
+        todo: numbers of the shards.
+    """
+
+    def __init__(self, todo: list[int]) -> None:
+        self.waiting = set(todo)
+        self.at: dict[str, int] = {}
         self.lost: Counter[int] = Counter()
 
     def __bool__(self) -> bool:
@@ -109,15 +111,23 @@ class Queue:
 
     def next(self, worker: str) -> int:
         """The next shard for a worker."""
-        scene = self.has.get(worker, -1)
-        if scene not in self.waiting:
-            free = [number for number in self.waiting if number not in self.has.values()]
-            scene = free[0] if free else max(self.waiting, key=lambda number: len(self.waiting[number]))
-        self.has[worker] = scene
-        shard = self.waiting[scene].popleft()
-        if not self.waiting[scene]:
-            del self.waiting[scene]
+        shard = self.at.get(worker, -2) + 1
+        if shard not in self.waiting:
+            first, end = self._longest()
+            taken = first - 1 in self.at.values()  # somebody will go on there
+            shard = (first + end) // 2 if taken else first
+        self.waiting.remove(shard)
+        self.at[worker] = shard
         return shard
+
+    def _longest(self) -> tuple[int, int]:
+        """The longest stretch of shards that wait: its first, and the one after its last."""
+        waiting = np.sort(np.fromiter(self.waiting, dtype=int))
+        ends = np.flatnonzero(np.append(np.diff(waiting) > 1, True)) + 1
+        lengths = np.diff(ends, prepend=0)
+        longest = int(lengths.argmax())
+        first = int(waiting[ends[longest] - lengths[longest]])
+        return first, first + int(lengths[longest])
 
     def give_back(self, shard: int) -> None:
         """A worker was lost with this shard: another makes it.
@@ -131,11 +141,11 @@ class Queue:
                 f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole "
                 "stays, the same command goes on"
             )
-        self.waiting.setdefault(self.scene[shard], deque()).appendleft(shard)
+        self.waiting.add(shard)
 
     def forget(self, alive: list[str]) -> None:
-        """Workers that are gone hold no scene."""
-        self.has = {worker: scene for worker, scene in self.has.items() if worker in alive}
+        """Workers that are gone are nowhere."""
+        self.at = {worker: shard for worker, shard in self.at.items() if worker in alive}
 
 
 def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
