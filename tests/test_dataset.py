@@ -23,7 +23,7 @@ from mitsonar.dataset.plan import Plan, sequences_of
 from mitsonar.dataset.rendering import FRAMES_A_SCENE, SceneRenderer, calibrate
 from mitsonar.dataset.shards import forget, make_shard
 from mitsonar.dataset.sheet import info, sheet_figure
-from mitsonar.dataset.store import DataStore, array_names
+from mitsonar.dataset.store import DataStore, array_names, versions
 from mitsonar.dataset.workers import Queue
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import to_uint8
@@ -78,7 +78,7 @@ def test_the_gain_is_set_on_20_frames_of_the_first_scene(made: Path) -> None:
     levels = store.read("image", slice(0, 20)) / 255
     assert np.percentile(levels, 99.9) == pytest.approx(0.9, abs=0.01)
     recipe = tiny_recipe()
-    assert calibrate(recipe, Plan.of(recipe, 1).scenes[0]) == store.about["gain"]
+    assert calibrate(recipe) == store.about["gain"]
 
 
 def test_plan_and_store_say_the_same(made: Path) -> None:
@@ -102,7 +102,7 @@ def test_standing_still_shows_the_jitter_alone() -> None:
         scene = Plan.of(recipe, 2).scenes[0]
         sequences = sequences_of(recipe, scene)
         poses = mounted(np.concatenate([next(sequences).vehicle for _ in range(2)]), recipe.mount.pose)
-        image = SceneRenderer(recipe, scene).frames(poses, 0, calibrate(recipe, scene))["image"].astype(float)
+        image = SceneRenderer(recipe, scene).frames(poses, 0, calibrate(recipe))["image"].astype(float)
         within, across = np.abs(image[1] - image[0]).mean(), np.abs(image[5] - image[0]).mean()
         assert (within > 0) == jitter
         assert within < 0.7 * across
@@ -232,6 +232,85 @@ def command(folder: Path, *options: object, recipe: dict[str, Any] | None = None
 
 def run(arguments: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(arguments, capture_output=True, text=True, env={**os.environ, **environment}, timeout=300)
+
+
+def test_a_worker_that_lives_on_makes_the_data_set_that_it_is_asked_for(tmp_path: Path) -> None:
+    """The same folder, another seed: nothing of the first may be in the second."""
+    import shutil
+
+    url = tmp_path / "tiny.zarr"
+    for seed in (1, 2):
+        shutil.rmtree(url, ignore_errors=True)
+        recipe = tiny_recipe(seed=seed)
+        place = Place(url)
+        about = {"gain": 0.02, "level_scale": 50.0, "variant": "llvm_ad_mono", "versions": versions()}
+        store = DataStore.create(place, recipe, Plan.of(recipe, 3), about)
+        make_shard(DataStore.open(url, write=True, unfinished=True), 0)
+    here = store.frames_of(0)
+    forget()
+    alone = SceneRenderer(recipe, store.scenes[0]).frames(store.read("pose", here), 0, 0.02)
+    np.testing.assert_array_equal(store.read("image", here), alone["image"])
+
+
+def test_a_shard_that_vanishes_while_others_are_written_is_made_again(made: Path, tmp_path: Path) -> None:
+    url = tmp_path / "tiny.zarr"
+    harmed: list[Path] = []
+
+    def harm(frames: int) -> None:
+        if not harmed:
+            harmed.append(first_shard(DataStore.open(url, unfinished=True)))
+            harmed[0].unlink()
+
+    make(tiny_recipe(), str(url), progress=harm)
+    assert harmed
+    assert files_of(url) == files_of(made)
+
+
+@pytest.mark.parametrize("name", ["pose", "time_s", "motion", "scene"])
+@pytest.mark.parametrize("harm", ["truncate", "delete", "change"])
+def test_what_the_plan_says_is_checked_and_mended(made: Path, tmp_path: Path, name: str, harm: str) -> None:
+    import zarr
+
+    url = copy_of(made, tmp_path)
+    (chunk,) = [path for path in (url / name / "c").rglob("*") if path.is_file()]
+    if harm == "change":
+        array = zarr.open_group(url, mode="r+")[name]
+        array[3] = np.asarray(array[3]) + 1  # type: ignore[index]
+    elif harm == "truncate":
+        chunk.write_bytes(chunk.read_bytes()[:20])
+    else:
+        chunk.unlink()
+    assert any(name in fault for fault in check(DataStore.open(url)))
+    make(tiny_recipe(), str(url), verify=True)
+    assert check(DataStore.open(url)) == []
+    assert files_of(url) == files_of(made)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("image/zarr.json", b"{"),
+        ("image/zarr.json", None),
+        ("zarr.json", b'{"zarr_format": 3, "node_type": "group", "attributes": {"kind": "mitsonar data set", "format": 1}}'),
+    ],
+)
+def test_damaged_metadata_is_one_sentence(made: Path, tmp_path: Path, name: str, content: bytes | None) -> None:
+    url = copy_of(made, tmp_path)
+    (url / name).unlink()
+    if content is not None:
+        (url / name).write_bytes(content)
+    for word in ("check", "info"):
+        refused(run([sys.executable, "-m", "mitsonar", "dataset", word, str(url)]), "damaged")
+    refused(run(command(tmp_path, "--workers", 1, "--verify")), "damaged")
+
+
+def test_killed_before_the_group_is_whole(made: Path, tmp_path: Path) -> None:
+    """A file half written, or a group with arrays half made: begun anew."""
+    url = tmp_path / "tiny.zarr"
+    url.mkdir()
+    (url / "zarr.json.4711.partial").write_bytes(b"{")
+    make(tiny_recipe(), str(url))
+    assert files_of(url) == files_of(made)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 7])
@@ -420,7 +499,7 @@ with Place({str(url)!r}).locked():
         assert holder.stdout is not None
         assert holder.stdout.readline() == "locked\n"
         refused(run(command(tmp_path, "--workers", 1)), "another process is writing", "nothing was changed")
-        assert files_of(url) == {}
+        assert files_of(url) == {"writer.lock": b""}
     finally:
         holder.kill()
         holder.wait()
@@ -440,6 +519,8 @@ def test_another_data_set_is_not_overwritten(made: Path, tmp_path: Path) -> None
     (tmp_path / "mine").write_text("years of work")
     with pytest.raises(MitsonarError, match="no Zarr store"):
         make(tiny_recipe(), str(tmp_path))
+    with pytest.raises(MitsonarError, match="is a file"):
+        make(tiny_recipe(), str(tmp_path / "mine"))
     assert files_of(tmp_path) == {"mine": b"years of work"}
 
 
@@ -450,7 +531,7 @@ def test_a_data_set_begun_with_another_version_is_not_mixed(made: Path, tmp_path
     group = zarr.open_group(url, mode="r+")
     group.attrs["versions"] = {**dict(group.attrs["versions"]), "mitsuba": "3.8.0"}  # type: ignore[arg-type]
     make(tiny_recipe(), str(url))  # finished: nothing would be mixed
-    group.attrs["finished"] = False
+    first_shard(DataStore.open(url)).unlink()
     with pytest.raises(MitsonarError, match=r"begun with mitsuba 3\.8\.0"):
         make(tiny_recipe(), str(url))
     group.attrs["versions"] = dict(DataStore.open(made).about["versions"])
@@ -594,6 +675,37 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
     assert objects_of(url) == files_of(made)
 
 
+def test_objects_of_others_are_kept(bucket: str) -> None:
+    place = Place(f"{bucket}/mine")
+    place.write("image/years.jpg", b"years of work")
+    with pytest.raises(MitsonarError, match="no Zarr store: it is kept"):
+        make(tiny_recipe(), f"{bucket}/mine")
+    assert place.read("image/years.jpg") == b"years of work"
+
+
+def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    arguments = command(tmp_path, "--workers", 1)
+    arguments[arguments.index("-o") + 1] = "s3://bucket/tiny.zarr"
+    refused(run(arguments), "cannot list s3://bucket/tiny.zarr", "endpoint")
+
+
+def test_a_writer_that_was_taken_over_stops(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a long stall another has gone on: this one must neither write on nor take the lock back."""
+    monkeypatch.setattr("mitsonar.dataset.place.HEARTBEAT_S", 0.05)
+    place = Place(f"{bucket}/stalled.zarr")
+    with place.locked() as still_ours:
+        still_ours()
+        other = json.dumps({"owner": "other 1 x", "time": time.time()}).encode()
+        place.write("writer.json", other)
+        time.sleep(1.0)
+        with pytest.raises(MitsonarError, match=r"took .* over"):
+            still_ours()
+    assert place.read("writer.json") == other
+    place.remove("writer.json")
+
+
 def test_a_store_that_is_not_there(bucket: str, tmp_path: Path) -> None:
     for url in (f"{bucket}/none.zarr", "s3://nobucket/none.zarr", str(tmp_path / "none.zarr")):
         with pytest.raises(MitsonarError, match="no data set at"):
@@ -696,6 +808,6 @@ def test_shards_can_be_made_by_hand(made: Path, tmp_path: Path) -> None:
     url = copy_of(made, tmp_path)
     store = DataStore.open(url)
     first_shard(store).unlink()
-    assert make_shard(str(url), 0) == 0
+    assert make_shard(DataStore.open(url, write=True, unfinished=True), 0) == 0
     forget()
     assert files_of(url) == files_of(made)

@@ -85,8 +85,9 @@ def test_three_frames_have_the_mean_motion_and_one_its_height(made: Path) -> Non
     heights = SonarPairs(made, part="all", frames=1)
     assert len(heights) == 150
     assert heights[3][1].tolist() == [2.5]
-    with pytest.raises(MitsonarError, match="no sample of 6 frames"):
-        SonarPairs(made, frames=6)
+    for many in (6, 149, 151, 400):
+        with pytest.raises(MitsonarError, match=f"no sample of {many} frames"):
+            SonarPairs(made, frames=many)
 
 
 def test_samples_never_cross_from_one_sequence_to_the_next(made: Path) -> None:
@@ -251,6 +252,26 @@ def test_no_image_and_by_scene_no_world_is_in_two_parts(made: Path, by: str) -> 
         assert [len(pairs) for pairs in parts.values()] == [15 * 4, 9 * 4, 6 * 4]
 
 
+def test_scenes_of_one_world_stay_together(tmp_path: Path) -> None:
+    """A scene file, or a picture as seabed, is the same world whatever the seed."""
+    world = {"family": "pattern", "texture": "photo_sand"}
+    recipe = tiny_recipe(
+        world=world, scenes=[{"count": 2, "sequences": 4}, {"count": 2, "sequences": 4, "world": {"texture": "gaussian"}}]
+    )
+    make(recipe, str(tmp_path / "photo.zarr"))
+    split = Split(by="scene", train=0.5, validation=0.3, test=0.2)
+    found = [set(pairs.scene[pairs.first]) for pairs in parts_of(tmp_path / "photo.zarr", split)]
+    assert sorted(map(len, found)) == [1, 1, 2]
+    assert {0, 1} in found
+    make(tiny_recipe(world=world), str(tmp_path / "one.zarr"))
+    with pytest.raises(MitsonarError, match="1 different scenes cannot be split"):
+        SonarPairs(tmp_path / "one.zarr", split=split)
+
+
+def parts_of(url: Path, split: Split) -> list[SonarPairs]:
+    return [SonarPairs(url, part=part, split=split) for part in ("train", "validation", "test")]
+
+
 def test_parts_do_not_depend_on_the_seed_of_noise_and_order(made: Path) -> None:
     """Another seed for validation must not move training samples into it."""
     for seed in (0, 1, 2):
@@ -315,8 +336,8 @@ def test_stores_are_read_without_a_renderer(made: Path) -> None:
 
 
 def test_rendered_samples_are_those_of_a_store_of_their_worlds(tmp_path: Path) -> None:
-    """Two routes, bit for bit: through a store on disk, and straight from the renderer."""
-    recipe = tiny_recipe(scenes=[{"count": 2, "sequences": 6}])
+    """Two routes, bit for bit, jitter included: through a store on disk, and straight from the renderer."""
+    recipe = tiny_recipe(scenes=[{"count": 2, "sequences": 6}], sonar__jitter=True)
     rendered = RenderedPairs(
         recipe,
         seed=5,

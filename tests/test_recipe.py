@@ -138,6 +138,22 @@ def test_a_scene_of_one_s_own(tmp_path: Path) -> None:
         ({"labels": ["shadow"], "store": "vectors"}, "labels are pixels"),
         ({"split": {"train": 0.5}}, "add up to 1"),
         ({"mount": {"pitch_deg": 100}}, "pitch_deg"),
+        ({"flight": {"height_m": float("nan")}}, "above 0"),
+        ({"flight": {"height_m": float("inf")}}, "above 0"),
+        ({"flight": {"jump_m": [-4, -3]}}, "0 <= low"),
+        ({"flight": {"footprint_fov_deg": [0, 10]}}, "footprint_fov_deg"),
+        ({"flight": {"footprint_fov_deg": [float("nan"), 10]}}, "footprint_fov_deg"),
+        ({"scenes": [{"sequences": 3}], "flight": {"kind": "runs", "height_m": [2, 3]}}, "one number"),
+        ({"sonar": {"jitter": True}, "receivers": [{"name": "label"}]}, "choose another name"),
+        (
+            {
+                "sonar": {"preset": "didson300", "beams": 768, "rays_per_beam": 4, "jitter": True, "model": "thesis"},
+                "receivers": [
+                    {"name": x, "starboard_m": 0.5, "sonar": {"beams": 96, "range_bins": n}} for x, n in (("a", 5), ("b", 6))
+                ],
+            },
+            "same window",
+        ),
     ],
 )
 def test_mistakes_are_answered_by_one_sentence(changes: dict[str, Any], words: str, tmp_path: Path) -> None:

@@ -446,3 +446,39 @@ def test_real_models_render(path: Path, tmp_path: Path) -> None:
     frames = Simulator(scene, found[0].replace(rays_per_beam=200)).render([found[1]], labels=True, gain=1.0)
     assert frames.object_id is not None
     assert (frames.object_id >= 1).mean() > 0.005
+
+
+@pytest.mark.parametrize(
+    ("fields", "left"),
+    [
+        ({"groups_a_side": (0, 0)}, ["anodes"]),
+        ({"anodes_a_side": (0, 0)}, ["tubes"]),
+        ({"tubes_a_group": (0, 0)}, ["anodes"]),
+        ({"tubes_a_group": (0, 2)}, ["tubes", "anodes"]),
+        ({"groups_a_side": (0, 0), "anodes_a_side": (0, 0)}, []),
+    ],
+)
+def test_hulls_without_some_of_their_objects(fields: dict[str, Any], left: list[str]) -> None:
+    for seed in range(6):
+        assert [mesh.name for mesh in ShipHull(**fields).build(seed).meshes] == left
+
+
+@pytest.mark.parametrize(
+    ("factor", "reflectivity", "wanted"),
+    [([128, 128, 128, 255], "luminance", 128 / 255), ([128, 0, 0, 255], "red", 128 / 255), (None, "luminance", 1.0)],
+)
+def test_colour_factors_of_gltf_are_linear(
+    factor: list[int] | None, reflectivity: str, wanted: float, tmp_path: Path
+) -> None:
+    box = trimesh.creation.box((1, 1, 1))
+    material = trimesh.visual.material.PBRMaterial(baseColorFactor=factor)
+    box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+    box.export(tmp_path / "box.glb")
+    (mesh,) = mesh_world(tmp_path / "box.glb", reflectivity=reflectivity).meshes
+    np.testing.assert_allclose(mesh.reflectivity, wanted, atol=1e-6)
+
+
+def test_a_model_without_colours_is_half_reflecting(tmp_path: Path) -> None:
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.stl")
+    (mesh,) = mesh_world(tmp_path / "box.stl").meshes
+    np.testing.assert_array_equal(mesh.reflectivity, 0.5)

@@ -30,6 +30,9 @@ def warn(text: str) -> None:
     typer.echo(f"warning: {text}", err=True)
 
 
+AGAIN = "the same command goes on (`render` with --resume)"
+
+
 def answered(command: Callable[P, R]) -> Callable[P, R]:
     """Answer a mistake with one sentence and exit code 2, and a full disk or Ctrl-C likewise; never with a traceback."""
 
@@ -45,15 +48,15 @@ def answered(command: Callable[P, R]) -> Callable[P, R]:
             raise typer.Exit(0) from None
         except OSError as error:
             where = f" ({error.filename})" if error.filename else ""
-            typer.echo(f"error: {error.strerror or error}{where}; what is whole on disk stays, --resume goes on", err=True)
+            typer.echo(f"error: {error.strerror or error}{where}; what is whole on disk stays, {AGAIN}", err=True)
         except MemoryError:
-            typer.echo("error: out of memory; lower beams, rays_per_beam, rays_across or range_bins of the sonar", err=True)
+            typer.echo("error: out of memory; ask for less: beams, rays or bins of the sonar, objects of a world", err=True)
         except RuntimeError as error:
             if "memory" not in str(error):
                 raise
             typer.echo("error: out of memory; lower --rays-per-launch, or the sonar's beams, rays or bins", err=True)
         except KeyboardInterrupt:
-            typer.echo("stopped; whole frames stay on disk, --resume goes on", err=True)
+            typer.echo(f"stopped; what is whole on disk stays, {AGAIN}", err=True)
             raise typer.Exit(130) from None
         raise typer.Exit(2)
 

@@ -78,7 +78,7 @@ def make(
 def info(
     data: Data,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
-    recipe: Annotated[bool, typer.Option("--recipe", help="The recipe as YAML, which makes the data set again.")] = False,
+    recipe: Annotated[bool, typer.Option("--recipe", help="The recipe as YAML.")] = False,
 ) -> None:
     """Print what a data set holds: frames, arrays, levels against noise, versions."""
     import yaml
@@ -130,6 +130,8 @@ def show(
 
     store = DataStore.open(data)
     path = out or Path(Path(store.place.url).stem + ".png")
+    if out is None and path.exists():
+        raise MitsonarError(f"{path} exists and is kept: say where to write with -o")
     buffer = io.BytesIO()
     sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
     write_whole(path, buffer.getvalue())

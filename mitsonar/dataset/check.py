@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.dataset.plan import footprint
+from mitsonar.dataset.plan import Plan, footprint, footprints_at
 from mitsonar.dataset.store import DataStore, array_names
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import motions
@@ -21,10 +21,11 @@ LABEL_TOLERANCE = 1e-9
 def check(store: DataStore, progress: Callable[[int], None] = lambda frames: None) -> list[str]:
     """What is wrong, a sentence each; nothing where all is well. Reads everything."""
     wrong = _files(store, progress)
-    try:
-        wrong += [*_counts(store), *_labels(store), *_flight(store)]
-    except MitsonarError as error:
-        wrong.append(str(error))
+    for look in (_plan, _counts, _labels, _flight):
+        try:
+            wrong += look(store)
+        except MitsonarError as error:
+            wrong.append(str(error))
     return wrong
 
 
@@ -89,6 +90,12 @@ def _limits(kind: str, values: NDArray[Any], beams: int) -> tuple[float, float]:
             return -1, np.inf
 
 
+def _plan(store: DataStore) -> list[str]:
+    """What recipe and seed say of each frame, planned again."""
+    plan = Plan.of(store.recipe, int(store.about["sequences"]))
+    return [f"{name} is not what recipe and seed give" for name in store.unplanned(plan)]
+
+
 def _counts(store: DataStore) -> list[str]:
     """Numbers of frames, sequences and scenes."""
     about, wrong = store.about, []
@@ -106,7 +113,7 @@ def _counts(store: DataStore) -> list[str]:
         if found != wanted.sequences:
             wrong.append(f"scene {number} has {found} sequences, {wanted.sequences} promised")
     for view in store.recipe.views:
-        suffix = f"_{view.name}" if len(store.recipe.views) > 1 else ""
+        suffix = store.recipe.suffix(view.name)
         if not np.array_equal(store.read(f"bearing_rad{suffix}"), view.bearing_rad):
             wrong.append(f"bearing_rad{suffix} is not what the recipe's sonar has")
     if not np.array_equal(store.read("range_m"), store.recipe.views[0].sonar.range_m):
@@ -138,7 +145,7 @@ def _flight(store: DataStore) -> list[str]:
     if flight.kind != "random":
         return []
     wrong = []
-    sequence, motion, vehicle, scene = (store.read(name) for name in ("sequence", "motion", "pose", "scene"))
+    sequence, motion, scene = (store.read(name) for name in ("sequence", "motion", "scene"))
     vehicle = _vehicle(store)
     limit = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
     if motion.size and np.nanmax(np.abs(np.nan_to_num(motion)) - limit) > LABEL_TOLERANCE:
@@ -165,8 +172,6 @@ def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.i
     for height in np.unique(vehicle[:, 2]):
         mine = vehicle[:, 2] == height
         reach = footprint(recipe.instrument, recipe.mount.pose, float(height), fov)
-        sin, cos = np.sin(vehicle[mine, 5])[:, None], np.cos(vehicle[mine, 5])[:, None]
-        x = vehicle[mine, 0][:, None] + reach[:, 0] * cos + reach[:, 1] * sin
-        y = vehicle[mine, 1][:, None] + reach[:, 1] * cos - reach[:, 0] * sin
-        farthest = max(farthest, float((np.maximum(np.abs(x), np.abs(y)).max(axis=1) - limit[mine]).max()))
+        corners = np.abs(footprints_at(vehicle[mine], reach))
+        farthest = max(farthest, float((corners.max(axis=(1, 2)) - limit[mine]).max()))
     return farthest

@@ -11,12 +11,15 @@ from mitsonar.dataset.place import Place
 from mitsonar.dataset.plan import Plan, scenes_of
 from mitsonar.dataset.recipe import Recipe
 from mitsonar.dataset.rendering import calibrate
-from mitsonar.dataset.store import DECIDING, DataStore, versions
+from mitsonar.dataset.store import DataStore, versions
 from mitsonar.dataset.workers import made_by
 from mitsonar.errors import MitsonarError
 from mitsonar.simulation.variant import ensure_variant
 
 __all__ = ["Made", "make"]
+
+ROUNDS = 3
+"""How often shards that are not there at the end are made."""
 
 
 @dataclass(frozen=True)
@@ -65,37 +68,49 @@ def make(
         MitsonarError: the store is another data set, is written by somebody else, or was begun with other versions.
     """
     place = Place(url)
-    if place.local and place.exists() and "zarr.json" not in place.sizes():
-        raise MitsonarError(f"{url} is there and is no Zarr store: it is kept as it is; choose another -o")
-    with place.locked():
+    _refuse_what_is_not_ours(place)
+    with place.locked() as still_ours:
         variant = ensure_variant()
-        store = _begun_or_new(place, recipe, sequences, variant)
         _clear_parts(place)
+        store = _begun_or_new(place, recipe, sequences, variant, verify)
         todo = store.missing(verify=verify)
-        if todo:
+        begun(len(store), len(store) - _frames(store, todo))
+        written = 0
+        for _ in range(ROUNDS):  # what somebody damaged meanwhile is made again
+            if not todo:
+                break
+            _check_versions(store)
             store.unfinish()
-        remaining = _frames(store, todo)
-        begun(len(store), len(store) - remaining)
-        if todo:
             for shard in made_by(store, todo, workers=workers, scheduler=scheduler):
+                still_ours()
                 progress(_frames(store, [shard]))
+            written += len(todo)
+            todo = store.missing()
+        if todo:
+            raise MitsonarError(f"{url}: shards vanish while others are written; does somebody else write there?")
         store.finish()
-        return Made(place.url, len(store), len(todo), store.shards, _warnings(store))
+        return Made(place.url, len(store), written, store.shards, _warnings(store))
 
 
-def _begun_or_new(place: Place, recipe: Recipe, sequences: int | None, variant: str) -> DataStore:
+def _refuse_what_is_not_ours(place: Place) -> None:
+    """Arrays are made by removing what has their names: there must be nothing else."""
+    there = [name for name in place.sizes() if not name.endswith(".partial")]
+    if there and "zarr.json" not in there:
+        raise MitsonarError(f"{place.url} is there and is no Zarr store: it is kept as it is; choose another -o")
+
+
+def _begun_or_new(place: Place, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
     """The store that is there, if it is the same data set, or a new one."""
     count = recipe.sequences if sequences is None else sequences
-    scenes = scenes_of(recipe, count)
-    files = place.sizes()
-    if "zarr.json" in files:
+    scenes_of(recipe, count)  # before anything is rendered: are there so many?
+    if "zarr.json" in place.sizes():
         store = DataStore.open(place, write=True, unfinished=True)
         _check_same(store, recipe, count, variant)
         if store.ready:
+            if verify:
+                store.mend_known(Plan.of(recipe, count))
             return store
-        gain = float(store.about["gain"])
-    else:
-        gain = calibrate(recipe, scenes[0])
+    gain = calibrate(recipe)
     about = {"gain": gain, "level_scale": 1 / gain, "variant": variant, "versions": versions()}
     return DataStore.create(place, recipe, Plan.of(recipe, count), about)
 
@@ -114,20 +129,23 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
     if other:
         raise MitsonarError(
             f"{store.place.url} holds another data set, it differs in {', '.join(other)}: make it with the recipe and "
-            "options that it was begun with (`mitsonar dataset info --recipe` prints it), or choose another -o"
+            "options that it was begun with (`mitsonar dataset info` prints both), or choose another -o"
         )
     if about["variant"] != variant:
         raise MitsonarError(
             f"{store.place.url} was begun with {about['variant']}, this is {variant}, which differs in the last bits: set "
             f"MITSONAR_VARIANT={about['variant']}, or choose another -o"
         )
-    now = versions()
-    changed = [
-        f"{name} {about['versions'].get(name)} (now {now[name]})"
-        for name in DECIDING
-        if about["versions"].get(name) != now[name]
-    ]
-    if changed and not store.finished:
+
+
+def _check_versions(store: DataStore) -> None:
+    """What is still to be rendered fits what is there.
+
+    Raises:
+        MitsonarError: it was begun with other versions.
+    """
+    changed = store.other_versions()
+    if changed:
         raise MitsonarError(
             f"{store.place.url} was begun with {', '.join(changed)}: the rest would differ from it; finish it with these "
             "versions, or choose another -o"

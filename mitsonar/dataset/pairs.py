@@ -79,6 +79,11 @@ class Samples:
         inputs = self.arrange(moved, moved["frames"], self.seed + SEED_STEP * self.epoch)
         return inputs, moved["label"]
 
+    @property
+    def stored_kind(self) -> str:
+        """What samples are made of: images also where vectors are wanted and only images are there."""
+        return self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
+
     def one(self, sample: dict[str, Any]) -> tuple[Any, torch.Tensor]:
         """Input and label of one raw sample."""
         batch = {name: torch.as_tensor(values)[None] for name, values in sample.items()}
@@ -96,7 +101,8 @@ class SonarPairs(Dataset[Any], Samples):
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
         split: ``sequence`` (the thesis's: 95 % and 5 % of the sequences), ``scene`` (80, 10 and 10 % of the scenes: worlds
-            that training never saw), or a :class:`~mitsonar.dataset.recipe.Split`; default: the recipe's own.
+            that training never saw; scenes of one world stay together), or a :class:`~mitsonar.dataset.recipe.Split`;
+            default: the recipe's own.
         frames: of a sample; 1 gives heights as labels; default: the recipe's.
         views: which views; default: all.
         kind: ``image`` or ``vector``; default: what is stored.
@@ -126,7 +132,8 @@ class SonarPairs(Dataset[Any], Samples):
         self.split = _split(split, self.recipe)
         self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
         self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
-        self.first = self._samples(deal(self.scene, self.sequence, self.split, part), one_a_sequence)
+        worlds = _worlds(self.store)[self.scene]
+        self.first = self._samples(deal(worlds, self.sequence, self.split, part), one_a_sequence)
         if not len(self.first):
             raise MitsonarError(
                 f"{self.store.place.url} has no sample of {self.frames} frames in part {part!r}: its sequences have "
@@ -135,9 +142,8 @@ class SonarPairs(Dataset[Any], Samples):
 
     def _samples(self, mine: NDArray[np.bool_], one_a_sequence: bool) -> NDArray[np.int64]:
         """The first frame of each sample: its sequence goes on for as many frames as it needs."""
-        last = len(self.sequence) - self.frames
-        first = np.arange(last + 1)
-        whole = mine[: last + 1] & (self.sequence[first] == self.sequence[first + self.frames - 1])
+        first = np.arange(max(0, len(self.sequence) - self.frames + 1))
+        whole = mine[first] & (self.sequence[first] == self.sequence[first + self.frames - 1])
         first = first[whole]
         if one_a_sequence:
             rank = np.random.default_rng([self.seed, 5]).permutation(len(first))
@@ -176,11 +182,6 @@ class SonarPairs(Dataset[Any], Samples):
             elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
                 sample[f"nonzero_{view}"] = self.store.read(name, here).astype(np.int32)
         return sample
-
-    @property
-    def stored_kind(self) -> str:
-        """What is read: images also where vectors are wanted and not stored."""
-        return self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
 
     def sonar_frames(self, index: int) -> SonarFrames:
         """A sample as frames, with noise, for estimators: image, poses, heights (one view)."""
@@ -253,25 +254,37 @@ def _split(split: str | Split | None, recipe: Recipe) -> Split:
             raise MitsonarError(f"split must be sequence or scene: got {split!r}")
 
 
-def deal(scene: NDArray[np.int32], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
-    """Which frames ``(frames,)`` belong to a part; sequences, or scenes with all that is in them, are dealt out at random.
+def _worlds(store: DataStore) -> NDArray[np.int64]:
+    """The first scene with the same world, by number of the scene: some worlds do not depend on their seed."""
+    recipe = store.recipe
+    known: dict[Any, int] = {}
+    worlds = np.zeros(max(store.scenes) + 1, dtype=np.int64)
+    for number, scene in sorted(store.scenes.items()):
+        family = recipe.family(scene.group)
+        world = (type(family), family.model_dump_json(), scene.seed if family.seeded else 0)
+        worlds[number] = known.setdefault(world, number)
+    return worlds
+
+
+def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+    """Which frames ``(frames,)`` belong to a part; sequences, or worlds with all that is in them, are dealt out at random.
 
     Raises:
-        MitsonarError: unknown part, a part that the split has not, fewer scenes or sequences than parts.
+        MitsonarError: unknown part, a part that the split has not, fewer worlds or sequences than parts.
     """
     if part == "all":
-        return np.ones(len(scene), dtype=bool)
+        return np.ones(len(world), dtype=bool)
     if part not in PARTS:
         raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}")
     shares = np.array([getattr(split, name) for name in PARTS])
     if shares[PARTS.index(part)] == 0:
         raise MitsonarError(f"the split by {split.by} has no {part} part: {_said(split)}; give another split")
-    owner = scene if split.by == "scene" else sequence
+    owner = world if split.by == "scene" else sequence
     numbers = np.unique(owner)
     counts = _counts(len(numbers), shares)
     if (counts[shares > 0] == 0).any():
         raise MitsonarError(
-            f"{len(numbers)} {split.by}s cannot be split into {_said(split)}: make more, or give another split"
+            f"{len(numbers)} different {split.by}s cannot be split into {_said(split)}: make more, or give another split"
         )
     dealt = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
     ends = np.cumsum(counts)

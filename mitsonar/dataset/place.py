@@ -10,7 +10,7 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from mitsonar.errors import MitsonarError
 __all__ = ["Place"]
 
 LOCK = "writer.json"
+LOCK_FILE = "writer.lock"
+"""The file whose lock is held on a file system; not the folder's own, since network file systems lock only files."""
+
 HEARTBEAT_S = 20.0
 """An object storage has no locks that end with their owner: its writer says every so often that it lives."""
 
@@ -57,13 +60,26 @@ class Place:
             return zarr.storage.LocalStore(self.root, read_only=not write)
         return zarr.storage.FsspecStore.from_url(self.url, read_only=not write)
 
-    def sizes(self, below: str = "") -> dict[str, int]:
-        """Sizes in bytes of all files, by their path here."""
+    def sizes(self) -> dict[str, int]:
+        """Sizes in bytes of all files, by their path here; without those that say who writes.
+
+        Raises:
+            MitsonarError: the storage does not answer, or not to us.
+        """
+        if self.local and os.path.isfile(self.root):
+            raise MitsonarError(f"{self.url} is a file: give a folder, or a URL")
         try:
-            found = self.fs.find(f"{self.root}/{below}".rstrip("/"), detail=True)
+            self.fs.invalidate_cache()
+            found = self.fs.find(self.root, detail=True)
         except FileNotFoundError:
             return {}
-        return {name[len(self.root) + 1 :]: int(entry["size"] or 0) for name, entry in found.items()}
+        except Exception as error:  # whatever a storage's library raises
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise MitsonarError(
+                f"cannot list {self.url}: {reason}; check the address, and for object storage its endpoint and credentials"
+            ) from None
+        files = {name[len(self.root) + 1 :]: int(entry["size"] or 0) for name, entry in found.items()}
+        return {name: size for name, size in files.items() if name not in (LOCK, LOCK_FILE)}
 
     def read(self, name: str) -> bytes:
         """The bytes of a file."""
@@ -78,41 +94,41 @@ class Place:
         with contextlib.suppress(FileNotFoundError):
             self.fs.rm_file(f"{self.root}/{name}")
 
-    def exists(self) -> bool:
-        """Whether anything is here."""
-        if self.local:
-            return os.path.exists(self.root) and (not os.path.isdir(self.root) or bool(os.listdir(self.root)))
-        self.fs.invalidate_cache()
-        return bool(self.sizes())
-
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
-        """Be the only one who writes here.
+    def locked(self) -> Iterator[Callable[[], None]]:
+        """Be the only one who writes here; yields what to call now and then: it raises when that is no longer so.
 
         Raises:
             MitsonarError: somebody else writes.
         """
-        with self._locked_folder() if self.local else self._locked_objects():
-            yield
+        with self._locked_folder() if self.local else self._locked_objects() as still_ours:
+            yield still_ours
 
     @contextlib.contextmanager
-    def _locked_folder(self) -> Iterator[None]:
-        """The kernel's lock on the folder: it ends with the process, however that ends."""
+    def _locked_folder(self) -> Iterator[Callable[[], None]]:
+        """The kernel's lock on a file: it ends with the process, however that ends."""
         os.makedirs(self.root, exist_ok=True)
-        handle = os.open(self.root, os.O_RDONLY)
+        path = os.path.join(self.root, LOCK_FILE)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not (os.path.exists(path) and os.path.samestat(os.fstat(handle), os.stat(path))):
+                    raise BlockingIOError  # its last owner has just removed it, or another has made a new one
             except BlockingIOError:
                 raise MitsonarError(
                     f"another process is writing {self.url}: wait for it to end, or choose another -o; nothing was changed"
                 ) from None
-            yield
+            try:
+                yield lambda: None
+            finally:
+                with contextlib.suppress(OSError):
+                    os.unlink(path)
         finally:
             os.close(handle)
 
     @contextlib.contextmanager
-    def _locked_objects(self) -> Iterator[None]:
+    def _locked_objects(self) -> Iterator[Callable[[], None]]:
         """A file that its owner renews; whoever finds a silent one takes it over."""
         owner = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex}"
         self._refuse_if_written()
@@ -120,29 +136,41 @@ class Place:
         time.sleep(0.5)  # two that began at the same moment: the one that wrote last stays
         self._refuse_if_written(besides=owner)
         done = threading.Event()
-        lost: list[str] = []
+        lost = threading.Event()
 
         def renew() -> None:
             while not done.wait(HEARTBEAT_S):
-                try:
+                with contextlib.suppress(Exception):  # the storage may be away for a while
+                    if self._owner() != owner:
+                        return lost.set()
                     self._say(owner)
-                except Exception as error:  # the storage may be away for a while
-                    lost.append(str(error))
+
+        def still_ours() -> None:
+            if lost.is_set():
+                raise MitsonarError(
+                    f"another process took {self.url} over, since this one had been silent for {STALE_S:.0f} s: it goes on "
+                    "there; what this one wrote is whole"
+                )
 
         thread = threading.Thread(target=renew, daemon=True)
         thread.start()
         try:
-            yield
+            yield still_ours
         finally:
             done.set()
             thread.join()
-            self.remove(LOCK)
+            with contextlib.suppress(Exception):
+                if self._owner() == owner:
+                    self.remove(LOCK)
+
+    def _owner(self) -> str:
+        """Who says that it writes here."""
+        return str(json.loads(self.read(LOCK))["owner"])
 
     def _say(self, owner: str) -> None:
         self.write(LOCK, json.dumps({"owner": owner, "time": time.time()}).encode())
 
     def _refuse_if_written(self, besides: str = "") -> None:
-        self.fs.invalidate_cache()
         try:
             found: dict[str, Any] = json.loads(self.read(LOCK))
             age = time.time() - float(found["time"])

@@ -57,9 +57,15 @@ class Mount(_Part):
         )
 
 
+RESERVED = ("frames", "label")
+"""What samples hold beside their views."""
+
+
 def _fits_name(name: str) -> str:
     if not name.isidentifier():
         raise ValueError(f"a name is letters, digits and _ : got {name!r}")
+    if name in RESERVED or name.startswith("nonzero"):
+        raise ValueError(f"{name} means something else in a data set: choose another name")
     return name
 
 
@@ -68,6 +74,16 @@ class ReceiverSpec(Mount):
 
     name: Annotated[str, AfterValidator(_fits_name)]
     sonar: dict[str, Any] = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
+
+
+def _from_0(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] < 0:
+        raise ValueError(f"a jump goes either way, give its size low,high with 0 <= low: got {pair[0]:g},{pair[1]:g}")
+    return pair
+
+
+_NotBelow0 = Annotated[Interval, AfterValidator(_from_0)]
+_Angle = Annotated[float, Field(gt=0, le=180)]
 
 
 class Flight(_Part):
@@ -79,8 +95,8 @@ class Flight(_Part):
     sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
     forward_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion ahead or back between pings [mm]")
     yaw_deg: float = Field(0.45, ge=0, le=180, description="largest turn between pings [deg]")
-    jump_m: Interval | None = Field((3.0, 4.0), description="jump between sequences, in x and in y [m]; null: anywhere")
-    footprint_fov_deg: tuple[float, float] | None = Field(
+    jump_m: _NotBelow0 | None = Field((3.0, 4.0), description="jump between sequences, in x and in y [m]; null: anywhere")
+    footprint_fov_deg: tuple[_Angle, _Angle] | None = Field(
         None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
     )
     runs: list[Literal["legs", "diagonal", "turn"]] = Field(
@@ -145,9 +161,13 @@ class Recipe(_Part):
             raise ValueError(str(error)) from None
         if len({view.name for view in self.views}) < len(self.views):
             raise ValueError(f"receivers and segments must have names of their own: got {[v.name for v in self.views]}")
-        low, _ = self.flight.heights
-        if low <= 0:
-            raise ValueError(f"flight height_m must be above 0: got {low:g} m")
+        low, high = self.flight.heights
+        if not (low > 0 and math.isfinite(high)):
+            raise ValueError(f"flight height_m must be finite and above 0: got {low:g} m")
+        if low != high and self.flight.kind == "runs":
+            raise ValueError(f"with flight.kind runs height_m is one number: got {low:g},{high:g}")
+        if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
+            raise ValueError("all receivers must have the same window: range_min, range_max and range_bins")
         if self.frames > self.flight.pings and self.flight.kind == "random":
             raise ValueError(f"frames must be at most flight.pings, {self.flight.pings}: got {self.frames}")
         if self.flight.kind == "runs" and any(group.sequences != len(self.flight.runs) for group in self.scenes):
@@ -176,6 +196,10 @@ class Recipe(_Part):
             own = {**self.sonar, "beams": sonar.beams, "jitter": None, **spec.sonar}
             made.append(Receiver(sonar, sonar_from({k: v for k, v in own.items() if v is not None}), spec.pose, spec.name))
         return made or [Whole(sonar)]
+
+    def suffix(self, view: str) -> str:
+        """What the names of a view's arrays end with: nothing where there is only one."""
+        return f"_{view}" if len(self.views) > 1 else ""
 
     @property
     def kinds(self) -> tuple[str, ...]:

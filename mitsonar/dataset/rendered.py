@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import sys
 from collections.abc import Iterator
@@ -13,8 +14,8 @@ import torch
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from mitsonar.dataset.pairs import Samples
-from mitsonar.dataset.plan import Scene, scenes_of, sequences_of, world_seed
-from mitsonar.dataset.recipe import Recipe, load_recipe
+from mitsonar.dataset.plan import Scene, sequences_of, world_seed
+from mitsonar.dataset.recipe import Recipe, load_recipe, recipe_from
 from mitsonar.dataset.rendering import SceneRenderer, calibrate
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import motions, mounted
@@ -24,7 +25,8 @@ __all__ = ["RenderedPairs"]
 
 
 class RenderedPairs(IterableDataset[Any], Samples):
-    """Endless samples of a recipe's kind, whose worlds and flights are in no data set that ``dataset make`` writes.
+    """Endless samples of a recipe's kind, whose worlds and flights are in no data set that ``dataset make`` writes (a world
+    that does not depend on its seed, as a scene file, stays what it is).
 
     Iterating gives ``(input, label)`` as :class:`~mitsonar.dataset.pairs.SonarPairs` does; :meth:`loader` gives batches with
     noise and layout made on their device. Each worker of a ``DataLoader`` renders worlds of its own; workers must be started
@@ -65,7 +67,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
         if self.frames > recipe.flight.pings:
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
         own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
-        self.worlds = recipe.model_copy(update={"seed": own_seed})
+        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # a copy would keep what it has cached
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
     def __iter__(self) -> Iterator[tuple[Any, torch.Tensor]]:
@@ -75,26 +77,30 @@ class RenderedPairs(IterableDataset[Any], Samples):
     def raw(self) -> Iterator[dict[str, Any]]:
         """Raw samples of this worker; :meth:`~mitsonar.dataset.pairs.Samples.finished` makes inputs of a batch of them."""
         worker, workers = self._ready()
-        gain = self.gain
-        if gain is None:
-            gain = calibrate(self.recipe, scenes_of(self.recipe, self.recipe.sequences)[0])
+        self._calibrate()
         rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
-        left = None if self.length is None else self.length // workers + (worker < self.length % workers)
+        mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
         waiting: list[dict[str, Any]] = []
-        for sample in self._rendered(worker, workers, gain):
-            if left is not None and left <= 0:
-                return
+
+        def drawn() -> dict[str, Any]:
+            place = int(rng.integers(len(waiting)))
+            waiting[place], waiting[-1] = waiting[-1], waiting[place]
+            return waiting.pop()
+
+        for sample in itertools.islice(self._rendered(worker, workers), mine):
             waiting.append(sample)
-            if len(waiting) >= (self.buffer if left is None else min(self.buffer, left)):
-                place = int(rng.integers(len(waiting)))
-                waiting[place], waiting[-1] = waiting[-1], waiting[place]
-                yield waiting.pop()
-                left = None if left is None else left - 1
+            if len(waiting) >= self.buffer:
+                yield drawn()
+        while waiting:
+            yield drawn()
 
     def loader(
         self, batch_size: int, *, device: torch.device | str | None = None, workers: int = 0
     ) -> Iterator[tuple[Any, torch.Tensor]]:
         """Batches on a device."""
+        if workers:  # once here, not in each of them
+            ensure_variant()
+            self._calibrate()
         batches = DataLoader(
             _Raw(self),
             batch_size=batch_size,
@@ -104,6 +110,10 @@ class RenderedPairs(IterableDataset[Any], Samples):
         )
         for batch in batches:
             yield self.finished(batch, device)
+
+    def _calibrate(self) -> None:
+        if self.gain is None:
+            self.gain = calibrate(self.recipe)
 
     def _ready(self) -> tuple[int, int]:
         """Number of this worker and how many there are; the renderer is set up for it."""
@@ -120,7 +130,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
         use_threads(1)
         return info.id, info.num_workers
 
-    def _rendered(self, worker: int, workers: int, gain: float) -> Iterator[dict[str, Any]]:
+    def _rendered(self, worker: int, workers: int) -> Iterator[dict[str, Any]]:
         """Samples in the order in which they are rendered, world after world."""
         weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
         number = worker + self.epoch * 10**6 * workers
@@ -129,11 +139,12 @@ class RenderedPairs(IterableDataset[Any], Samples):
             group = int(rng.choice(len(weights), p=weights / weights.sum()))
             scene = Scene(number, group, world_seed(self.worlds.seed, number), self.sequences_a_world)
             release_memory()
-            yield from self._of_world(SceneRenderer(self.worlds, scene), gain)
+            yield from self._of_world(SceneRenderer(self.worlds, scene))
             number += workers
 
-    def _of_world(self, renderer: SceneRenderer, gain: float) -> Iterator[dict[str, Any]]:
+    def _of_world(self, renderer: SceneRenderer) -> Iterator[dict[str, Any]]:
         """Samples of one world, as many sequences a launch as fit."""
+        assert self.gain is not None
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
         together = max(1, renderer.simulator.pings_per_launch // pings)
         sequences = sequences_of(recipe, renderer.scene)
@@ -141,7 +152,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
         for start in range(0, self.sequences_a_world, together):
             flown = [next(sequences).vehicle for _ in range(min(together, self.sequences_a_world - start))]
             poses = mounted(np.concatenate(flown), recipe.mount.pose)
-            values = renderer.frames(poses, start * pings, gain)
+            values = renderer.frames(poses, start * pings, self.gain)
             for k, vehicle in enumerate(flown):
                 for first in range(pings - self.frames + 1):
                     yield self._sample(values, vehicle, k * pings, first, before + start * pings)
@@ -157,12 +168,10 @@ class RenderedPairs(IterableDataset[Any], Samples):
             "frames": np.arange(here.start, here.stop) + number,
             "label": self.labels.encode(target),
         }
-        several = len(self.recipe.views) > 1
         for view in self.arrange.views:
-            suffix = f"_{view}" if several else ""
-            stored = self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
-            sample[view] = values[f"{stored}{suffix}"][here].copy()
-            if stored == "vector":
+            suffix = self.recipe.suffix(view)
+            sample[view] = values[f"{self.stored_kind}{suffix}"][here].copy()
+            if self.stored_kind == "vector":
                 sample[f"nonzero_{view}"] = values[f"nonzero{suffix}"][here].astype(np.int32)
         return sample
 

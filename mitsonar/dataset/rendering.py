@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.dataset.plan import Scene, sequences_of
+from mitsonar.dataset.plan import Scene, scenes_of, sequences_of
 from mitsonar.dataset.recipe import Recipe
 from mitsonar.dataset.store import PER_FRAME, array_names, pixel_type
 from mitsonar.errors import MitsonarError
@@ -73,8 +73,9 @@ class SceneRenderer:
         """What is stored of one batch."""
         values["height_m"][:] = looks[0].height_m
         for view, pings in zip(self.simulator.views, looks, strict=True):
-            suffix = f"_{view.name}" if len(looks) > 1 else ""
-            values["dropped"] += (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
+            suffix = self.recipe.suffix(view.name)
+            outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
+            np.maximum(values["dropped"], outside, out=values["dropped"])  # portions overlap
             for number, levels in enumerate(pings.levels):  # one by one: a frame fits the cache, a batch does not
                 image = np.minimum(levels * np.float32(gain), np.float32(1))
                 values["saturated"][number] += np.count_nonzero(image >= 1)
@@ -87,7 +88,7 @@ class SceneRenderer:
                 values[f"{label}{suffix}"][:] = pings.labels[label]
 
 
-def calibrate(recipe: Recipe, scene: Scene) -> float:
+def calibrate(recipe: Recipe) -> float:
     """The gain of a data set: the 99.9th percentile of all pixels of the first 20 frames of its first scene becomes 0.9.
 
     The frames are those of the recipe, however few of them are made.
@@ -95,6 +96,7 @@ def calibrate(recipe: Recipe, scene: Scene) -> float:
     Raises:
         MitsonarError: these frames are empty.
     """
+    scene = scenes_of(recipe, recipe.sequences)[0]
     poses = []
     for sequence in sequences_of(recipe, scene):
         poses.append(mounted(sequence.vehicle, recipe.mount.pose))

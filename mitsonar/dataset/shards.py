@@ -8,33 +8,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.dataset.plan import Scene
 from mitsonar.dataset.rendering import SceneRenderer
 from mitsonar.dataset.store import DataStore
 from mitsonar.simulation.variant import ensure_variant, release_memory
 
 __all__ = ["forget", "make_shard"]
 
-_OPEN: dict[str, DataStore] = {}
-_RENDERER: dict[tuple[str, int], SceneRenderer] = {}
+_RENDERER: dict[tuple[str, Scene], SceneRenderer] = {}
+"""The last scene, by all that it depends on: the recipe, and which of its scenes."""
+
 _ONE_AT_A_TIME = threading.Lock()
 """A process renders one shard at a time, whatever threads its scheduler has: they share one ray tracer."""
 
 
-def make_shard(url: str, shard: int) -> int:
-    """Render and write one shard; its number again. The store and the last scene stay open for the next call."""
+def make_shard(store: DataStore, shard: int) -> int:
+    """Render and write one shard; its number again. The last scene stays open for the next call."""
     with _ONE_AT_A_TIME:
-        store = _OPEN.get(url)
-        if store is None:
-            forget()
-            store = _OPEN[url] = DataStore.open(url, write=True, unfinished=True)
-            ensure_variant(store.about["variant"])
+        ensure_variant(store.about["variant"])
         store.write_shard(shard, _shard_values(store, shard))
     return shard
 
 
 def forget() -> None:
     """Close what :func:`make_shard` keeps open."""
-    _OPEN.clear()
     _RENDERER.clear()
     release_memory()
 
@@ -60,10 +57,10 @@ def _first_frames(store: DataStore) -> dict[int, int]:
     return dict(zip(numbers.tolist(), first.tolist(), strict=True))
 
 
-def _renderer(store: DataStore, scene: int) -> SceneRenderer:
-    key = (store.place.url, scene)
+def _renderer(store: DataStore, number: int) -> SceneRenderer:
+    scene = store.scenes[number]
+    key = (store.recipe.model_dump_json(), scene)
     if key not in _RENDERER:
-        _RENDERER.clear()  # before the next is loaded: two scenes would need twice the memory
-        release_memory()
-        _RENDERER[key] = SceneRenderer(store.recipe, store.scenes[scene])
+        forget()  # before the next is loaded: two scenes would need twice the memory
+        _RENDERER[key] = SceneRenderer(store.recipe, scene)
     return _RENDERER[key]

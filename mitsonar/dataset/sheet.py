@@ -129,6 +129,19 @@ def _sampled(store: DataStore, name: str) -> Any:
     return np.concatenate([store.read(name, slice(start, start + chunk)) for start in some])
 
 
+def _level(store: DataStore, name: str, view: str) -> dict[str, Any]:
+    """How many pixels hold an echo, their mean level, and that over the scale of the noise that is added to them."""
+    some = _levels(store, _sampled(store, name))
+    if some.ndim == 2:  # sums over the beams
+        beams = next(len(v.bearing_rad) for v in store.recipe.views if v.name == view)
+        echoes, pixels = int(_sampled(store, name.replace("vector", "nonzero", 1)).sum()), some.size * beams
+    else:
+        echoes, pixels = int(np.count_nonzero(some)), some.size
+    mean = float(some.sum()) / max(echoes, 1)
+    noise = {model: mean / NOISE_MODELS[model].scale for model in ("low", "high", "chapter2")}
+    return {"filled": echoes / pixels, "signal_mean": mean, "signal_over_noise": noise}
+
+
 def info(store: DataStore) -> dict[str, Any]:
     """What a data set holds, by name; values are numbers, words, or tables of them."""
     about, sizes = store.about, store.place.sizes()
@@ -137,12 +150,8 @@ def info(store: DataStore) -> dict[str, Any]:
         array = store.array(name)
         size = sum(size for key, size in sizes.items() if key.startswith(f"{name}/"))
         arrays[name] = f"{'x'.join(map(str, array.shape))} {array.dtype}, {size / max(len(store), 1):,.0f} bytes a frame"
-        if kind == "image" and store.finished:
-            some = _levels(store, _sampled(store, name))
-            echo = some[some > 0]
-            mean = float(echo.mean()) if echo.size else 0.0
-            noise = {model: mean / NOISE_MODELS[model].scale for model in ("low", "high", "chapter2")}
-            levels[view] = {"filled": float((some > 0).mean()), "signal_mean": mean, "signal_over_noise": noise}
+        if kind == store.recipe.kinds[0] and store.finished:
+            levels[view] = _level(store, name, view)
     done = int((store.seals().any(axis=(1, 2))).sum())
     return {
         "name": store.recipe.name,

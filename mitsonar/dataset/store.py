@@ -69,7 +69,7 @@ def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
     for view in recipe.views:
         kinds = [*recipe.kinds, *(["nonzero"] if "vector" in recipe.kinds else []), *recipe.labels]
         for kind in kinds:
-            names[kind if len(recipe.views) == 1 else f"{kind}_{view.name}"] = (kind, view.name)
+            names[f"{kind}{recipe.suffix(view.name)}"] = (kind, view.name)
     return names
 
 
@@ -98,7 +98,6 @@ class DataStore:
         ``about`` is kept in the attributes; it holds at least ``gain``.
         """
         layout = Layout.of(recipe, plan)
-        group = zarr.open_group(place.store(write=True), mode="a", zarr_format=3)
         attributes = {
             "format": FORMAT,
             "kind": "mitsonar data set",
@@ -115,7 +114,11 @@ class DataStore:
             "finished": False,
             **about,
         }
-        group.attrs.put(attributes)
+        if "zarr.json" in place.sizes():
+            group = zarr.open_group(place.store(write=True), mode="r+", zarr_format=3)
+            group.attrs.put(attributes)
+        else:  # in one write: a group without its attributes is nobody's
+            group = zarr.create_group(place.store(write=True), zarr_format=3, attributes=attributes)
         store = cls(place, group)
         store._create_arrays(plan, layout)
         group.attrs.put(attributes | {"ready": True})
@@ -136,7 +139,7 @@ class DataStore:
         place = url if isinstance(url, Place) else Place(url)
         try:
             group = zarr.open_group(place.store(write=write), mode="r+" if write else "r", zarr_format=3)
-            attributes = dict(group.attrs)
+            attributes: dict[str, Any] = dict(group.attrs)
             ours = attributes.get("kind") == "mitsonar data set"
             known = attributes.get("format")
         except Exception as error:  # a damaged file or a storage that does not answer: whatever it leads to
@@ -148,7 +151,15 @@ class DataStore:
             raise MitsonarError(
                 f"{place.url} has format {known}, this mitsonar reads {FORMAT}: use the version that made it"
             )
-        store = cls(place, group)
+        try:
+            store = cls(place, group)
+            if min(len(store), store.shard_frames, int(attributes["chunk_frames"]), len(store.scenes)) < 1:
+                raise ValueError("numbers below 1")
+            float(attributes["gain"]), dict(attributes["versions"]), str(attributes["variant"])
+        except (KeyError, TypeError, ValueError, MitsonarError) as error:
+            raise MitsonarError(
+                f"the attributes of {place.url} are damaged ({type(error).__name__}: {error}): remove it and make it again"
+            ) from None
         if not unfinished and not store.finished:
             raise MitsonarError(
                 f"{place.url} is not finished: run the same `mitsonar dataset make` again, it goes on where it stopped"
@@ -183,8 +194,16 @@ class DataStore:
     def array(self, name: str) -> zarr.Array:
         """An array by its name."""
         if name not in self._arrays:  # the group would read its metadata again each time
-            found = self.group[name]
-            assert isinstance(found, zarr.Array)
+            try:
+                with zarr.config.set({"array.write_empty_chunks": True}):  # a file that is not there is a shard not made
+                    found = self.group[name]
+            except Exception as error:  # no metadata, or bytes that are none
+                raise MitsonarError(
+                    f"{self.place.url}/{name}/zarr.json is damaged or gone ({type(error).__name__}): remove the data set "
+                    "and make it again"
+                ) from None
+            if not isinstance(found, zarr.Array):
+                raise MitsonarError(f"{self.place.url}/{name} is no array: remove the data set and make it again")
             self._arrays[name] = found
         return self._arrays[name]
 
@@ -194,10 +213,9 @@ class DataStore:
         Raises:
             MitsonarError: bytes are damaged.
         """
+        array = self.array(name)
         try:
-            return np.asarray(self.array(name)[index])
-        except KeyError:
-            raise MitsonarError(f"{self.place.url} lacks the array {name}: it is damaged; make it again") from None
+            return np.asarray(array[index])
         except (ValueError, RuntimeError, OSError) as error:
             reason = " ".join(str(error).split())[:160]
             raise MitsonarError(
@@ -233,10 +251,9 @@ class DataStore:
 
     def write_shard(self, shard: int, values: dict[str, NDArray[Any]]) -> None:
         """Write all arrays of a shard, then its seal: sizes and digests of the files."""
-        with zarr.config.set({"array.write_empty_chunks": True}):
-            for name in self.rendered:
-                self.place.remove(self.key(name, shard))  # Zarr would read a damaged shard before it writes over it
-                self.array(name)[self.frames_of(shard)] = values[name]
+        for name in self.rendered:
+            self.place.remove(self.key(name, shard))  # Zarr would read a damaged shard before it writes over it
+            self.array(name)[self.frames_of(shard)] = values[name]
         self.seal(shard)
 
     def seal(self, shard: int) -> None:
@@ -305,33 +322,22 @@ class DataStore:
 
     def _create_arrays(self, plan: Plan, layout: Layout) -> None:
         views = {view.name: view for view in self.recipe.views}
-        several = len(views) > 1
         for name, (kind, view_name) in array_names(self.recipe).items():
             view = views[view_name]
-            beam = f"beam_{view_name}" if several else "beam"
+            beam = f"beam{self.recipe.suffix(view_name)}"
             shape: tuple[int, ...] = (len(plan), view.sonar.range_bins)
             dims: tuple[str, ...] = ("frame", "range")
             if kind not in ("vector", "nonzero"):
                 shape, dims = (*shape, len(view.bearing_rad)), (*dims, beam)
             self._array(name, shape, dims, pixel_type(kind, self.recipe), layout, TEXTS[kind].format(view_name))
         for view_name, view in views.items():
-            suffix = f"_{view_name}" if several else ""
+            suffix = self.recipe.suffix(view_name)
             self._known(f"bearing_rad{suffix}", view.bearing_rad, (f"beam{suffix}",), TEXTS["bearing_rad"])
         self._known("range_m", self.recipe.views[0].sonar.range_m, ("range",), TEXTS["range_m"])
         for name, kind_of in PER_FRAME.items():
             self._array(name, (len(plan),), ("frame",), np.dtype(kind_of), Layout(layout.shard, 0), TEXTS[name])
-        known: dict[str, NDArray[Any]] = {
-            "pose": plan.poses,
-            "motion": plan.motion,
-            "time_s": plan.time_s,
-            "scene": plan.scene,
-        }
-        known["sequence"] = plan.sequence
-        if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
-            known["vehicle_pose"] = plan.vehicle
-        inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",)}
-        for name, values in known.items():
-            self._known(name, values, ("frame", *inner.get(name, ())), TEXTS[name])
+        for name, values in planned(plan).items():
+            self._planned(name, values)
         shape = (self.shards, len(self.rendered), 2)
         seal = self.group.create_array(
             SEAL,
@@ -364,6 +370,34 @@ class DataStore:
                 overwrite=True,
             )
 
+    def other_versions(self) -> list[str]:
+        """Packages that decide pixels and are not here what the store was begun with."""
+        there, here = self.about["versions"], versions()
+        return [f"{name} {there.get(name)} (now {here[name]})" for name in DECIDING if there.get(name) != here[name]]
+
+    def unplanned(self, plan: Plan) -> list[str]:
+        """Arrays that the plan decides and that do not hold it (to 1e-9: processors differ in last bits)."""
+        wrong = []
+        for name, values in planned(plan).items():
+            try:
+                there = self.read(name)
+                same = there.shape == values.shape and np.allclose(there, values, rtol=0, atol=1e-9, equal_nan=True)
+            except MitsonarError:
+                same = False
+            if not same:
+                wrong.append(name)
+        return wrong
+
+    def mend_known(self, plan: Plan) -> None:
+        """Write again what the plan decides and what is damaged of it."""
+        for name in self.unplanned(plan):
+            self._arrays.pop(name, None)
+            self._planned(name, planned(plan)[name])
+
+    def _planned(self, name: str, values: NDArray[Any]) -> None:
+        inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",)}
+        self._known(name, values, ("frame", *inner.get(name, ())), TEXTS[name])
+
     def _known(self, name: str, values: NDArray[Any], dims: tuple[str, ...], text: str) -> None:
         """An array whose values are known from the start, in one piece."""
         array = self.group.create_array(
@@ -378,6 +412,15 @@ class DataStore:
         )
         with zarr.config.set({"array.write_empty_chunks": True}):
             array[...] = values
+
+
+def planned(plan: Plan) -> dict[str, NDArray[Any]]:
+    """What the plan says of each frame."""
+    known: dict[str, NDArray[Any]] = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s}
+    known |= {"scene": plan.scene, "sequence": plan.sequence}
+    if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
+        known["vehicle_pose"] = plan.vehicle
+    return known
 
 
 def digest(content: bytes) -> int:

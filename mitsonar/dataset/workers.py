@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsonar.dataset.shards import forget, make_shard
-from mitsonar.dataset.store import DECIDING, DataStore, versions
+from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.simulation.variant import use_threads
 
@@ -49,7 +49,7 @@ def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: s
     if scheduler is None and workers <= 1:
         try:
             for shard in todo:
-                yield make_shard(store.place.root if store.place.local else store.place.url, shard)
+                yield make_shard(store, shard)
         finally:
             forget()
     else:
@@ -205,12 +205,10 @@ def _work(url: str, shard: int) -> int:
     from distributed import get_worker
 
     use_threads(get_worker().state.nthreads)
-    _check_versions(url)
-    return make_shard(url, shard)
-
-
-def _check_versions(url: str) -> None:
-    there, here = DataStore.open(url, unfinished=True).about["versions"], versions()
-    other = [f"{name} {here[name]} instead of {there[name]}" for name in DECIDING if there[name] != here[name]]
+    store = DataStore.open(url, write=True, unfinished=True)
+    other = store.other_versions()
     if other:
-        raise MitsonarError(f"the worker on {socket.gethostname()} has {', '.join(other)}: install the same everywhere")
+        raise MitsonarError(
+            f"the store was begun with {', '.join(other)} on {socket.gethostname()}: install the same everywhere"
+        )
+    return make_shard(store, shard)

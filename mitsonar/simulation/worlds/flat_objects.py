@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -32,8 +30,6 @@ STEP_M = 5e-6
 
 class FlatObjects(Family):
     """Almost flat objects on a seabed (Almanza-Medina, 5.4.1), anywhere on it, each of one reflectivity."""
-
-    title: ClassVar[str] = "thin rectangles and ellipses on a flat seabed, Almanza-Medina 5.4.1"
 
     size_m: float = Field(50.0, gt=0, le=10_000, description="edge of the square field [m]")
     seabed_cells: int = Field(2048, ge=1, le=2**20, description="cells along the seabed's edge")

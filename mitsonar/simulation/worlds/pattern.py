@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,8 +27,6 @@ class Pattern(Family):
     """The test field of Almanza-Medina, section 2.3. The seed draws the three random seabeds; the other three are pictures
     (generated stand-ins for the thesis's photographs, see the README beside them)."""
 
-    title: ClassVar[str] = "blocks in a T and pairs of bars, six seabeds, Almanza-Medina 2.3"
-
     size_m: float = Field(12.0, gt=0, le=10_000, description="edge of the square seabed [m] (ours)")
     texture: Literal["gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock"] = Field(
         "gaussian", description="seabed: Gaussian cells, Perlin of high or low correlation, or a picture"
@@ -45,6 +43,10 @@ class Pattern(Family):
     @property
     def half_m(self) -> float:
         return self.size_m / 2
+
+    @property
+    def seeded(self) -> bool:
+        return not self.texture.startswith("photo")
 
     def build(self, seed: int) -> World:
         """The field with the seabed of a seed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -37,8 +37,6 @@ class _Kind(NamedTuple):
 class RockyField(Family):
     """Rocks on a flat seabed (Almanza-Medina, 3.2.1): each kind on its own square grid, each rock moved at random within
     its grid step, with its own height, sizes and turns; their reflectivity is Perlin's noise, one value a face."""
-
-    title: ClassVar[str] = "rocks (cubes, cylinders, capsules) on a flat seabed, Almanza-Medina 3.2.1"
 
     size_m: float = Field(30.0, gt=0, le=10_000, description="edge of the square field [m]; the thesis has 30 and 50")
     seabed_cells: int = Field(2048, ge=1, le=2**20, description="cells along the seabed's edge")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic import Field
 
@@ -16,8 +16,6 @@ __all__ = ["SceneFile"]
 class SceneFile(Family):
     """A scene that is there already; the seed only decides how the vehicle moves in it."""
 
-    title: ClassVar[str] = "a Mitsuba XML file of your own"
-
     file: str = Field(description="the XML file; in a recipe, relative to the recipe's folder")
     size_m: float = Field(gt=0, le=1e6, description="edge of the square around the origin to stay inside [m]")
     parameters: dict[str, str] = Field(default_factory=dict, description="values of the scene's $names")
@@ -25,6 +23,10 @@ class SceneFile(Family):
     @property
     def half_m(self) -> float:
         return self.size_m / 2
+
+    @property
+    def seeded(self) -> bool:
+        return False
 
     def build(self, seed: int) -> World:
         raise MitsonarError(f"{self.file} is a scene already: there is nothing to build")

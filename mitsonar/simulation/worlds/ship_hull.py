@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
@@ -30,8 +28,6 @@ __all__ = ["ShipHull"]
 class ShipHull(Family):
     """The bottom of a ship, laid flat (Almanza-Medina, 3.2.2): groups of elliptical tubes side by side, and sacrificial
     anodes, elliptical too with their cross-section facing the sonar; both attached to the plate z = 0."""
-
-    title: ClassVar[str] = "tubes and anodes on a flat plate, Almanza-Medina 3.2.2"
 
     size_m: float = Field(20.0, gt=0, le=10_000, description="edge of the square plate [m] (ours)")
     plate_cells: int = Field(1024, ge=1, le=2**20, description="cells along the plate's edge")
@@ -83,8 +79,9 @@ class ShipHull(Family):
         length = draw(rng, self.tube_length_m, total)
         heading = draw(rng, (0, np.pi), groups)[of_group]
         before = np.cumsum(width) - width
-        begin, end = before[np.cumsum(counts) - counts], np.cumsum(width)[np.cumsum(counts) - 1]
-        aside = before + width / 2 - ((begin + end) / 2)[of_group]
+        last = (np.cumsum(counts) - 1)[of_group]
+        begin, end = before[last + 1 - counts[of_group]], np.cumsum(width)[last]
+        aside = before + width / 2 - (begin + end) / 2
         across = np.column_stack([np.cos(heading), np.sin(heading)])
         centre = np.column_stack([middle[of_group] + across * aside[:, None], height / 2])
         # a cylinder along z laid down: its length along y, its height along z

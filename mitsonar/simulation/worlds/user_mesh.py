@@ -18,6 +18,9 @@ from mitsonar.simulation.worlds.world import Floor, Mesh, Standpoint, World
 __all__ = ["FORMATS", "mesh_world"]
 
 FORMATS = (".glb", ".gltf", ".obj", ".stl", ".dae", ".ply")
+UNCOLOURED = 0.5
+"""Reflectivity of a model without colours, as of BSDFs that have none."""
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
 """Rows of the turn that brings each axis up, by even permutations: nothing is mirrored."""
@@ -135,22 +138,28 @@ def _piece(geometry: trimesh.Trimesh, value: str | float) -> _Piece:
     if visual.kind == "texture":
         material = visual.material
         picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-        tint = _one(_colours(material.main_color), value)
+        factor = _tint(material, value)
         if picture is None or visual.uv is None or len(visual.uv) != len(vertices):
-            return _Piece(vertices, faces, np.full(len(faces), float(tint[0])))
-        factor = _one(_factor(material), value)
+            return _Piece(vertices, faces, np.full(len(faces), factor))
         # trimesh counts v upwards, Mitsuba's bitmaps from the top row
         uv = np.asarray(visual.uv, dtype=float) * (1, -1) + (0, 1)
-        return _Piece(vertices, faces, uv=uv, picture=_grey_png(picture, value, float(factor[0])))
+        return _Piece(vertices, faces, uv=uv, picture=_grey_png(picture, value, factor))
+    if visual.kind is None:
+        return _Piece(vertices, faces, np.full(len(faces), UNCOLOURED))
     if visual.kind == "vertex":
         return _Piece(vertices, faces, _one(_colours(visual.vertex_colors), value)[faces].mean(axis=1))
     return _Piece(vertices, faces, _one(_colours(visual.face_colors), value))
 
 
-def _factor(material: Any) -> NDArray[np.float64]:
-    """What a picture is multiplied by, 0..1 ``(1, 3)``."""
-    factor = getattr(material, "baseColorFactor", None)
-    return np.ones((1, 3)) if factor is None else _colours(factor)
+def _tint(material: Any, value: str) -> float:
+    """One number of a material's own colour, 0..1; a picture is multiplied by it."""
+    if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear already, white where it is not given
+        factor = material.baseColorFactor
+        colour = np.ones(3) if factor is None else _colours(factor)[0]
+        return float(colour[0] if value == "red" else colour @ LUMINANCE)
+    if getattr(material, "image", None) is not None:
+        return 1.0
+    return float(_one(_colours(material.main_color), value)[0])
 
 
 def _colours(values: Any) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -43,12 +43,15 @@ class Family(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    title: ClassVar[str]
-
     @property
     def half_m(self) -> float:
         """Half the edge of the square, around the origin, that the world fills [m]."""
         raise NotImplementedError
+
+    @property
+    def seeded(self) -> bool:
+        """Whether another seed gives another world."""
+        return True
 
     def build(self, seed: int) -> World:
         """The world of a seed; the same bytes for the same seed."""
@@ -79,7 +82,7 @@ def whole(rng: np.random.Generator, span: tuple[int, int], *shape: int) -> Any:
 def shifted_grid(half_m: float, a_side: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Vertices of a square grid over the field, each moved within its grid step (Almanza-Medina, 3.2.1) ``(a_side^2, 2)``
     [m]."""
-    step = 2 * half_m / a_side
+    step = 2 * half_m / max(a_side, 1)
     vertex = np.stack(np.meshgrid(*[np.arange(a_side)] * 2, indexing="ij"), -1).reshape(-1, 2) * step - half_m
     return np.asarray(vertex + step * rng.random((a_side**2, 2)), dtype=np.float64)
 
