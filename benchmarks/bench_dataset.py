@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import psutil
 
-SIZES = (1_000, 3_000)
-"""Sequences of five frames: 5,000 and 15,000 frames, over 30 worlds each."""
+SIZES = (1_000, 5_000)
+"""Sequences of five frames: 5,000 and 25,000 frames, over 30 worlds each."""
 
 QUICK = (300, 900)
 SAMPLE_S = 3.0
@@ -62,7 +62,7 @@ def main() -> None:
                 result["make"].append(note(making(recipe, workers, sizes, Path(folder))))
         for recipe in ("rocky-field", "rocky-field-physical"):
             for workers in (0, 2) if "rendered" in parts else ():
-                samples = str(4 * sizes[1])
+                samples = str(3 * sizes[1])
                 result["rendered"].append(note(in_a_process("--rendered", recipe, str(workers), samples)))
         if "read" in parts:
             command(["dataset", "make", "rocky-field", "--sequences", "400", "-o", str(made)])
