@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -605,7 +606,10 @@ if __name__ == "__main__":
         timeout=200,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
     )
-    assert "a worker was lost again and again" in done.stdout, done.stdout + done.stderr
+    # dask gives a worker up that dies before it is known to have started, which a busy machine may show
+    assert re.search("(a worker was|workers were) lost .*out of memory.*fewer workers", done.stdout), (
+        done.stdout + done.stderr
+    )
 
 
 # ---------------------------------------------------------------- object storage

@@ -30,7 +30,7 @@ ASK_S = 1.0
 LOSSES = 3
 """How often workers may be lost with the same shard."""
 
-SILENCE_S = 120.0
+SILENCE_S = 90.0
 """How long there may be no worker at all."""
 
 
@@ -166,8 +166,11 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
                 heard = time.monotonic()
             elif time.monotonic() - heard > SILENCE_S:
                 raise MitsonarError(
-                    f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`; what is "
-                    "whole stays, the same command goes on"
+                    f"workers were lost at shards {', '.join(map(str, queue.lost))} and none has come back for "
+                    f"{SILENCE_S:.0f} s (out of memory?): use fewer workers; what is whole stays, the same command goes on"
+                    if queue.lost
+                    else f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`; "
+                    "what is whole stays, the same command goes on"
                 )
             for worker in alive:
                 while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
