@@ -79,6 +79,18 @@ class Samples:
         inputs = self.arrange(moved, moved["frames"], self.seed + SEED_STEP * self.epoch)
         return inputs, moved["label"]
 
+    def batches(
+        self, raw: Dataset[Any], batch_size: int, device: torch.device | str | None, workers: int, **words: Any
+    ) -> Iterator[tuple[Any, torch.Tensor]]:
+        """Inputs and labels of batches of raw samples, which workers read or render, on a device."""
+        pinned = device is not None and torch.device(device).type == "cuda"
+        start = "spawn" if workers else None  # a fork after the ray tracer has started is unsafe
+        loader = DataLoader(
+            raw, batch_size=batch_size, num_workers=workers, pin_memory=pinned, multiprocessing_context=start, **words
+        )
+        for batch in loader:
+            yield self.finished(batch, device)
+
     @property
     def stored_kind(self) -> str:
         """What samples are made of: images also where vectors are wanted and only images are there."""
@@ -213,18 +225,8 @@ class SonarPairs(Dataset[Any], Samples):
     ) -> Iterator[tuple[Any, torch.Tensor]]:
         """Batches of one epoch on a device; their order is a function of seed and epoch."""
         order = torch.Generator().manual_seed(self.seed + SEED_STEP * self.epoch)
-        batches = DataLoader(
-            _Raw(self),
-            batch_size=batch_size,
-            shuffle=shuffle,
-            generator=order,
-            num_workers=workers,
-            drop_last=drop_last,
-            pin_memory=device is not None and torch.device(device).type == "cuda",
-            multiprocessing_context="spawn" if workers else None,
-        )
-        for batch in batches:
-            yield self.finished(batch, device)
+        words = {"shuffle": shuffle, "generator": order, "drop_last": drop_last}
+        yield from self.batches(_Raw(self), batch_size, device, workers, **words)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset, get_worker_info
 
 from mitsonar.dataset.pairs import Samples
 from mitsonar.dataset.plan import Scene, sequences_of, world_seed
@@ -101,15 +101,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
         if workers:  # once here, not in each of them
             ensure_variant()
             self._calibrate()
-        batches = DataLoader(
-            _Raw(self),
-            batch_size=batch_size,
-            num_workers=workers,
-            pin_memory=device is not None and torch.device(device).type == "cuda",
-            multiprocessing_context="spawn" if workers else None,
-        )
-        for batch in batches:
-            yield self.finished(batch, device)
+        yield from self.batches(_Raw(self), batch_size, device, workers)
 
     def _calibrate(self) -> None:
         if self.gain is None:
