@@ -13,7 +13,7 @@ from mitsonar import plugins
 
 if TYPE_CHECKING:
     from mitsonar.dataset.pairs import SonarPairs
-    from mitsonar.dataset.recipe import load_recipe
+    from mitsonar.dataset.recipe import Split, load_recipe
     from mitsonar.dataset.rendered import RenderedPairs
     from mitsonar.dataset.store import DataStore
     from mitsonar.errors import MitsonarError, MitsonarWarning
@@ -40,6 +40,7 @@ __all__ = [
     "Sonar",
     "SonarFrames",
     "SonarPairs",
+    "Split",
     "Trajectory",
     "load_noise",
     "load_recipe",
@@ -60,6 +61,7 @@ _HOME = {
     "Sonar": "sonar",
     "SonarFrames": "frames",
     "SonarPairs": "dataset.pairs",
+    "Split": "dataset.recipe",
     "Trajectory": "motion",
     "load_noise": "noise",
     "load_recipe": "dataset.recipe",

@@ -37,7 +37,7 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
         what: what the keys belong to, in the sentence: ``sonar``.
         see: where more is said, for the end of the sentence.
     """
-    first = error.errors()[0]
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a typing slip explains what is missing
     where = [str(part) for part in first["loc"]]
     key = ".".join(where)
     if first["type"] == "extra_forbidden":

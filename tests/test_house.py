@@ -24,7 +24,10 @@ STAGES = (
     "simulation.worlds.families",
     *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "tracing", "views", "segments", "bistatic")),
     *(f"simulation.{name}" for name in ("binning", "imaging", "runs")),
-    *(f"dataset.{name}" for name in ("recipe", "plan", "place", "store", "rendering", "shards", "workers", "generate")),
+    *(
+        f"dataset.{name}"
+        for name in ("recipe", "plan", "split", "place", "store", "rendering", "shards", "workers", "generate")
+    ),
     *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered")),
     "cli",
     "__main__",

@@ -188,6 +188,7 @@ def test_views_stand_in_the_order_in_which_they_are_asked_for(portions: Path) ->
     names = both.arrange.views
     turned = SonarPairs(portions, part="all", kind="vector", views=list(names[::-1]))
     torch.testing.assert_close(turned[4][0][..., [2, 3, 0, 1]], both[4][0], rtol=0, atol=0)
+    assert SonarPairs(portions, views="q3").arrange.views == ("q3",)
     with pytest.raises(MitsonarError, match="q1, q3"):
         SonarPairs(portions, views=["quadrant-9"])
 
@@ -263,8 +264,9 @@ def test_scenes_of_one_world_stay_together(tmp_path: Path) -> None:
     found = [set(pairs.scene[pairs.first]) for pairs in parts_of(tmp_path / "photo.zarr", split)]
     assert sorted(map(len, found)) == [1, 1, 2]
     assert {0, 1} in found
-    make(tiny_recipe(world=world), str(tmp_path / "one.zarr"))
-    with pytest.raises(MitsonarError, match="1 different scenes cannot be split"):
+    one = make(tiny_recipe(world=world, split={"by": "scene"}), str(tmp_path / "one.zarr"))
+    assert any("too few for train 95%" in sentence for sentence in one.warnings)
+    with pytest.raises(MitsonarError, match="1 different scene, too few"):
         SonarPairs(tmp_path / "one.zarr", split=split)
 
 
@@ -288,8 +290,14 @@ def test_parts_that_are_not_there_are_refused(made: Path) -> None:
         SonarPairs(made, part="training")
     with pytest.raises(MitsonarError, match="no test part"):
         SonarPairs(made, part="test", split="sequence")
-    with pytest.raises(MitsonarError, match="sequence or scene: got 'world'"):
+    with pytest.raises(MitsonarError, match=r"sequence, scene, or keys .*got 'world'"):
         SonarPairs(made, split="world")
+    with pytest.raises(MitsonarError, match="unknown split key trian: did you mean train"):
+        SonarPairs(made, split={"trian": 0.5})
+    assert len(SonarPairs(made, split={"train": 0.5, "validation": 0.5})) == 60
+    for noise in (None, 0.1):
+        with pytest.raises(MitsonarError, match="noise must be a name"):
+            SonarPairs(made, noise=noise)
     with pytest.raises(MitsonarError, match="channels: got 'beside'"):
         SonarPairs(made, layout="beside")
 

@@ -34,7 +34,7 @@ SCENE = """
 
     def channels(scene=None):
         import mitsuba as mi, numpy as np
-        scene = scene or mi.load_string(XML)
+        scene = scene or mi.load_string(XML, parallel=False)
         image = np.array(mi.render(scene))
         assert image.shape[:2] == (5, 12)
         picked = image[:, :, -len(scene.integrator().aov_names()):]
@@ -97,7 +97,7 @@ KEPT = """
     import mitsuba as mi
     import numpy as np
     mi.set_variant("llvm_ad_mono")
-    scene = mi.load_string(XML)
+    scene = mi.load_string(XML, parallel=False)
     first = channels(scene)
     mi.set_variant("llvm_ad_rgb")
     mi.set_variant("llvm_ad_mono")
@@ -157,7 +157,7 @@ def test_snippet_of_the_docstring_loads(name: str) -> None:
     assert f'type="{name}"' in text
     if text.startswith("<texture"):
         text = f'<shape type="sphere"><bsdf type="diffuse">{text}</bsdf></shape>'
-    scene = mi.load_string(f'<scene version="3.0.0">{text}</scene>')
+    scene = mi.load_string(f'<scene version="3.0.0">{text}</scene>', parallel=False)
     assert isinstance(scene, mi.Scene)
     if name == "imaging_sonar":
         assert type(scene.sensors()[0]).__name__ == "ImagingSonar"

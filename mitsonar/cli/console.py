@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import sys
 import time
@@ -14,7 +15,7 @@ import typer
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 
-__all__ = ["answered", "numbers", "progress_bar", "say", "warn"]
+__all__ = ["answered", "numbers", "progress_bar", "say", "say_stopped", "warn"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -33,6 +34,11 @@ def warn(text: str) -> None:
 AGAIN = "the same command goes on (`render` with --resume)"
 
 
+def say_stopped() -> None:
+    """After Ctrl-C."""
+    typer.echo(f"stopped; what is whole on disk stays, {AGAIN}", err=True)
+
+
 def answered(command: Callable[P, R]) -> Callable[P, R]:
     """Answer a mistake with one sentence and exit code 2, and a full disk or Ctrl-C likewise; never with a traceback."""
 
@@ -48,7 +54,9 @@ def answered(command: Callable[P, R]) -> Callable[P, R]:
             raise typer.Exit(0) from None
         except OSError as error:
             where = f" ({error.filename})" if error.filename else ""
-            typer.echo(f"error: {error.strerror or error}{where}; what is whole on disk stays, {AGAIN}", err=True)
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+            stays = f"; what is whole on disk stays, {AGAIN}" if full else ""
+            typer.echo(f"error: {error.strerror or error}{where}{stays}", err=True)
         except MemoryError:
             typer.echo("error: out of memory; ask for less: beams, rays or bins of the sonar, objects of a world", err=True)
         except RuntimeError as error:
@@ -56,7 +64,7 @@ def answered(command: Callable[P, R]) -> Callable[P, R]:
                 raise
             typer.echo("error: out of memory; lower --rays-per-launch, or the sonar's beams, rays or bins", err=True)
         except KeyboardInterrupt:
-            typer.echo(f"stopped; what is whole on disk stays, {AGAIN}", err=True)
+            say_stopped()
             raise typer.Exit(130) from None
         raise typer.Exit(2)
 

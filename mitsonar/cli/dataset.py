@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_stopped, warn
 from mitsonar.errors import MitsonarError
 
 __all__ = ["datasets"]
@@ -33,8 +34,8 @@ def make(
     ],
     sequences: Annotated[int | None, typer.Option(help="Only so many sequences.")] = None,
     scale: Annotated[float | None, typer.Option(help="Only this part of the sequences, 0..1.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of worlds, flights and jitter [default: the recipe's].")] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes on this machine [default: its cores].")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of worlds, flights and jitter (default: the recipe's).")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes on this machine (default: its cores).")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler that runs: its workers render.")] = None,
     change: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the recipe: sonar.range_bins=256.")] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Read all that is there and make again what is damaged.")] = False,
@@ -56,17 +57,14 @@ def make(
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
     crew = len(os.sched_getaffinity(0)) if workers is None else workers
     bar = _Bar()
-    with bar:
-        made = make_dataset(
-            described,
-            out,
-            sequences=sequences,
-            workers=crew,
-            scheduler=scheduler,
-            verify=verify,
-            begun=bar.begin,
-            progress=bar.advance,
-        )
+    words = {"sequences": sequences, "workers": crew, "scheduler": scheduler, "verify": verify}
+    try:
+        with bar:
+            made = make_dataset(described, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
+    except KeyboardInterrupt:
+        say_stopped()
+        sys.stdout.flush()
+        os._exit(130)  # threads of Zarr and dask would complain one by one
     for sentence in made.warnings:
         warn(sentence)
     there = made.shards - made.made
@@ -116,10 +114,13 @@ def info(
 @answered
 def show(
     data: Data,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Picture to write [default: NAME.png here].")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Picture to write (default: NAME.png in this folder).")
+    ] = None,
     samples: Annotated[int, typer.Option(min=1, max=16, help="Samples to draw.")] = 4,
-    view: Annotated[str | None, typer.Option(help="Which view [default: the first].")] = None,
+    view: Annotated[str | None, typer.Option(help="Which view (default: the first).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Which samples.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there.")] = False,
 ) -> None:
     """Draw a sheet of sample pairs with labels, the distribution of the labels, and the mean image."""
     import io
@@ -130,8 +131,10 @@ def show(
 
     store = DataStore.open(data)
     path = out or Path(Path(store.place.url).stem + ".png")
-    if out is None and path.exists():
-        raise MitsonarError(f"{path} exists and is kept: say where to write with -o")
+    if path.suffix.lower() != ".png" or not path.parent.is_dir():
+        raise MitsonarError(f"-o must name a .png file in a folder that is there: got {path}")
+    if path.exists() and not overwrite:
+        raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
     buffer = io.BytesIO()
     sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
     write_whole(path, buffer.getvalue())
@@ -151,8 +154,8 @@ def check(data: Data) -> None:
         say(fault)
     if faults:
         raise MitsonarError(
-            f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it, with --verify, makes again what is "
-            "damaged"
+            f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it goes on where it stopped, and with "
+            "--verify makes again what is damaged"
         )
     say(f"{len(store):,} frames in {store.shards} shards: all is well")
 

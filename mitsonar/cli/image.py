@@ -16,10 +16,10 @@ __all__ = ["image"]
 @answered
 def image(
     run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
-    bins: Annotated[int | None, typer.Option(help="Range bins [default: as rendered].")] = None,
-    window: Annotated[str | None, typer.Option("--range", help="Window from,to in m [default: as rendered].")] = None,
+    bins: Annotated[int | None, typer.Option(help="Range bins (default: as rendered).")] = None,
+    window: Annotated[str | None, typer.Option("--range", help="Window from,to in m (default: as rendered).")] = None,
     noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make [default: OUT/rebinned].")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,

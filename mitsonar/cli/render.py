@@ -22,7 +22,7 @@ SIX = "x,y,z,pitch,roll,heading in m and deg"
 @answered
 def render(
     scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make [default: out/SCENE].")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE).")] = None,
     frames: Annotated[int | None, typer.Option(help="Number of frames.")] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,

@@ -111,14 +111,17 @@ def mesh(
     file: Annotated[Path, typer.Argument(help="Model: glb, gltf, obj, stl, dae or ply.")],
     out: Out,
     scale: Annotated[float, typer.Option(help="Metres a unit of the file (0.001 for millimetres).")] = 1.0,
-    up: Annotated[str | None, typer.Option(help="Axis that points up: x, y or z [default: y for glTF, else z].")] = None,
+    up: Annotated[str | None, typer.Option(help="Axis that points up: x, y or z (default: y for glTF, else z).")] = None,
     reflectivity: Annotated[str, typer.Option(help="red, luminance, or a number 0..1.")] = "luminance",
     floor: Annotated[bool, typer.Option(help="A seabed of random cells below the model.")] = True,
+    floor_m: Annotated[
+        float | None, typer.Option(help="Edge of that seabed in m (default: 3 x the model's diagonal).")
+    ] = None,
 ) -> None:
     """Turn a model of your own, textured or not, into a scene: on a seabed, with a sonar that looks at it."""
     from mitsonar.simulation.worlds.user_mesh import mesh_world
 
-    _write(mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor), out)
+    _write(mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m), out)
 
 
 def _write(world: World, out: Path) -> None:

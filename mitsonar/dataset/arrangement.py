@@ -153,7 +153,7 @@ class Arrangement:
 def arrangement_of(
     recipe: Recipe,
     *,
-    views: tuple[str, ...] | list[str] | None = None,
+    views: str | tuple[str, ...] | list[str] | None = None,
     kind: str | None = None,
     layout: str = "side",
     coordinates: str = "polar",
@@ -166,7 +166,9 @@ def arrangement_of(
         MitsonarError: a word that is not known, or that does not fit the others.
     """
     known = {view.name: view for view in recipe.views}
-    chosen = tuple(known if views is None else views)
+    chosen = (views,) if isinstance(views, str) else tuple(known if views is None else views)
+    if not isinstance(noise, str | NoiseModel):
+        raise MitsonarError(f"noise must be a name, three numbers as text, or a NoiseModel: got {noise!r}; 'none' for none")
     kind = kind or recipe.kinds[0]
     for word, name, allowed in (
         (kind, "kind", ("image", "vector")),

@@ -32,25 +32,32 @@ def check(store: DataStore, progress: Callable[[int], None] = lambda frames: Non
 def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
     """Every file against its seal, and what is in it against what may be."""
     wrong: list[str] = []
+    unwritten: list[int] = []
     sizes, seals = store.place.sizes(), store.seals()
     for shard in range(store.shards):
         here = store.frames_of(shard)
         keys = [store.key(name, shard) for name in store.rendered]
         lacking = [key for key in keys if key not in sizes]
         if lacking or not seals[shard].any():
-            wrong.append(
-                f"shard {shard} (frames {here.start}..{here.stop - 1}) is not written: lacks {lacking or 'its seal'}"
-            )
+            unwritten.append(shard)
         else:
             damaged = store.damaged(shard, seals[shard])
             for key in damaged:
                 size = int(seals[shard][keys.index(key), 0])
                 wrong.append(
-                    f"{key} is damaged (frames {here.start}..{here.stop - 1}): {sizes[key]} bytes, sealed with {size}"
+                    f"{key} is damaged (frames {here.start}..{here.stop - 1}): "
+                    + (f"{sizes[key]} bytes, sealed with {size}" if sizes[key] != size else "other bytes than were sealed")
                 )
             if not damaged:
                 wrong += _values(store, here)
         progress(here.stop - here.start)
+    if unwritten:
+        which = ", ".join(map(str, unwritten[:10])) + (" ..." if len(unwritten) > 10 else "")
+        state = "is damaged" if store.finished else "is not finished"
+        wrong.append(
+            f"{store.place.url} {state}: {len(unwritten)} of {store.shards} shards are not written ({which}); the same "
+            "`mitsonar dataset make` makes them"
+        )
     return wrong
 
 

@@ -11,6 +11,7 @@ from mitsonar.dataset.place import Place
 from mitsonar.dataset.plan import Plan, scenes_of
 from mitsonar.dataset.recipe import Recipe
 from mitsonar.dataset.rendering import calibrate
+from mitsonar.dataset.split import deal, world_of
 from mitsonar.dataset.store import DataStore, versions
 from mitsonar.dataset.workers import made_by
 from mitsonar.errors import MitsonarError
@@ -129,7 +130,7 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
     if other:
         raise MitsonarError(
             f"{store.place.url} holds another data set, it differs in {', '.join(other)}: make it with the recipe and "
-            "options that it was begun with (`mitsonar dataset info` prints both), or choose another -o"
+            "options that it was begun with (`mitsonar dataset info --recipe` prints the recipe), or choose another -o"
         )
     if about["variant"] != variant:
         raise MitsonarError(
@@ -160,13 +161,29 @@ def _clear_parts(place: Place) -> None:
                 place.remove(name)
 
 
+def _too_few(store: DataStore) -> list[str]:
+    """Whether the recipe's own split can be read."""
+    worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
+    try:
+        deal(worlds, store.read("sequence"), store.recipe.split, "train")
+    except MitsonarError as error:
+        return [str(error)]
+    return []
+
+
 def _frames(store: DataStore, shards: list[int]) -> int:
     return sum(store.frames_of(shard).stop - store.frames_of(shard).start for shard in shards)
 
 
 def _warnings(store: DataStore) -> list[str]:
     """What the user should know of a finished data set."""
-    sentences = []
+    sentences = [*_too_few(store)]
+    over_nothing = int(np.isnan(store.read("height_m")).sum())
+    if over_nothing:
+        sentences.append(
+            f"nothing is below the sonar in {over_nothing:,} of {len(store):,} frames: world.size_m is larger than what the "
+            "scene holds"
+        )
     dropped, saturated = (store.read(name).astype(np.int64) for name in ("dropped", "saturated"))
     recipe = store.recipe
     if dropped.any():

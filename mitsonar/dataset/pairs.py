@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from mitsonar.dataset.arrangement import Labels, arrangement_of
-from mitsonar.dataset.recipe import Recipe, Split
+from mitsonar.dataset.recipe import Recipe, Split, split_from
+from mitsonar.dataset.split import deal, world_of
 from mitsonar.dataset.store import DataStore, array_names
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import SonarFrames
 from mitsonar.noise import NoiseModel
 
-__all__ = ["Samples", "SonarPairs", "deal"]
-
-PARTS = ("train", "validation", "test")
+__all__ = ["Samples", "SonarPairs"]
 
 SEED_STEP = 1_000_003
 """Between the noise seeds of two epochs: more than any number of views."""
@@ -44,7 +43,7 @@ class Samples:
         recipe: Recipe,
         *,
         frames: int | None = None,
-        views: list[str] | None = None,
+        views: str | list[str] | None = None,
         kind: str | None = None,
         layout: str = "side",
         coordinates: str = "polar",
@@ -113,8 +112,8 @@ class SonarPairs(Dataset[Any], Samples):
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
         split: ``sequence`` (the thesis's: 95 % and 5 % of the sequences), ``scene`` (80, 10 and 10 % of the scenes: worlds
-            that training never saw; scenes of one world stay together), or a :class:`~mitsonar.dataset.recipe.Split`;
-            default: the recipe's own.
+            that training never saw; scenes of one world stay together), or by, train, validation, test and seed as a
+            dictionary or :class:`~mitsonar.dataset.recipe.Split`; default: the recipe's own.
         frames: of a sample; 1 gives heights as labels; default: the recipe's.
         views: which views; default: all.
         kind: ``image`` or ``vector``; default: what is stored.
@@ -135,7 +134,7 @@ class SonarPairs(Dataset[Any], Samples):
         url: str | Path,
         *,
         part: str = "train",
-        split: str | Split | None = None,
+        split: str | Split | dict[str, Any] | None = None,
         one_a_sequence: bool = False,
         **arrangement: Any,
     ) -> None:
@@ -144,7 +143,7 @@ class SonarPairs(Dataset[Any], Samples):
         self.split = _split(split, self.recipe)
         self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
         self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
-        worlds = _worlds(self.store)[self.scene]
+        worlds = world_of(self.recipe, self.store.scenes)[self.scene]
         self.first = self._samples(deal(worlds, self.sequence, self.split, part), one_a_sequence)
         if not len(self.first):
             raise MitsonarError(
@@ -242,9 +241,11 @@ class _Raw(Dataset[Any]):
         return self.pairs.raw(index)
 
 
-def _split(split: str | Split | None, recipe: Recipe) -> Split:
+def _split(split: str | Split | dict[str, Any] | None, recipe: Recipe) -> Split:
     if isinstance(split, Split):
         return split
+    if isinstance(split, dict):
+        return split_from(split)
     match split:
         case None:
             return recipe.split
@@ -253,54 +254,4 @@ def _split(split: str | Split | None, recipe: Recipe) -> Split:
         case "scene":
             return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
         case _:
-            raise MitsonarError(f"split must be sequence or scene: got {split!r}")
-
-
-def _worlds(store: DataStore) -> NDArray[np.int64]:
-    """The first scene with the same world, by number of the scene: some worlds do not depend on their seed."""
-    recipe = store.recipe
-    known: dict[Any, int] = {}
-    worlds = np.zeros(max(store.scenes) + 1, dtype=np.int64)
-    for number, scene in sorted(store.scenes.items()):
-        family = recipe.family(scene.group)
-        world = (type(family), family.model_dump_json(), scene.seed if family.seeded else 0)
-        worlds[number] = known.setdefault(world, number)
-    return worlds
-
-
-def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
-    """Which frames ``(frames,)`` belong to a part; sequences, or worlds with all that is in them, are dealt out at random.
-
-    Raises:
-        MitsonarError: unknown part, a part that the split has not, fewer worlds or sequences than parts.
-    """
-    if part == "all":
-        return np.ones(len(world), dtype=bool)
-    if part not in PARTS:
-        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}")
-    shares = np.array([getattr(split, name) for name in PARTS])
-    if shares[PARTS.index(part)] == 0:
-        raise MitsonarError(f"the split by {split.by} has no {part} part: {_said(split)}; give another split")
-    owner = world if split.by == "scene" else sequence
-    numbers = np.unique(owner)
-    counts = _counts(len(numbers), shares)
-    if (counts[shares > 0] == 0).any():
-        raise MitsonarError(
-            f"{len(numbers)} different {split.by}s cannot be split into {_said(split)}: make more, or give another split"
-        )
-    dealt = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
-    ends = np.cumsum(counts)
-    place = PARTS.index(part)
-    return np.isin(owner, dealt[ends[place] - counts[place] : ends[place]])
-
-
-def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
-    """How many of ``total`` each part gets: by its share, at least one where it has any."""
-    counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
-    largest = int(shares.argmax())
-    counts[largest] = total - (counts.sum() - counts[largest])
-    return np.maximum(counts, 0)
-
-
-def _said(split: Split) -> str:
-    return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)
+            raise MitsonarError(f"split must be sequence, scene, or keys as in a recipe: got {split!r}")

@@ -21,7 +21,7 @@ from mitsonar.simulation.worlds.families import create_family
 from mitsonar.simulation.worlds.world import Family, Interval
 from mitsonar.sonar import Sonar
 
-__all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "shipped_recipes"]
+__all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "shipped_recipes", "split_from"]
 
 
 class _Part(BaseModel):
@@ -90,7 +90,7 @@ class Flight(_Part):
     """How the vehicle moves: sequences of pings at a constant rate, with jumps between, or named runs."""
 
     kind: Literal["random", "runs"] = Field("random", description="random sequences, or the runs of chapter 2")
-    height_m: float | Interval = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
+    height_m: Interval | float = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
     pings: int = Field(5, ge=1, le=10**6, description="pings of a sequence")
     sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
     forward_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion ahead or back between pings [mm]")
@@ -270,6 +270,18 @@ def recipe_from(fields: dict[str, Any]) -> Recipe:
         raise MitsonarError(complaint(error, Recipe, "recipe", " (see docs/dataset.md)")) from None
     except TypeError as error:
         raise MitsonarError(f"recipe keys must be words: {error}") from None
+
+
+def split_from(fields: dict[str, Any]) -> Split:
+    """The split with these keys.
+
+    Raises:
+        MitsonarError: an unknown key, a value outside its limits.
+    """
+    try:
+        return Split(**fields)
+    except ValidationError as error:
+        raise MitsonarError(complaint(error, Split, "split", " (see docs/dataset.md)")) from None
 
 
 def _find_files(fields: dict[str, Any], folder: Path) -> None:

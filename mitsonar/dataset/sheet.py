@@ -82,7 +82,7 @@ def _sample(axes: Any, store: DataStore, name: str, view: str, start: int, place
             axes.imshow(
                 last - first, extent=_extent(store, view), origin="lower", aspect="auto", cmap="RdBu_r", vmin=-0.3, vmax=0.3
             )
-        axes.set_title("last minus first (+-0.3)", fontsize=8)
+        axes.set_title("last minus first" + (" (+-0.3)" if first.ndim == 2 else ""), fontsize=8)
     else:
         axes.axis("off")
         if place == min(frames + 1, 2 * frames):
@@ -105,7 +105,7 @@ def _summary(axes: Any, store: DataStore, name: str, view: str) -> None:
     """The mean image, and histograms of the labels."""
     mean = _levels(store, _sampled(store, name)).mean(axis=0)
     top = float(mean.max()) or 1.0
-    _draw(axes[0], store, mean, view, f"mean of frames (white {top:.3g})", top=top)
+    _draw(axes[0], store, mean, view, "mean of frames" + (f" (white {top:.3g})" if mean.ndim == 2 else ""), top=top)
     motion = store.read("motion")
     motion = motion[~np.isnan(motion).any(axis=1)]
     if len(motion):

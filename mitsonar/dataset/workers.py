@@ -82,6 +82,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
         # dask lets workers return memory at each release, which doubles the time of NumPy here, and samples their stacks
         "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": "1"},
         "distributed.worker.profile.enabled": False,
+        # Ctrl-C reaches all processes of a terminal: this one stops the others
+        "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     }
     quiet = logging.CRITICAL  # what a user should know of a lost worker, we say
     with (

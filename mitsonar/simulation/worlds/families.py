@@ -24,6 +24,9 @@ FAMILIES: dict[str, type[Family]] = {
 }
 
 
+SEE_SCENE = " (see docs/dataset.md, `A scene of your own`)"
+
+
 def create_family(name: str, **fields: Any) -> Family:
     """The family of that name with these numbers, the others the thesis's; or ``scene``, a file of the user's own.
 
@@ -37,4 +40,6 @@ def create_family(name: str, **fields: Any) -> Family:
     try:
         return family(**fields)
     except ValidationError as error:
-        raise MitsonarError(complaint(error, family, name, f" (see `mitsonar world {name} --help`)")) from None
+        raise MitsonarError(
+            complaint(error, family, name, SEE_SCENE if name == "scene" else f" (see `mitsonar world {name} --help`)")
+        ) from None

@@ -44,6 +44,7 @@ def mesh_world(
     up: str | None = None,
     reflectivity: str | float = "luminance",
     floor: bool = True,
+    floor_m: float | None = None,
 ) -> World:
     """The world of a model: turned z up, scaled, its lowest point on a seabed at z = 0, its middle at the origin.
 
@@ -54,6 +55,7 @@ def mesh_world(
         reflectivity: ``luminance`` (of linear light, as Mitsuba computes it), ``red`` (the red channel as stored, as the
             thesis does), or one number for all.
         floor: a seabed of random cells of 15 mm below.
+        floor_m: edge of that seabed [m]; default: three times the model's diagonal.
 
     Raises:
         MitsonarError: unreadable, broken or empty model; scale, axis or reflectivity that is not allowed.
@@ -64,6 +66,8 @@ def mesh_world(
         raise MitsonarError(f"up must be x, y or z: got {up!r}")
     if not (np.isfinite(scale) and scale > 0):
         raise MitsonarError(f"scale must be a finite number above 0, metres a unit of the file: got {scale:g}")
+    if floor_m is not None and not 0 < floor_m <= 10_000:
+        raise MitsonarError(f"floor_m must lie in 0..10000 m: got {floor_m:g}")
     value = _value(reflectivity)
     pieces = [_piece(geometry, value) for geometry in _geometries(path)]
     turn = np.array(UP[up], dtype=float) * scale
@@ -74,7 +78,7 @@ def mesh_world(
     shift = np.array([*(low + high)[:2] / 2, low[2]])
     meshes, content = _merge(pieces, turn, shift)
     radius = float(np.linalg.norm(high - low)) / 2
-    half = 3 * radius
+    half = 3 * radius if floor_m is None else floor_m / 2
     return World(
         about=f"{path.name}: {sum(len(piece.faces) for piece in pieces)} triangles, "
         f"{' x '.join(f'{edge:.4g}' for edge in high - low)} m, reflectivity {reflectivity}",
