@@ -1,8 +1,10 @@
-"""Where a cell of a sonar image lies: directions of beams, and scan conversion from (range, bearing) to metres."""
+"""Where a cell of a sonar image lies: directions of beams, scan conversion from (range, bearing) to metres, and the ground:
+which point of it a cell shows, and how the cell moves with the sonar."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,10 @@ from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.motion import Pose, vehicle_rotation
 from mitsonar.sonar import Bearing
 
-__all__ = ["CartesianImage", "CartesianMap", "cartesian_map", "directions", "to_cartesian"]
+__all__ = ["CartesianImage", "CartesianMap", "GroundGeometry", "cartesian_map", "directions", "moved", "to_cartesian"]
 
 
 def directions(bearing: Bearing, bearing_rad: ArrayLike, elevation_rad: ArrayLike) -> NDArray[np.float64]:
@@ -21,6 +24,90 @@ def directions(bearing: Bearing, bearing_rad: ArrayLike, elevation_rad: ArrayLik
     if bearing == "azimuth":
         return np.stack([np.cos(e) * np.sin(b), np.cos(e) * np.cos(b), np.sin(e)], axis=-1)
     return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], axis=-1)
+
+
+@dataclass(frozen=True)
+class GroundGeometry:
+    """A sonar over level ground. Ground points are (starboard, forward) [m] in level axes that turn with its heading.
+
+    Attributes:
+        range_m: of the cells ``(bins,)`` [m].
+        bearing_rad: of the cells ``(beams,)`` [rad].
+        bearing: which angle that is.
+        height_m: of the sonar over the ground.
+        pitch_rad: > 0 looks down.
+        roll_rad: > 0 puts starboard down.
+    """
+
+    range_m: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    bearing: Bearing
+    height_m: float
+    pitch_rad: float
+    roll_rad: float = 0.0
+
+    @cached_property
+    def turn(self) -> NDArray[np.float64]:
+        """The sonar's starboard, forward and up in level axes, as columns ``(3, 3)``."""
+        return np.asarray(vehicle_rotation(Pose(0, 0, 0, self.pitch_rad, self.roll_rad, 0)).as_matrix()[0])
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Ground points of the cells ``(bins, beams, 2)``; nan where a cell's arc does not meet the ground.
+
+        Of the two places where an arc can meet it, the one nearer to the sonar's axis in elevation.
+        """
+        radius, b = np.meshgrid(self.range_m, self.bearing_rad, indexing="ij")
+        starboard, forward, up = self.turn[2]  # how much of each points up
+        if self.bearing == "azimuth":
+            fixed, ahead, upward = 0.0, starboard * np.sin(b) + forward * np.cos(b), np.broadcast_to(up, b.shape)
+        else:
+            fixed, ahead, upward = starboard * np.sin(b), forward * np.cos(b), up * np.cos(b)
+        # fixed + ahead cos e + upward sin e = -height / radius
+        lean = np.arctan2(upward, ahead)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            swing = np.arccos((-self.height_m / radius - fixed) / np.hypot(ahead, upward))
+        one, other = (_within_pi(lean + sign * swing) for sign in (-1, 1))
+        e = np.where(np.abs(one) <= np.abs(other), one, other)
+        return np.asarray((directions(self.bearing, b, e) * radius[..., None] @ self.turn.T)[..., :2])
+
+    def see(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Range [m] and bearing [rad] of ground points ``(..., 2)``."""
+        s, f, u = self._in_sonar(points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
+
+    @cached_property
+    def derivative(self) -> NDArray[np.float64]:
+        """How range [m] and bearing [rad] of each cell's ground point change with the motion (sideways, forward [m], yaw
+        [rad]; eq. 3.4), at rest ``(bins, beams, 2, 3)``."""
+        x, y = np.moveaxis(self.points, -1, 0)
+        s, f, u = self._in_sonar(self.points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        along = np.stack([x, y], axis=-1) / radius[..., None]
+        aside, ahead = self.turn[:2, 0], self.turn[:2, 1]
+        if self.bearing == "azimuth":
+            turning = (f[..., None] * aside - s[..., None] * ahead) / (s * s + f * f)[..., None]
+        else:
+            turning = (aside - (s / radius)[..., None] * along) / np.sqrt(radius * radius - s * s)[..., None]
+        one, none = np.ones_like(x), np.zeros_like(x)
+        point = np.stack([np.stack([-one, none, -y], axis=-1), np.stack([none, -one, x], axis=-1)], axis=-2)
+        return np.asarray(np.stack([along, turning], axis=-2) @ point)
+
+    def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], ...]:
+        """Starboard, forward, up of ground points in the sonar's own axes."""
+        x, y = points[..., 0], points[..., 1]
+        a = self.turn.astype(points.dtype)
+        drop = points.dtype.type(self.height_m)
+        return tuple(x * a[0, k] + y * a[1, k] - drop * a[2, k] for k in range(3))
+
+
+def moved(points: NDArray[np.floating], motion: ArrayLike) -> NDArray[Any]:
+    """Where ground points ``(..., 2)`` lie for a sonar that has moved by (sideways, forward [m], yaw [rad]; eq. 3.4)."""
+    sideways, forward, yaw = (points.dtype.type(value) for value in np.asarray(motion, dtype=float))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([x * cos - y * sin - sideways, x * sin + y * cos - forward], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -118,6 +205,10 @@ def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, r
     conversion = cartesian_map(range_m, bearing_rad, rows)
     fan = np.where(conversion.weight.any(axis=0), conversion.apply(image), np.nan).astype(np.float32)
     return CartesianImage(fan, conversion.extent)
+
+
+def _within_pi(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _cell(place: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry import cartesian_map, to_cartesian
+from mitsonar.geometry import GroundGeometry, cartesian_map, moved, to_cartesian
+from mitsonar.motion import Motion, Pose, compose, vehicle_rotation
 from mitsonar.sonar import Sonar
 
 
@@ -68,3 +69,60 @@ def test_torch_converts_the_same() -> None:
         wanted = to_cartesian(images[one, 1], sonar.range_m, sonar.bearing_rad, rows=50)
         np.testing.assert_allclose(fans[one, 1], np.nan_to_num(wanted.image), atol=1e-6)
         assert wanted.extent == conversion.extent
+
+
+# ---------------------------------------------------------------- ground
+
+TILTS = [(35.0, 0.0), (20.0, 5.0), (50.0, -8.0)]
+
+
+def over_ground(bearing: str, tilt: tuple[float, float]) -> GroundGeometry:
+    pitch, roll = np.radians(tilt)
+    return GroundGeometry(np.linspace(3.3, 5.5, 12), np.radians(np.linspace(-14, 14, 9)), bearing, 2.5, pitch, roll)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+@pytest.mark.parametrize("tilt", TILTS)
+def test_cells_are_seen_where_they_lie(bearing: str, tilt: tuple[float, float]) -> None:
+    """There and back; and the point is on the ground, by the sonar's rotation of motion.py."""
+    ground = over_ground(bearing, tilt)
+    radius, b = ground.see(ground.points)
+    np.testing.assert_allclose(radius, np.broadcast_to(ground.range_m[:, None], radius.shape), rtol=1e-12)
+    np.testing.assert_allclose(b, np.broadcast_to(ground.bearing_rad, b.shape), atol=1e-12)
+    pose = Pose(0, 0, 2.5, *np.radians(tilt), 0.0)
+    level = np.concatenate([ground.points, np.full((*radius.shape, 1), -2.5)], axis=-1).reshape(-1, 3)
+    s, f, _ = vehicle_rotation(pose).inv().apply(level).T
+    wanted = np.arctan2(s, f) if bearing == "azimuth" else np.arcsin(s / np.linalg.norm(level, axis=1))
+    np.testing.assert_allclose(b.ravel(), wanted, atol=1e-12)
+
+
+def test_axis_beam_over_a_level_floor() -> None:
+    ground = GroundGeometry(np.array([2.0, 4.0]), np.array([0.0]), "azimuth", 2.5, np.radians(35))
+    np.testing.assert_allclose(ground.points[1, 0], [0, np.sqrt(4.0**2 - 2.5**2)], atol=1e-12)
+    assert np.isnan(ground.points[0]).all()
+
+
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+def test_a_point_moves_as_poses_do(bearing: str) -> None:
+    """A fixed point of the world, seen from two poses of motion.py (eq. 3.4)."""
+    ground = over_ground(bearing, (35.0, 0.0))
+    motion = Motion(0.06, -0.09, np.radians(2.0))
+    first = Pose(3.0, -2.0, 2.5, 0, 0, 1.1)
+    second = compose(first, motion)
+
+    def level(pose: Pose, points: np.ndarray) -> np.ndarray:
+        return vehicle_rotation(pose).inv().apply(points - np.array(pose[:3]))
+
+    flat = ground.points.reshape(-1, 2)
+    world = vehicle_rotation(first).apply(np.column_stack([flat, np.full(len(flat), -2.5)])) + np.array(first[:3])
+    np.testing.assert_allclose(moved(flat, motion), level(second, world)[:, :2], atol=1e-12)
+
+
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+@pytest.mark.parametrize("tilt", TILTS)
+def test_derivative_by_differences(bearing: str, tilt: tuple[float, float]) -> None:
+    ground = over_ground(bearing, tilt)
+    for axis, step in enumerate(1e-5 * np.eye(3)):
+        (r1, b1), (r2, b2) = (ground.see(moved(ground.points, sign * step)) for sign in (-1, 1))
+        difference = np.stack([r2 - r1, b2 - b1], axis=-1) / 2e-5
+        np.testing.assert_allclose(ground.derivative[..., axis], difference, atol=1e-8)

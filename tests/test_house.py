@@ -29,6 +29,7 @@ STAGES = (
         for name in ("recipe", "plan", "split", "place", "store", "rendering", "shards", "workers", "generate")
     ),
     *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered")),
+    *(f"estimation.{name}" for name in ("estimator", "zero", "direct")),
     "cli",
     "__main__",
 )
@@ -88,7 +89,7 @@ def stage(name: str) -> int:
     return STAGES.index("cli" if name.split(".")[0] == "cli" else name)
 
 
-PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "scenes"}
+PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "estimation", "scenes"}
 """Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
 

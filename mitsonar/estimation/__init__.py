@@ -1,0 +1,1 @@
+"""Frames become motion: the estimator protocol, and one method a file."""

@@ -1,0 +1,21 @@
+"""The estimator ``zero``: always "no motion", the row that every table needs."""
+
+from __future__ import annotations
+
+from mitsonar.estimation.estimator import Estimate, register, two_frames
+from mitsonar.frames import SonarFrames
+from mitsonar.motion import Motion
+
+__all__ = ["Zero"]
+
+
+@register("zero")
+class Zero:
+    """No motion, whatever is seen."""
+
+    inputs = "nothing"
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        """No motion."""
+        two_frames(frames)
+        return Estimate(Motion(0.0, 0.0, 0.0))
