@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from pathlib import Path
 from typing import Any
 
@@ -311,9 +312,43 @@ def test_killed_before_the_group_is_whole(made: Path, tmp_path: Path) -> None:
     """A file half written, or a group with arrays half made: begun anew."""
     url = tmp_path / "tiny.zarr"
     url.mkdir()
-    (url / "zarr.json.4711.partial").write_bytes(b"{")
+    (url / f"zarr.{uuid.uuid4().hex}.partial").write_bytes(b"{")  # as Zarr names it
     make(tiny_recipe(), str(url))
     assert files_of(url) == files_of(made)
+
+
+def test_half_written_files_of_others_are_kept(tmp_path: Path) -> None:
+    """A download, and what another program writes into a Zarr group of its own."""
+    import zarr
+
+    (tmp_path / "downloads").mkdir()
+    (tmp_path / "downloads" / "film.partial").write_text("half a film")
+    zarr.open_group(tmp_path / "other", mode="w")
+    (tmp_path / "other" / f"zarr.{uuid.uuid4().hex}.partial").write_text("half a file")
+    for name, words in (("downloads", "no Zarr store"), ("other", "no data set of mitsonar")):
+        before = files_of(tmp_path / name)
+        with pytest.raises(MitsonarError, match=words):
+            make(tiny_recipe(), str(tmp_path / name))
+        assert files_of(tmp_path / name) == before
+
+
+def test_nothing_stays_of_what_cannot_be_made(tmp_path: Path) -> None:
+    with pytest.raises(MitsonarError, match="first frames are empty"):
+        make(tiny_recipe(mount__pitch_deg=-35.0), str(tmp_path / "empty.zarr"))
+    assert not (tmp_path / "empty.zarr").exists()
+
+
+def test_what_only_looks_right_is_warned_of(tmp_path: Path) -> None:
+    """Metres given as millimetres; a split without a training part is none of it."""
+    made = make(
+        tiny_recipe(
+            flight__sideways_mm=0.02, flight__forward_mm=0.02, split={"by": "scene", "train": 0, "validation": 0, "test": 1}
+        ),
+        str(tmp_path / "still.zarr"),
+        sequences=2,
+    )
+    assert [sentence for sentence in made.warnings if "in millimetres" in sentence]
+    assert not [sentence for sentence in made.warnings if "split" in sentence]
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 7])

@@ -7,7 +7,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.direct import Direct
-from mitsonar.estimation.estimator import create_estimator
+from mitsonar.estimation.estimators import create_estimator
 from mitsonar.estimation.zero import Zero
 from mitsonar.frames import SonarFrames
 from mitsonar.motion import Motion, Pose, Trajectory, compose

@@ -29,7 +29,7 @@ STAGES = (
         for name in ("recipe", "plan", "split", "place", "store", "rendering", "shards", "workers", "generate")
     ),
     *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered")),
-    *(f"estimation.{name}" for name in ("estimator", "zero", "direct")),
+    *(f"estimation.{name}" for name in ("estimator", "zero", "direct", "estimators")),
     "cli",
     "__main__",
 )

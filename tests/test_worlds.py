@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -476,6 +478,16 @@ def test_colour_factors_of_gltf_are_linear(
     box.export(tmp_path / "box.glb")
     (mesh,) = mesh_world(tmp_path / "box.glb", reflectivity=reflectivity).meshes
     np.testing.assert_allclose(mesh.reflectivity, wanted, atol=1e-6)
+
+
+def test_a_model_in_the_wrong_unit_is_warned_of(tmp_path: Path) -> None:
+    trimesh.creation.box((1000, 2000, 500)).export(tmp_path / "box.stl")
+    assert mesh_world(tmp_path / "box.stl").size_m == pytest.approx(2000)
+    for scale, warned in ((1, True), (0.001, False)):
+        command = [sys.executable, "-m", "mitsonar", "world", "mesh", str(tmp_path / "box.stl"), "--scale", str(scale)]
+        done = subprocess.run([*command, "-o", str(tmp_path / str(scale))], capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        assert ("0.001 for millimetres" in done.stderr) == warned
 
 
 def test_a_model_without_colours_is_half_reflecting(tmp_path: Path) -> None:

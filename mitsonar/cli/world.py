@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 import typer
 from typer.core import TyperGroup
 
-from mitsonar.cli.console import answered, say
+from mitsonar.cli.console import answered, say, warn
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -121,7 +121,10 @@ def mesh(
     """Turn a model of your own, textured or not, into a scene: on a seabed, with a sonar that looks at it."""
     from mitsonar.simulation.worlds.user_mesh import mesh_world
 
-    _write(mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m), out)
+    world = mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m)
+    if not 0.05 <= world.size_m <= 500:
+        warn(f"the model is {world.size_m:.3g} m large: --scale is metres a unit of the file, 0.001 for millimetres")
+    _write(world, out)
 
 
 def _write(world: World, out: Path) -> None:

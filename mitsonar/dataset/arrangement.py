@@ -111,7 +111,7 @@ class Arrangement:
             seed: of the noise.
         """
         xp = array_namespace(numbers)
-        parts = [self._noisy(frames, view, numbers, seed + place) for place, view in enumerate(self.views)]
+        parts = [self.noisy(frames, view, numbers, seed + place) for place, view in enumerate(self.views)]
         if self.kind == "vector":
             axis = 1 if self.layout == "channels" else 3
             columns = [part[:, q, :] for part in parts for q in range(part.shape[1])]
@@ -122,7 +122,7 @@ class Arrangement:
         fan = self._laid_out([self.maps[view].apply(part) for view, part in zip(self.views, parts, strict=True)])
         return fan if polar is None else (polar, fan)
 
-    def _noisy(self, frames: dict[str, Any], view: str, numbers: Any, seed: int) -> Any:
+    def noisy(self, frames: dict[str, Any], view: str, numbers: Any, seed: int) -> Any:
         """Float32 frames of a view, with noise."""
         values = frames[view]
         xp = array_namespace(values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,13 +12,16 @@ from mitsonar.dataset.place import Place
 from mitsonar.dataset.plan import Plan, scenes_of
 from mitsonar.dataset.recipe import Recipe
 from mitsonar.dataset.rendering import calibrate
-from mitsonar.dataset.split import deal, world_of
+from mitsonar.dataset.split import PARTS, deal, world_of
 from mitsonar.dataset.store import DataStore, versions
 from mitsonar.dataset.workers import made_by
 from mitsonar.errors import MitsonarError
 from mitsonar.simulation.variant import ensure_variant
 
 __all__ = ["Made", "make"]
+
+HALF_A_GROUP = re.compile(r"zarr\.[0-9a-f]{32}\.partial")
+"""What a kill leaves before anything else is there; any other file is somebody's."""
 
 ROUNDS = 3
 """How often shards that are not there at the end are made."""
@@ -72,8 +76,8 @@ def make(
     _refuse_what_is_not_ours(place)
     with place.locked() as still_ours:
         variant = ensure_variant()
-        _clear_parts(place)
         store = _begun_or_new(place, recipe, sequences, variant, verify)
+        _clear_parts(place)
         todo = store.missing(verify=verify)
         begun(len(store), len(store) - _frames(store, todo))
         written = 0
@@ -95,7 +99,7 @@ def make(
 
 def _refuse_what_is_not_ours(place: Place) -> None:
     """Arrays are made by removing what has their names: there must be nothing else."""
-    there = [name for name in place.sizes() if not name.endswith(".partial")]
+    there = [name for name in place.sizes() if not HALF_A_GROUP.fullmatch(name)]
     if there and "zarr.json" not in there:
         raise MitsonarError(f"{place.url} is there and is no Zarr store: it is kept as it is; choose another -o")
 
@@ -163,9 +167,10 @@ def _clear_parts(place: Place) -> None:
 
 def _too_few(store: DataStore) -> list[str]:
     """Whether the recipe's own split can be read."""
+    split = store.recipe.split
     worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
     try:
-        deal(worlds, store.read("sequence"), store.recipe.split, "train")
+        deal(worlds, store.read("sequence"), split, max(PARTS, key=lambda part: getattr(split, part)))
     except MitsonarError as error:
         return [str(error)]
     return []
@@ -178,6 +183,13 @@ def _frames(store: DataStore, shards: list[int]) -> int:
 def _warnings(store: DataStore) -> list[str]:
     """What the user should know of a finished data set."""
     sentences = [*_too_few(store)]
+    flight, bin_mm = store.recipe.flight, 1e3 * store.recipe.instrument.bin_m
+    largest_mm = max(flight.sideways_mm, flight.forward_mm)
+    if flight.kind == "random" and flight.pings > 1 and 0 < largest_mm < bin_mm / 100:
+        sentences.append(
+            f"motions of at most {largest_mm:g} mm are less than a hundredth of a range bin ({bin_mm:.2g} mm): "
+            "flight.sideways_mm and forward_mm are in millimetres"
+        )
     over_nothing = int(np.isnan(store.read("height_m")).sum())
     if over_nothing:
         sentences.append(

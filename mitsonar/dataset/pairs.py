@@ -201,7 +201,7 @@ class SonarPairs(Dataset[Any], Samples):
         here, (name,) = self.frame_numbers(index), self.arrange.views
         view = next(view for view in self.recipe.views if view.name == name)
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
-        image = self.arrange._noisy(sample, name, sample["frames"], self.seed + SEED_STEP * self.epoch)[0]
+        image = self.arrange.noisy(sample, name, sample["frames"], self.seed + SEED_STEP * self.epoch)[0]
         return SonarFrames(
             image=np.asarray(image),
             range_m=view.sonar.range_m,

@@ -107,6 +107,7 @@ class Place:
     @contextlib.contextmanager
     def _locked_folder(self) -> Iterator[Callable[[], None]]:
         """The kernel's lock on a file: it ends with the process, however that ends."""
+        new = not os.path.exists(self.root)
         os.makedirs(self.root, exist_ok=True)
         path = os.path.join(self.root, LOCK_FILE)
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -124,6 +125,8 @@ class Place:
             finally:
                 with contextlib.suppress(OSError):
                     os.unlink(path)
+                    if new:
+                        os.rmdir(self.root)  # only if nothing was written
         finally:
             os.close(handle)
 

@@ -6,7 +6,7 @@ import math
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -26,6 +26,9 @@ __all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "shipp
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+_Made = TypeVar("_Made", bound=_Part)
 
 
 class Scenes(_Part):
@@ -247,7 +250,9 @@ def load_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None)
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise MitsonarError(f"cannot read recipe {path}: {error.strerror}") from None
+        raise MitsonarError(
+            f"cannot read recipe {path}: {error.strerror}; give a YAML file or a name of `mitsonar dataset recipes`"
+        ) from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise MitsonarError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
     if not isinstance(fields, dict):
@@ -264,12 +269,7 @@ def recipe_from(fields: dict[str, Any]) -> Recipe:
     Raises:
         MitsonarError: an unknown key, a value outside its limits.
     """
-    try:
-        return Recipe(**fields)
-    except ValidationError as error:
-        raise MitsonarError(complaint(error, Recipe, "recipe", " (see docs/dataset.md)")) from None
-    except TypeError as error:
-        raise MitsonarError(f"recipe keys must be words: {error}") from None
+    return _checked(Recipe, "recipe", fields)
 
 
 def split_from(fields: dict[str, Any]) -> Split:
@@ -278,10 +278,16 @@ def split_from(fields: dict[str, Any]) -> Split:
     Raises:
         MitsonarError: an unknown key, a value outside its limits.
     """
+    return _checked(Split, "split", fields)
+
+
+def _checked(part: type[_Made], what: str, fields: dict[str, Any]) -> _Made:
     try:
-        return Split(**fields)
+        return part(**fields)
     except ValidationError as error:
-        raise MitsonarError(complaint(error, Split, "split", " (see docs/dataset.md)")) from None
+        raise MitsonarError(complaint(error, part, what, " (see docs/dataset.md)")) from None
+    except TypeError as error:
+        raise MitsonarError(f"{what} keys must be words: {error}") from None
 
 
 def _find_files(fields: dict[str, Any], folder: Path) -> None:

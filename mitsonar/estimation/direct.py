@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, register, two_frames
+from mitsonar.estimation.estimator import Estimate, two_frames
 from mitsonar.frames import SonarFrames
 from mitsonar.geometry import GroundGeometry
 from mitsonar.motion import Motion
@@ -62,7 +62,6 @@ class _Fit(NamedTuple):
     converged: bool
 
 
-@register("direct")
 @dataclass(frozen=True)
 class Direct:
     """Photometric registration with the exact geometry of the sonar over level ground.
@@ -86,11 +85,11 @@ class Direct:
         """The motion, its covariance, and whether to believe it; zero motion where there is nothing to match."""
         first, second = two_frames(frames)
         height, pitch, roll = self._geometry(frames)
-        bearing_m = tuple(frames.bearing_rad.tolist())
+        range_m, bearing_rad = tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist())
         v = np.zeros(3)
         fit = None
         for level in self.levels:
-            ground = _cells(tuple(frames.range_m.tolist()), bearing_m, frames.sonar.bearing, height, pitch, roll, level.step)
+            ground = _cells(range_m, bearing_rad, frames.sonar.bearing, height, pitch, roll, level.step)
             fit = _register(_smoothed(first, level), _smoothed(second, level), *ground, v, level)
             if fit is None:
                 return Estimate(Motion(0.0, 0.0, 0.0), None, False, "nothing in the frames to match")

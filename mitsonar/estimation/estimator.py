@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError
 from mitsonar.frames import SonarFrames
 from mitsonar.motion import Motion
 
-__all__ = ["ESTIMATORS", "Estimate", "Estimator", "create_estimator", "register", "two_frames"]
+__all__ = ["Estimate", "Estimator", "two_frames"]
 
 
 @dataclass(frozen=True)
@@ -50,34 +49,6 @@ class Estimator(Protocol):
         Raises:
             MitsonarError: not two frames, or frames without what the estimator needs.
         """
-
-
-ESTIMATORS: dict[str, Callable[..., Estimator]] = {}
-"""By name; the modules of this package fill it."""
-
-
-def register(name: str) -> Callable[[Callable[..., Estimator]], Callable[..., Estimator]]:
-    """Make an estimator known by a name."""
-
-    def keep(make: Callable[..., Estimator]) -> Callable[..., Estimator]:
-        ESTIMATORS[name] = make
-        return make
-
-    return keep
-
-
-def create_estimator(name: str, **options: Any) -> Estimator:
-    """The estimator of that name.
-
-    Raises:
-        MitsonarError: unknown name or option.
-    """
-    if name not in ESTIMATORS:
-        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, ESTIMATORS)}")
-    try:
-        return ESTIMATORS[name](**options)
-    except TypeError as error:
-        raise MitsonarError(f"estimator {name}: {error}") from None
 
 
 def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from mitsonar.estimation.estimator import Estimate, register, two_frames
+from mitsonar.estimation.estimator import Estimate, two_frames
 from mitsonar.frames import SonarFrames
 from mitsonar.motion import Motion
 
 __all__ = ["Zero"]
 
 
-@register("zero")
 class Zero:
     """No motion, whatever is seen."""
 

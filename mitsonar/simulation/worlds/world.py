@@ -229,6 +229,12 @@ class World:
     content: dict[str, bytes] = field(default_factory=dict)
 
     @property
+    def size_m(self) -> float:
+        """Longest edge of the box around the meshes [m]."""
+        vertices = np.concatenate([mesh.vertices for mesh in self.meshes])
+        return float(np.ptp(vertices, axis=0).max())
+
+    @property
     def faces(self) -> int:
         """Triangles of all meshes."""
         return sum(len(mesh.faces) for mesh in self.meshes)
