@@ -77,6 +77,11 @@ class GroundGeometry:
         radius = np.sqrt(s * s + f * f + u * u)
         return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
 
+    def elevation(self, points: NDArray[np.floating]) -> NDArray[Any]:
+        """Elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
+        s, f, u = self._in_sonar(points)
+        return np.asarray(np.arctan2(u, np.hypot(s, f) if self.bearing == "azimuth" else f))
+
     @cached_property
     def derivative(self) -> NDArray[np.float64]:
         """How range [m] and bearing [rad] of each cell's ground point change with the motion (sideways, forward [m], yaw
@@ -93,6 +98,19 @@ class GroundGeometry:
         one, none = np.ones_like(x), np.zeros_like(x)
         point = np.stack([np.stack([-one, none, -y], axis=-1), np.stack([none, -one, x], axis=-1)], axis=-2)
         return np.asarray(np.stack([along, turning], axis=-2) @ point)
+
+    @cached_property
+    def derivative_by_height(self) -> NDArray[np.float64]:
+        """How range [m] and bearing [rad] of each cell's ground point change as the sonar rises [m] ``(bins, beams, 2)``."""
+        s, f, u = self._in_sonar(self.points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        along = self.height_m / radius
+        aside, ahead = -self.turn[2, 0], -self.turn[2, 1]
+        if self.bearing == "azimuth":
+            turning = (f * aside - s * ahead) / (s * s + f * f)
+        else:
+            turning = (aside - (s / radius) * along) / np.sqrt(radius * radius - s * s)
+        return np.stack([along, turning], axis=-1)
 
     def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], ...]:
         """Starboard, forward, up of ground points in the sonar's own axes."""
