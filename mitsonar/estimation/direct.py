@@ -2,7 +2,9 @@
 
 Both frames are drawn half a motion apart from an unknown frame in the middle, so that both are interpolated alike and
 second-order terms of the geometry cancel: cell c is seen at c - D v / 2 in the first and at c + D v / 2 in the second, D the
-exact derivative of (bin, beam) by the motion. Residuals are weighed by Cauchy's law: shadow edges and relief are outliers.
+exact derivative of (bin, beam) by the motion. The slopes of the mean of both, as far as they rise over the noise, turn
+differences into motion. Single differences, and whole blocks that want to move by themselves, are weighed by Cauchy's law:
+shadow edges and relief are outliers.
 """
 
 from __future__ import annotations
@@ -11,16 +13,25 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy.interpolate import make_interp_spline
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, two_frames
+from mitsonar.estimation.estimator import (
+    FEWEST_BLOCKS,
+    LEAST_CORRELATION,
+    Estimate,
+    correlation_of,
+    spread_of,
+    two_frames,
+    unbelieved,
+)
+from mitsonar.estimation.height import Standing, standing_of
 from mitsonar.frames import SonarFrames
 from mitsonar.geometry import GroundGeometry
 from mitsonar.motion import Motion
-from mitsonar.sonar import Bearing
 
 __all__ = ["Direct"]
 
@@ -28,38 +39,73 @@ Floats = NDArray[np.float32]
 
 
 class Level(NamedTuple):
-    """One step from coarse to fine: every so many bins, smoothed over bins and beams, for so many iterations."""
+    """One step from coarse to fine.
+
+    Attributes:
+        step: every so many bins are used.
+        smoothing: of the frames, in bins and beams.
+        slopes: further smoothing of their mean, before its slopes are taken.
+        iterations: at most.
+    """
 
     step: int
-    bins: float
-    beams: float
+    smoothing: tuple[float, float]
+    slopes: tuple[float, float]
     iterations: int
 
 
-LEVELS = (Level(4, 6.0, 1.5, 8), Level(1, 1.0, 0.6, 12))
+LEVELS = (
+    Level(8, (16.0, 4.0), (0.0, 0.0), 10),
+    Level(4, (6.0, 1.5), (0.0, 0.0), 8),
+    Level(1, (0.7, 0.5), (0.6, 0.4), 24),
+)
 
-STILL = np.array([1e-5, 1e-5, 2e-6])
+STILL = np.array([3e-5, 3e-5, 6e-6])
 """Steps below which an iteration ends [m, m, rad]."""
 
-CAUCHY = 4.0
+CAUCHY = 3.0
 """Residuals of so many standard deviations have half the weight."""
 
 FAINTEST = 0.02
 """Residuals of this size are never outliers: patterns of rays and interpolation reach it without any noise."""
 
+NEIGHBOURS = (3, 7)
+"""Beams and bins within which the slopes' variance is compared with the noise (Wiener's filter)."""
+
+BLOCK = (24, 8)
+"""Bins and beams within which residuals belong together: rocks and their shadows."""
+
+BLOCK_CAUCHY = 4.0
+"""Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
+
+MODEL = 4.5
+"""Squared errors over the covariance of the residuals, as found on rocky fields in both models with and without noise: the
+ground is neither level nor sampled finely enough."""
+
+REMEMBERED = 4
+LEVER_M = 4.0
+LONGEST = 4.0
+NEAR_M = 0.002
+"""Steps that are remembered for the next; metres that a turn is worth; how many times longer a step may get; how short it
+must be before."""
+
+HEIGHT_STEP = 0.05
+"""Part of the height by which it is changed to see what depends on it."""
+
 FEWEST_CELLS = 500
-LEAST_CORRELATION = 8.0
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
-"""What an estimate that is to be believed must have: cells; correlation of the frames as matched, over that of independent
-noise in as many cells; standard deviations."""
+"""What an estimate that is to be believed must have besides: cells; standard deviations."""
 
 
 class _Fit(NamedTuple):
-    motion: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    correlation: float
-    cells: float
+    """What tells how good a motion is: covariance of the residuals' making, what a height wrong by 1 m changes, ..."""
+
     converged: bool
+    covariance: NDArray[np.float64]
+    by_height: NDArray[np.float64]
+    correlation: float
+    independent: float
+    blocks: float
 
 
 @dataclass(frozen=True)
@@ -69,156 +115,356 @@ class Direct:
     Args:
         height_m: over the ground; default: what the frames say.
         pitch_rad: default: what the frames say.
-        relief_m: mean height over the ground of what is seen: rocks, growth. Motions are scaled wrongly by about its part
-            of the height where it is not given.
+        relief_m: mean height over the ground of what is seen: rocks, growth; default: from the first echoes, where the
+            window shows them, else 0. Motions are scaled wrongly by about its part of the height where it is not known.
+        heave_std_m: how far the sonar may have risen or sunk between the frames; 0: not at all.
         levels: coarse to fine.
+
+    Raises:
+        MitsonarError: a height or a heave that is not positive.
     """
 
     height_m: float | None = None
     pitch_rad: float | None = None
-    relief_m: float = 0.0
+    relief_m: float | None = None
+    heave_std_m: float = 0.0
     levels: tuple[Level, ...] = LEVELS
 
     inputs = "height and pitch"
 
+    def __post_init__(self) -> None:
+        if self.heave_std_m < 0 or (self.height_m is not None and not self.height_m > 0):
+            raise MitsonarError(
+                "direct takes a height above 0 m and a heave_std_m of 0 or more: got "
+                f"{self.height_m} and {self.heave_std_m:g}"
+            )
+
     def estimate(self, frames: SonarFrames) -> Estimate:
         """The motion, its covariance, and whether to believe it; zero motion where there is nothing to match."""
         first, second = two_frames(frames)
-        height, pitch, roll = self._geometry(frames)
-        range_m, bearing_rad = tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist())
-        v = np.zeros(3)
+        standing = standing_of(frames, "direct", self.height_m, self.pitch_rad, self.relief_m)
+        if standing.doubt:
+            return unbelieved(standing.doubt)
+        v = np.zeros(4 if self.heave_std_m else 3)
         fit = None
-        for level in self.levels:
-            ground = _cells(range_m, bearing_rad, frames.sonar.bearing, height, pitch, roll, level.step)
-            fit = _register(_smoothed(first, level), _smoothed(second, level), *ground, v, level)
-            if fit is None:
-                return Estimate(Motion(0.0, 0.0, 0.0), None, False, "nothing in the frames to match")
-            v = fit.motion
+        for number, level in enumerate(self.levels):
+            if len(first) < 24 * level.step and number + 1 < len(self.levels):
+                continue  # too few bins for so coarse a step
+            pair = _smoothed(first, level), _smoothed(second, level)
+            cells = _Cells(frames, standing, level.step, heave=bool(self.heave_std_m))
+            found = self._register(*pair, cells, v, level, last=number + 1 == len(self.levels))
+            if found is None:
+                return unbelieved("nothing in the frames to match")
+            v, fit = found
         assert fit is not None
         turn = _to_new_heading(v)
-        about = {"correlation": fit.correlation, "cells": fit.cells}
-        covariance = turn @ fit.covariance @ turn.T
-        reason = _doubt(fit)
-        return Estimate(Motion(*(float(x) for x in turn @ v)), covariance, not reason, reason, about)
+        height = fit.by_height[:3] * standing.height_std_m
+        covariance = turn @ (MODEL * fit.covariance[:3, :3] + np.outer(height, height)) @ turn.T
+        about = {"correlation": fit.correlation, "height_m": standing.height_m}
+        about |= {"heave_m": float(v[3])} if self.heave_std_m else {}
+        reason = _doubt(fit, covariance)
+        return Estimate(Motion(*(float(x) for x in turn @ v[:3])), covariance, not reason, reason, about)
 
-    def _geometry(self, frames: SonarFrames) -> tuple[float, float, float]:
-        """Height over what is seen, pitch and roll, the mean of both frames."""
-        height = self.height_m if self.height_m is not None else _mean(frames.height_m)
-        pose = None if frames.poses is None else frames.poses.mean(axis=0)
-        pitch = self.pitch_rad if self.pitch_rad is not None else (None if pose is None else float(pose[3]))
-        if height is None or pitch is None:
-            raise MitsonarError(
-                "direct needs height and pitch: the frames lack height_m or poses; give height_m and pitch_rad to it"
-            )
-        if not height - self.relief_m > 0:
-            raise MitsonarError(f"the height over what is seen must be above 0: got {height:g} m less {self.relief_m:g} m")
-        return height - self.relief_m, pitch, 0.0 if pose is None else float(pose[4])
+    def _register(
+        self, first: Floats, second: Floats, cells: _Cells, start: NDArray[np.float64], level: Level, *, last: bool
+    ) -> tuple[NDArray[np.float64], _Fit | None] | None:
+        """Gauss-Newton from a start; None where there is nothing to match."""
+        v, hasten, converged = start.copy(), _Hasten(), False
+        look = None
+        for _ in range(level.iterations):
+            look = _look(first, second, cells, v, level, by_blocks=last)
+            if look is None:
+                return None
+            held = self._held(look.scale, len(v))
+            step = np.asarray(-np.linalg.solve(look.normal + np.diag(held), look.pull + held * v), dtype=np.float64)
+            v = np.add(v, hasten(v, step))
+            converged = bool((np.abs(step[:3]) < STILL).all())
+            if converged:
+                break
+        if not last or look is None:
+            return v, None
+        return v, _fit(look, cells, v, level, self._held(look.scale, len(v)), converged)
+
+    def _held(self, scale: float, unknowns: int) -> NDArray[np.float64]:
+        """How strongly each unknown is held to zero: only heave is, in units of the residuals' noise."""
+        held = np.zeros(unknowns)
+        held[3:] = scale**2 / self.heave_std_m**2 if self.heave_std_m else 0.0
+        return held
 
 
-def _mean(values: NDArray[np.float64] | None) -> float | None:
-    known = None if values is None else values[np.isfinite(values)]
-    return float(known.mean()) if known is not None and len(known) else None
+class _Look(NamedTuple):
+    """Both frames as they look at a motion: what differs, and what a further motion would change."""
+
+    before: Floats
+    after: Floats
+    inner: tuple[slice, slice]
+    slopes: tuple[Floats, Floats]
+    residual: Floats
+    jacobian: Floats
+    weight: Floats
+    scale: float
+
+    @property
+    def weighted(self) -> Floats:
+        """The weighted Jacobian ``(3 or 4, cells)``."""
+        return self.jacobian * self.weight
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """The normal matrix."""
+        return (self.weighted @ self.jacobian.T).astype(np.float64)
+
+    @property
+    def pull(self) -> NDArray[np.float64]:
+        """The right side of the normal equations."""
+        return (self.weighted @ self.residual).astype(np.float64)
+
+
+def _look(
+    first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], level: Level, *, by_blocks: bool
+) -> _Look | None:
+    """Both frames drawn half a motion apart from the middle; None where too little of them remains."""
+    half = cells.shift(v / 2)
+    inner = _inner(half, cells.usable)
+    if inner is None:
+        return None
+    before = _drawn(first, cells.row - half[0], cells.column - half[1])
+    after = _drawn(second, cells.row + half[0], cells.column + half[1])
+    residual = (after - before)[inner].ravel()
+    scale = max(1.4826 * float(np.median(np.abs(residual[::5]))), FAINTEST)
+    slopes = _slopes((before + after) * np.float32(0.5), level, scale)
+    weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
+    if by_blocks:
+        weight = weight * _block_weight(slopes, after - before, weight, inner)
+    look = _Look(before, after, inner, slopes, residual, cells.along(slopes, inner), weight, scale)
+    return None if residual.size < FEWEST_CELLS or _singular(look.normal) else look
+
+
+def _fit(
+    look: _Look, cells: _Cells, v: NDArray[np.float64], level: Level, held: NDArray[np.float64], converged: bool
+) -> _Fit:
+    """How good the motion is: from the pulls of blocks, and from slopes of one frame times those of the other."""
+    shape = look.before[look.inner].shape
+    true = _cross(look, cells, level)
+    inverse = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else look.normal) + np.diag(held))
+    weighted = look.weighted
+    pulls = _by_block((weighted * look.residual).reshape(len(v), *shape))
+    shares = _by_block((weighted * (inverse.astype(np.float32) @ look.jacobian)).sum(axis=0).reshape(1, *shape))
+    lifted = cells.lifted_shift(v)
+    change = (look.slopes[0] * lifted[0] + look.slopes[1] * lifted[1])[look.inner].ravel()
+    # smoothed noise is alike in neighbouring cells: as many count once as a smoothing kernel covers
+    alike = 4 * np.pi * max(level.smoothing[0], 0.28) * max(level.smoothing[1], 0.28)
+    return _Fit(
+        converged=converged,
+        covariance=inverse @ (pulls @ pulls.T) @ inverse,
+        by_height=inverse @ (weighted @ change),
+        correlation=correlation_of(look.before[look.inner], look.after[look.inner]),
+        independent=look.residual.size / alike,
+        blocks=spread_of(shares[0]),
+    )
+
+
+class _Cells:
+    """The cells of one level: where they are, and how they move with the sonar, in bins and beams."""
+
+    def __init__(self, frames: SonarFrames, standing: Standing, step: int, *, heave: bool) -> None:
+        self.bearing, self.standing, self.heave = frames.sonar.bearing, standing, heave
+        self.grid = _grid(tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist()), step)
+        self.row, self.column = self.grid.row, self.grid.column
+        self.nodes, self.usable = self._nodes(standing.height_m)
+        self.derivative = self._on_all(self.nodes)
+
+    def _nodes(self, height: float) -> tuple[Floats, slice]:
+        """The derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``; bins that meet the ground."""
+        grid, standing = self.grid, self.standing
+        ground = GroundGeometry(
+            grid.node_range, grid.node_bearing, self.bearing, height, standing.pitch_rad, standing.roll_rad
+        )
+        nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
+        if self.heave:
+            nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
+        known = np.asarray(np.isfinite(nodes).all(axis=(0, 1, 3)))
+        start = min(int(known.argmax()) if known.any() else len(known), len(known) - 1)
+        nodes = np.concatenate([np.repeat(nodes[:, :, start : start + 1], start, axis=2), nodes[:, :, start:]], axis=2)
+        usable = slice(int(np.searchsorted(grid.range_m, grid.node_range[start])), None)
+        return np.nan_to_num(nodes).astype(np.float32), usable
+
+    def _on_all(self, nodes: Floats) -> Floats:
+        """From the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
+        full = self.grid.over_bins @ nodes @ self.grid.over_beams.T
+        full[..., 0, :, :] /= self.grid.bin_m[:, None]
+        full[..., 1, :, :] /= self.grid.beam_rad
+        return np.asarray(full)
+
+    def shift(self, v: NDArray[np.float64]) -> Floats:
+        """How far each cell moves ``(2, bins, beams)``."""
+        shape = self.derivative.shape
+        return np.asarray((v.astype(np.float32) @ self.derivative.reshape(shape[0], -1)).reshape(shape[1:]))
+
+    def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
+        """The change of :meth:`shift` with the height, a metre."""
+        change = HEIGHT_STEP * self.standing.height_m
+        other, _ = self._nodes(self.standing.height_m + change)
+        return self._on_all(np.tensordot(v.astype(np.float32) / np.float32(change), other - self.nodes, axes=1))
+
+    def along(self, slopes: tuple[Floats, Floats], inner: tuple[slice, slice]) -> Floats:
+        """The image's derivative by each motion ``(3 or 4, cells)``."""
+        by_bin, by_beam = slopes[0][inner], slopes[1][inner]
+        jacobian = np.empty((len(self.derivative), *by_bin.shape), dtype=np.float32)
+        for out, (bins, beams) in zip(jacobian, self.derivative, strict=True):
+            np.multiply(by_bin, bins[inner], out=out)
+            out += by_beam * beams[inner]
+        return jacobian.reshape(len(jacobian), -1)
+
+
+class _Grid(NamedTuple):
+    """Cells of every so many bins, and splines from few nodes to all of them: the geometry is smooth."""
+
+    range_m: NDArray[np.float64]
+    node_range: NDArray[np.float64]
+    node_bearing: NDArray[np.float64]
+    over_bins: Floats
+    over_beams: Floats
+    bin_m: Floats
+    beam_rad: Floats
+    row: Floats
+    column: Floats
 
 
 @lru_cache(maxsize=16)
-def _cells(
-    range_m: tuple[float, ...],
-    bearing_rad: tuple[float, ...],
-    bearing: Bearing,
-    height: float,
-    pitch: float,
-    roll: float,
-    step: int,
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Derivative of (bin, beam) by the motion in the middle frame ``(bins, beams, 2, 3)``, and which cells have one."""
-    ranges, axes = np.array(range_m), np.array(bearing_rad)
-    ground = GroundGeometry(ranges[step // 2 :: step], axes, bearing, height, pitch, roll)
-    places = np.stack(
-        [
-            np.broadcast_to((step * np.gradient(ranges))[step // 2 :: step, None], ground.points.shape[:2]),
-            np.broadcast_to(np.gradient(axes), ground.points.shape[:2]),
-        ],
-        axis=-1,
-    )
-    derivative = ground.derivative / places[..., None]
-    known = np.isfinite(derivative).all(axis=(2, 3))
-    return np.nan_to_num(derivative).astype(np.float32), known
+def _grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: int) -> _Grid:
+    ranges, axes = np.array(range_m)[step // 2 :: step], np.array(bearing_rad)
+    nodes = [np.linspace(values[0], values[-1], count) for values, count in ((ranges, 33), (axes, 17))]
+    splines = [
+        np.asarray(make_interp_spline(node, np.eye(len(node)), 3)(values), dtype=np.float32)
+        for node, values in zip(nodes, (ranges, axes), strict=True)
+    ]
+    row = np.arange(len(ranges), dtype=np.float32)[:, None]
+    column = np.arange(len(axes), dtype=np.float32)[None, :]
+    spacing = [np.gradient(values).astype(np.float32) for values in (ranges, axes)]
+    return _Grid(ranges, nodes[0], nodes[1], splines[0], splines[1], spacing[0], spacing[1], row, column)
+
+
+def _blurred(image: Floats, bins: float, beams: float) -> Floats:
+    if not bins and not beams:
+        return image
+    size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
+    return np.asarray(cv2.GaussianBlur(image, size, sigmaX=beams, sigmaY=bins, borderType=cv2.BORDER_REPLICATE))
 
 
 def _smoothed(image: Floats, level: Level) -> Floats:
     """Every so many bins of the smoothed image."""
-    smooth = ndimage.gaussian_filter(image, (level.bins, level.beams), mode="nearest", truncate=3)
+    smooth = _blurred(image, *level.smoothing)
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
 
 
-def _register(
-    first: Floats, second: Floats, derivative: Floats, known: NDArray[np.bool_], start: NDArray[np.float64], level: Level
-) -> _Fit | None:
-    """Gauss-Newton from a start; None where there is nothing to match."""
-    v = start.copy()
-    bins, beams = first.shape
-    row, column = np.meshgrid(np.arange(bins, dtype=np.float32), np.arange(beams, dtype=np.float32), indexing="ij")
-    converged = False
-    for _ in range(level.iterations):
-        half = derivative @ (v / 2).astype(np.float32)
-        inner = _inner(half, bins, beams)
-        if inner is None:
-            return None
-        before = _at(first, row - half[..., 0], column - half[..., 1])
-        after = _at(second, row + half[..., 0], column + half[..., 1])
-        by_bin, by_beam = _slopes((before + after) * np.float32(0.5))
-        jacobian = by_bin[..., None] * derivative[..., 0, :] + by_beam[..., None] * derivative[..., 1, :]
-        use = known[inner]
-        j, r = jacobian[inner][use], (after - before)[inner][use]
-        scale = max(1.4826 * float(np.median(np.abs(r[::5]))) if r.size else 0.0, FAINTEST)
-        weight = 1 / (1 + (r / (CAUCHY * scale)) ** 2)
-        weighted = j * weight[:, None]
-        normal = (weighted.T @ j).astype(np.float64)
-        if len(r) < FEWEST_CELLS or np.linalg.cond(normal / np.outer(*[np.sqrt(np.diag(normal)) + 1e-30] * 2)) > 1e8:
-            return None
-        step = -np.linalg.solve(normal, (weighted.T @ r).astype(np.float64))
-        v = v + step
-        converged = bool((np.abs(step) < STILL).all())
-        if converged:
-            break
-    inverse = np.linalg.inv(normal)
-    # smoothed noise is alike in neighbouring cells: as many cells count once as a smoothing kernel covers
-    alike = 4 * np.pi * max(level.bins / level.step, 0.28) * max(level.beams, 0.28)
-    spread = weighted * r[:, None]
-    covariance = inverse @ (spread.T @ spread).astype(np.float64) @ inverse * alike
-    a, b = before[inner][use], after[inner][use]
-    moving = float(a.std() * b.std())
-    correlation = float(((a - a.mean()) * (b - b.mean())).mean()) / moving if moving > 0 else 0.0
-    return _Fit(v, covariance, correlation, len(r) / alike, converged)
-
-
-def _inner(half: Floats, bins: int, beams: int) -> tuple[slice, slice] | None:
-    """Cells that stay within both images; None where none does."""
-    margin = [int(np.ceil(np.abs(half[..., axis]).max())) + 1 for axis in (0, 1)]
-    if not (2 * margin[0] < bins and 2 * margin[1] < beams):
-        return None
-    return slice(margin[0], bins - margin[0]), slice(margin[1], beams - margin[1])
-
-
-def _at(image: Floats, row: Floats, column: Floats) -> Floats:
+def _drawn(image: Floats, row: Floats, column: Floats) -> Floats:
     """Values between pixels, bilinear."""
-    bins, beams = image.shape
-    row, column = np.clip(row, 0, bins - 1.001), np.clip(column, 0, beams - 1.001)
-    i, j = row.astype(np.int32), column.astype(np.int32)
-    over_row, over_column = row - i, column - j
-    flat, place = image.ravel(), i * beams + j
-    near, far = flat[place], flat[place + beams]
-    near = near + (flat[place + 1] - near) * over_column
-    far = far + (flat[place + beams + 1] - far) * over_column
-    return np.asarray(near + (far - near) * over_row, dtype=np.float32)
+    return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _slopes(image: Floats) -> tuple[Floats, Floats]:
+def _slopes(image: Floats, level: Level, scale: float) -> tuple[Floats, Floats]:
+    """Central differences over bins and beams of the image as far as it rises over the noise.
+
+    ``scale`` is the standard deviation of a difference of two frames; their mean has half of it.
+    """
+    smooth = _blurred(image, *level.slopes)
+    if scale > FAINTEST:
+        mean = cv2.blur(smooth, NEIGHBOURS)
+        variance = cv2.blur(smooth * smooth, NEIGHBOURS) - mean * mean
+        kept = np.maximum(0, 1 - np.float32(2 * (scale / 2) ** 2) / np.maximum(variance, np.float32(1e-9)))
+        smooth = mean + (smooth - mean) * kept
+    return _differences(smooth)
+
+
+HALVES = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+ONE = np.ones(1, dtype=np.float32)
+
+
+def _differences(image: Floats) -> tuple[Floats, Floats]:
     """Central differences over bins and over beams."""
-    by_bin, by_beam = np.zeros_like(image), np.zeros_like(image)
-    by_bin[1:-1] = (image[2:] - image[:-2]) / 2
-    by_beam[:, 1:-1] = (image[:, 2:] - image[:, :-2]) / 2
-    return by_bin, by_beam
+    by_bin = cv2.sepFilter2D(image, -1, ONE, HALVES, borderType=cv2.BORDER_REPLICATE)
+    by_beam = cv2.sepFilter2D(image, -1, HALVES, ONE, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(by_bin, dtype=np.float32), np.asarray(by_beam, dtype=np.float32)
+
+
+class _Hasten:
+    """Anderson's acceleration (1965): noise in the slopes makes steps too short, by what the last ones tell."""
+
+    def __init__(self) -> None:
+        self.places: list[NDArray[np.float64]] = []
+        self.steps: list[NDArray[np.float64]] = []
+
+    def __call__(self, place: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The step to take instead of one; the same where the last ones tell too little, or too much."""
+        lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
+        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
+            return step
+        self.places.append(place)
+        self.steps.append(step)
+        if len(self.steps) < 2:
+            return step
+        places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
+        past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
+        hastened = np.asarray(step - (places + steps) @ past)
+        lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (hastened, step)]
+        return hastened if lengths[0] < LONGEST * lengths[1] else step
+
+
+def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
+    """Cells that meet the ground and stay within both images; None where none does."""
+    _, bins, beams = half.shape
+    reach = np.abs(half).max(axis=(1, 2))
+    if not np.isfinite(reach).all():
+        return None
+    margin = [int(np.ceil(far)) + 1 for far in reach]
+    start = max(margin[0], usable.start)
+    if not (start + margin[0] < bins and 2 * margin[1] < beams):
+        return None
+    return slice(start, bins - margin[0]), slice(margin[1], beams - margin[1])
+
+
+def _singular(normal: NDArray[np.float64]) -> bool:
+    """Whether some motion changes nothing."""
+    size = np.sqrt(np.diag(normal))
+    return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
+
+
+def _cross(look: _Look, cells: _Cells, level: Level) -> NDArray[np.float64]:
+    """The normal matrix from slopes of one frame times slopes of the other, whose noise is not the same."""
+    frames = (look.before, look.after)
+    one, other = (cells.along(_differences(_blurred(image, *level.slopes)), look.inner) for image in frames)
+    product = ((one * look.weight) @ other.T).astype(np.float64)
+    return (product + product.T) / 2
+
+
+def _block_weight(slopes: tuple[Floats, Floats], difference: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
+    """Weights ``(cells,)`` of whole blocks: one that wants to move by itself shows relief, or a shadow.
+
+    How much it wants to is what its own best shift would take off its squared differences (Lucas and Kanade, 1981).
+    """
+    r, along, across = difference[inner], slopes[0][inner], slopes[1][inner]
+    w = weight.reshape(r.shape)
+    terms = (along * along, along * across, across * across, along * r, across * r)
+    aa, ab, bb, pull_a, pull_b = _by_block(np.stack([w * term for term in terms]))
+    aa, bb = aa + 1e-3 * aa.mean() + 1e-12, bb + 1e-3 * bb.mean() + 1e-12
+    unrest = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
+    blocks = 1 / (1 + unrest / (BLOCK_CAUCHY**2 * float(np.median(unrest)) + 1e-12))
+    row, column = (_block_of(size, block) for size, block in zip(r.shape, BLOCK, strict=True))
+    table = blocks.reshape(row[-1] + 1, column[-1] + 1).astype(np.float32)
+    return np.asarray(table[row][:, column]).ravel()
+
+
+def _block_of(size: int, block: int) -> NDArray[np.intp]:
+    """The block of each cell along an axis; cells beyond the last whole block belong to it."""
+    return np.minimum(np.arange(size) // block, max(size // block, 1) - 1)
+
+
+def _by_block(maps: Floats) -> NDArray[np.float64]:
+    """Sums over blocks ``(maps, blocks)``."""
+    starts = [np.arange(0, max(size // block, 1) * block, block) for size, block in zip(maps.shape[1:], BLOCK, strict=True)]
+    sums = np.add.reduceat(np.add.reduceat(maps, starts[0], axis=1), starts[1], axis=2)
+    return np.asarray(sums.reshape(len(maps), -1), dtype=np.float64)
 
 
 def _to_new_heading(v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -232,13 +478,15 @@ def _to_new_heading(v: NDArray[np.float64]) -> NDArray[np.float64]:
     return turn
 
 
-def _doubt(fit: _Fit) -> str:
+def _doubt(fit: _Fit, covariance: NDArray[np.float64]) -> str:
     """Why not to believe an estimate; empty where nothing speaks against it."""
-    std = np.sqrt(np.diag(fit.covariance))
+    std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"
-    if fit.correlation < LEAST_CORRELATION / np.sqrt(fit.cells):
+    if fit.correlation < LEAST_CORRELATION / np.sqrt(fit.independent):
         return f"the frames as matched correlate by {fit.correlation:.2f} only"
-    if (std > LARGEST_STD).any():
+    if fit.blocks < FEWEST_BLOCKS:
+        return "too small a part of the frames holds anything to match"
+    if not (std < LARGEST_STD).all():
         return f"standard deviations of {1e3 * std[0]:.1f}, {1e3 * std[1]:.1f} mm, {np.degrees(std[2]):.2f} deg"
     return ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +13,27 @@ from mitsonar.errors import MitsonarError
 from mitsonar.frames import SonarFrames
 from mitsonar.motion import Motion
 
-__all__ = ["Estimate", "Estimator", "two_frames"]
+__all__ = [
+    "FEWEST_BLOCKS",
+    "LEAST_CORRELATION",
+    "Estimate",
+    "Estimator",
+    "blank",
+    "correlation_of",
+    "matching_doubt",
+    "spread_of",
+    "two_frames",
+    "unbelieved",
+]
+
+LEAST_CORRELATION = 8.0
+"""Of frames as matched, in standard deviations of the correlation of independent noise in as many cells."""
+
+LEAST_AT_BEST = 0.3
+"""Of frames that were brought together: a maximum found among noise reaches 0.1 to 0.2."""
+
+FEWEST_BLOCKS = 8.0
+"""Parts of a frame that share what is matched: one object alone tells little, and its height is not known."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +53,11 @@ class Estimate:
     believe: bool = True
     reason: str = ""
     about: dict[str, Any] = field(default_factory=dict)
+
+
+def unbelieved(reason: str) -> Estimate:
+    """No motion, and why not to believe it."""
+    return Estimate(Motion(0.0, 0.0, 0.0), None, False, reason)
 
 
 class Estimator(Protocol):
@@ -62,3 +88,49 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
     scale = np.float32(1 / 255 if frames.image.dtype == np.uint8 else 1)
     first, second = (np.asarray(image, dtype=np.float32) * scale for image in frames.image)
     return first, second
+
+
+def blank(image: NDArray[np.float32]) -> bool:
+    """Whether all pixels are the same."""
+    return bool(image.size == 0 or image.min() == image.max())
+
+
+def correlation_of(first: NDArray[Any], second: NDArray[Any]) -> float:
+    """Correlation coefficient of two arrays of one shape; 0 where either is constant."""
+    a, b = first - first.mean(), second - second.mean()
+    size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
+    return float(np.vdot(a, b)) / size if size > 0 else 0.0
+
+
+def spread_of(shares: NDArray[np.floating]) -> float:
+    """How many blocks share what is matched, from the energy of each; few bright ones do not hide many faint ones."""
+    amplitude = np.sqrt(np.maximum(shares, 0))
+    energy = float((amplitude**2).sum())
+    return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0
+
+
+def matching_doubt(
+    first: NDArray[Any], second: NDArray[Any], inside: NDArray[np.bool_], *, alike: float, block: int = 32
+) -> str:
+    """What speaks against two images ``(rows, columns)`` that should now be alike; empty where nothing does.
+
+    Args:
+        first: one.
+        second: the other, as matched.
+        inside: which pixels count.
+        alike: how many neighbouring pixels count as one, since they were smoothed.
+        block: edge of the blocks over which what is matched must be spread [pixels].
+    """
+    count = int(inside.sum())
+    if count < alike:
+        return "nothing in the frames to match"
+    # what is slow belongs to the sonar's lighting, not to the ground
+    first, second = (image - cv2.blur(image, (block // 2, block // 2)) for image in (first, second))
+    correlation = correlation_of(first[inside], second[inside])
+    if correlation < max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(count / alike)):
+        return f"the frames as matched correlate by {correlation:.2f} only"
+    product = np.where(inside, (first - first[inside].mean()) * (second - second[inside].mean()), 0).astype(np.float64)
+    rows, columns = (np.arange(0, size, block) for size in product.shape)
+    if spread_of(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1)) < FEWEST_BLOCKS:
+        return "too small a part of the frames holds anything to match"
+    return ""
