@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 from array_api_compat import array_namespace, device
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.special import ndtr
 
 from mitsonar.errors import MitsonarError, nearest_names
 
-__all__ = ["NOISE_MODELS", "NoiseModel", "load_noise", "uniform"]
+__all__ = ["NOISE_MODELS", "Information", "NoiseModel", "information", "information_of_sums", "load_noise", "uniform"]
 
 MASK = 0xFFFFFFFF
 
@@ -84,6 +87,36 @@ class NoiseModel(BaseModel):
         noisy = xp.round(noisy * 2.0**24) * 2.0**-24  # hides the last bits in which libraries differ
         return xp.astype(noisy, xp.float32)
 
+    def grey_of_empty(self, greys: int = 255) -> NDArray[np.float64]:
+        """Probability of each grey value 0..``greys`` of a pixel without echo, as stored ``(greys + 1,)``."""
+        edges = _grey_edges(greys)
+        above = (self.mean > edges).astype(float) if self.std == 0 else ndtr((self.mean - edges) / self.std)
+        return np.asarray(-np.diff(above, prepend=1.0, append=0.0), dtype=np.float64)
+
+    def grey_of_echo(self, level: ArrayLike, greys: int = 255) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Probability of each grey value 0..``greys`` of a pixel with that echo, and its derivative by the echo.
+
+        Args:
+            level: the echo before noise, above 0 ``(...)``.
+            greys: the largest grey value.
+
+        Returns:
+            Two arrays ``(..., greys + 1)``.
+
+        Raises:
+            MitsonarError: echoes that no noise is added to: their grey value has no derivative.
+        """
+        if self.scale == 0:
+            raise MitsonarError("the law of an echo needs noise: got scale 0; give a scale above 0")
+        over = (_grey_edges(greys) - np.asarray(level, dtype=float)[..., None]) / self.scale
+        over = np.maximum(over, 0.0)
+        above = np.ones((*over.shape[:-1], greys + 2))
+        above[..., 1:-1] = np.exp(-over * over / 2)
+        above[..., -1] = 0.0
+        slope = np.zeros_like(above)
+        slope[..., 1:-1] = above[..., 1:-1] * over / self.scale
+        return above[..., :-1] - above[..., 1:], slope[..., :-1] - slope[..., 1:]
+
 
 def _clipped_gaussian(mean: float, std: float) -> tuple[float, float]:
     """Mean and variance of a Gaussian clipped to 0..1."""
@@ -145,6 +178,114 @@ def _mix(value: Any, key: Any) -> Any:
 
 def _mix_int(value: int) -> int:
     return int(_mix(value & MASK, 0x68BC21EB))
+
+
+def _grey_edges(greys: int) -> NDArray[np.float64]:
+    """What a value must exceed to be stored as grey 1, 2 ... ``greys``: a non-zero value is at least 1."""
+    edges = (np.arange(1, greys + 1) - 0.5) / greys
+    edges[0] = 0.0
+    return edges
+
+
+class Information(NamedTuple):
+    """What noisy values tell of two numbers of each pixel: its mean echo, and how often it holds one at all.
+
+    Attributes:
+        law: Fisher information of the exact law ``(..., 2, 2)``, in 1 / (fraction of the maximum)^2; None where echoes have
+            no noise, and a value tells its level without limit.
+        slope: derivative of the value's mean by the two ``(..., 2)``.
+        variance: of the value ``(...)``.
+    """
+
+    law: NDArray[np.float64] | None
+    slope: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+    def matched(self, more: ArrayLike = 0.0) -> NDArray[np.float64]:
+        """Information of a Gaussian of this mean and variance ``(..., 2, 2)``: what least squares can use, never more than
+        ``law``. ``more`` variance may be added."""
+        variance = self.variance + np.asarray(more, dtype=float)
+        return np.asarray(self.slope[..., :, None] * self.slope[..., None, :] / variance[..., None, None])
+
+
+CHUNK = 2048
+"""Pixels whose laws are held at a time: 4 MB an array."""
+
+
+def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *, greys: int = 255) -> Information:
+    """Fisher information of noisy, clipped pixels, stored as grey values 0..``greys`` (Almanza-Medina, 2.2.3; law ours).
+
+    A pixel holds an echo ``level / filled`` with probability ``filled``, else none: where the edge of a shadow crosses a
+    pixel, only part of the pings fill it. With p_e, p_0 the laws of a pixel with and without echo, the pixel's is
+    p = filled p_e + (1 - filled) p_0, and the information the sum over grey values of g g' / p, g its derivatives.
+
+    The information of an added Rayleigh value alone grows with the logarithm of ``greys``: its density begins with a corner,
+    which fine grey values show.
+
+    Where echoes have no noise (scale 0) ``law`` is None, and ``variance`` is that of rounding, 1 / (12 greys^2).
+
+    Args:
+        noise: of the pixels.
+        level: mean echo, 0..1, over pings that fill the pixel and pings that do not ``(...)``.
+        filled: part of the pings that fill it, 0..1 ``(...)``.
+        greys: the largest grey value.
+    """
+    level, filled = np.broadcast_arrays(np.asarray(level, dtype=float), np.asarray(filled, dtype=float))
+    shape, level, filled = level.shape, level.ravel(), filled.ravel()
+    echo = np.divide(level, filled, out=np.zeros_like(level), where=filled > 0)
+    if noise.scale == 0:
+        slope, variance = _noiseless(noise, echo, filled, greys)
+        return Information(None, slope.reshape(*shape, 2), variance.reshape(shape))
+    parts = [_exact(noise, echo[k : k + CHUNK], filled[k : k + CHUNK], greys) for k in range(0, max(len(level), 1), CHUNK)]
+    law, slope, variance = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Information(law.reshape(*shape, 2, 2), slope.reshape(*shape, 2), variance.reshape(shape))
+
+
+def _exact(
+    noise: NoiseModel, echo: NDArray[np.float64], filled: NDArray[np.float64], greys: int
+) -> tuple[NDArray[np.float64], ...]:
+    """Law, slope and variance of some pixels."""
+    empty = noise.grey_of_empty(greys)
+    p_echo, by_echo = noise.grey_of_echo(echo, greys)
+    c = filled[:, None]
+    p = c * p_echo + (1 - c) * empty
+    by_level, by_filled = by_echo, p_echo - empty - echo[:, None] * by_echo  # the echo is level / filled
+    g = np.stack([by_level, by_filled], axis=1)
+    weighted = np.divide(g, p[:, None], out=np.zeros_like(g), where=p[:, None] > 0)
+    value = np.arange(greys + 1) / greys
+    mean = p @ value
+    return weighted @ g.transpose(0, 2, 1), g @ value, np.maximum(p @ value**2 - mean**2, 1e-300)
+
+
+def _noiseless(
+    noise: NoiseModel, echo: NDArray[np.float64], filled: NDArray[np.float64], greys: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slope and variance where echoes are only rounded."""
+    mean, variance = _clipped_gaussian(noise.mean, noise.std)
+    slope = np.stack([(echo < 1).astype(float), np.full_like(echo, -mean)], axis=-1)
+    spread = filled * (1 - filled) * (echo - mean) ** 2 + (1 - filled) * variance
+    return slope, spread + 1 / (12 * greys**2)
+
+
+def information_of_sums(noise: NoiseModel, nonzero: ArrayLike, cells: int) -> Information:
+    """Fisher information of noisy sums over the beams, :meth:`NoiseModel.apply_sum`, about the sum of the echoes and the
+    number of pixels that hold one; sums are not rounded.
+
+    Args:
+        noise: of the pixels.
+        nonzero: how many pixels of each row hold an echo ``(...)``.
+        cells: pixels of a row.
+    """
+    nonzero = np.asarray(nonzero, dtype=float)
+    empty_mean, empty_variance = _clipped_gaussian(noise.mean, noise.std)
+    echo_mean, echo_variance = math.sqrt(math.pi / 2) * noise.scale, (2 - math.pi / 2) * noise.scale**2
+    slope = np.broadcast_to(np.array([1.0, echo_mean - empty_mean]), (*nonzero.shape, 2))
+    variance = nonzero * echo_variance + (cells - nonzero) * empty_variance
+    if noise.scale == 0:
+        return Information(None, slope, variance)
+    by_filled = np.diag([0.0, echo_variance - empty_variance])
+    of_variance = (by_filled @ by_filled) / (2 * variance**2)[..., None, None]
+    return Information(slope[..., :, None] * slope[..., None, :] / variance[..., None, None] + of_variance, slope, variance)
 
 
 def load_noise(text: str) -> NoiseModel:
