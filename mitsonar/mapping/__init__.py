@@ -1,0 +1,1 @@
+"""Motions become a path, frames and a path become a mosaic."""
