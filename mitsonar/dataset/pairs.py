@@ -194,13 +194,20 @@ class SonarPairs(Dataset[Any], Samples):
                 sample[f"nonzero_{view}"] = self.store.read(name, here).astype(np.int32)
         return sample
 
-    def sonar_frames(self, index: int) -> SonarFrames:
-        """A sample as frames, with noise, for estimators: image, poses, heights (one view)."""
+    def sonar_frames(self, index: int, image: NDArray[Any] | None = None) -> SonarFrames:
+        """A sample as frames, with noise, for estimators: image, poses, heights (one view).
+
+        Args:
+            index: of the sample.
+            image: in place of the stored frames, like them ``(frames, bins, beams)``; it gets the same noise.
+        """
         if len(self.arrange.views) > 1 or self.arrange.kind != "image":
             raise MitsonarError(f"frames hold images of one view: choose one of {', '.join(self.arrange.views)}")
         here, (name,) = self.frame_numbers(index), self.arrange.views
         view = next(view for view in self.recipe.views if view.name == name)
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
+        if image is not None:
+            sample[name] = image[None]
         image = self.arrange.noisy(sample, name, sample["frames"], self.seed + SEED_STEP * self.epoch)[0]
         return SonarFrames(
             image=np.asarray(image),

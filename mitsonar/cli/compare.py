@@ -1,0 +1,286 @@
+"""``mitsonar compare``: estimators side by side on the same pairs of a data set."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mitsonar.dataset.pairs import SonarPairs
+    from mitsonar.estimation.comparison import Answers
+    from mitsonar.estimation.estimator import Estimator
+
+__all__ = ["compare", "table_lines"]
+
+METHODS = "zero,ecc,flow,phase,direct"
+
+
+@answered
+def compare(
+    data: Annotated[str, typer.Argument(metavar="DATA.zarr", help="Path or URL of a data set of images.")],
+    estimators: Annotated[
+        str, typer.Option(help="Names with commas between them, each NAME or NAME:key=value:key=value.")
+    ] = METHODS,
+    noise: Annotated[str, typer.Option(help="Noise levels with commas: none, low, high, chapter2.")] = "none",
+    part: Annotated[str | None, typer.Option(help="train, validation, test (default where it is), all.")] = None,
+    pairs: Annotated[int | None, typer.Option(min=2, help="At most so many, each of a sequence of its own.")] = None,
+    perturb: Annotated[
+        bool, typer.Option("--perturb", help="Rows with wrong height, pitch, roll, sound speed, heave.")
+    ] = False,
+    jitter: Annotated[
+        bool, typer.Option("--jitter", help="A row with rays that move: is it the sampling's pattern?")
+    ] = False,
+    prior: Annotated[bool, typer.Option("--prior", help="Rows that know how large motions are, as networks do.")] = False,
+    limit: Annotated[int, typer.Option(min=0, help="Pairs over which the physical limit is computed; 0: none.")] = 10,
+    reference: Annotated[str | None, typer.Option(help="Method that others are compared with (default: the last).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise, choice of pairs and bootstrap.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder for answers, table.md and table.json; goes on.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print for programs.")] = False,
+) -> None:
+    """Errors of all methods on the same pairs; failures count as zero motion; bootstrap by scene, then sequence."""
+    try:
+        from mitsonar.dataset.pairs import SonarPairs
+    except ModuleNotFoundError:
+        raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'") from None
+    from mitsonar.estimation.comparison import VARIATIONS, answers_of, limits_of, rows_of, with_prior
+    from mitsonar.estimation.estimators import estimator_from
+    from mitsonar.metrics import cluster_resamples, in_units
+    from mitsonar.noise import load_noise
+
+    methods = {text: estimator_from(text) for text in dict.fromkeys(estimators.split(",")) if text}
+    if not methods or (reference is not None and reference not in methods):
+        raise MitsonarError(f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {reference!r}")
+    levels = {name: load_noise(name) for name in noise.split(",")}
+    changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if perturb else []
+    asked = ["as told", *changed, *(["jitter"] if jitter else [])]
+    samples = {name: _pairs(SonarPairs, data, part, name, seed) for name in levels}
+    first = next(iter(samples.values()))
+    numbers = _chosen(len(first), pairs, seed)
+    truth = np.array([first.target(number) for number in numbers])
+    resamples = cluster_resamples(first.scene[first.first[numbers]], seed=seed)
+    settings = {"data": _digest(first), "methods": list(methods), "part": part, "pairs": len(numbers), "seed": seed}
+    store = _Kept(out, settings)
+    report: dict[str, Any] = {"data": data, "model": first.recipe.instrument.model, **settings, "tables": []}
+    with progress_bar("comparing", len(levels) * len(asked) * len(numbers), "pairs") as progress:
+        answers = {
+            (level, variation): answers_of(
+                methods,
+                samples[level],
+                numbers,
+                variation,
+                known=store.load(level, variation, methods),
+                keep=store.keeper(level, variation),
+                progress=progress,
+            )
+            for level in levels
+            for variation in asked
+        }
+    inputs = {name: method.inputs for name, method in methods.items()}
+    for level, model in levels.items():
+        bounds = store.limits(level, limit)
+        if limit and bounds is None:
+            few = [numbers[k] for k in np.linspace(0, len(numbers) - 1, min(limit, len(numbers))).astype(int)]
+            with progress_bar("limit", len(few), "pairs") as progress:
+                bounds = limits_of(samples[level], few, model, progress)
+            store.keep_limits(level, limit, bounds)
+        for variation in asked:
+            said = dict(answers[level, variation])
+            if prior:
+                largest = np.abs(truth).max(axis=0)
+                known = {k: one for k, one in said.items() if np.isfinite(one.covariance).any()}
+                said |= {f"{k} with prior": with_prior(one, largest) for k, one in known.items()}
+            words = {k: inputs[k.removesuffix(" with prior")] + (", prior" if "with prior" in k else "") for k in said}
+            bound = None if not bounds else bounds["rays"]
+            rows = rows_of(said, words, truth, resamples, limit=bound, reference=reference or list(methods)[-1])
+            report["tables"].append(
+                {
+                    "noise": level,
+                    "variation": variation,
+                    "limits": {law: in_units(std).tolist() for law, std in (bounds or {}).items()},
+                    "reference": reference or list(methods)[-1],
+                    "rows": [row.plain() for row in rows],
+                }
+            )
+    lines = [line for table in report["tables"] for line in table_lines(table)]
+    store.finish(lines, report)
+    if as_json:
+        say(json.dumps(report, indent=1))
+        return
+    say(
+        f"{data}: {len(numbers)} pairs of {len(np.unique(first.scene[first.first[numbers]]))} scenes, "
+        f"{first.recipe.instrument.model} model; sideways mm / forward mm / yaw deg"
+    )
+    for line in lines:
+        say(line)
+    if out is not None:
+        say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}")
+
+
+def _pairs(reader: type[SonarPairs], data: str, part: str | None, noise: str, seed: int) -> SonarPairs:
+    """One pair a sequence of the part that is asked for."""
+    from mitsonar.dataset.store import DataStore
+
+    recipe = DataStore.open(data).recipe
+    part = part or ("test" if recipe.split.test > 0 else "validation")
+    return reader(data, part=part, frames=2, noise=noise, seed=seed, one_a_sequence=True)
+
+
+def _chosen(count: int, pairs: int | None, seed: int) -> list[int]:
+    """Which samples: all, or some at random, in order."""
+    if count < 2:
+        raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
+    if pairs is None or pairs >= count:
+        return list(range(count))
+    return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
+
+
+def _digest(pairs: SonarPairs) -> str:
+    """Of what is compared on: the motions and the recipe."""
+    content = pairs.motion.tobytes() + pairs.pose.tobytes() + json.dumps(pairs.recipe.model_dump(), default=str).encode()
+    return hashlib.sha256(content).hexdigest()
+
+
+class _Kept:
+    """Answers on disk, so that a comparison that was broken off goes on; a stub without a folder."""
+
+    def __init__(self, folder: Path | None, settings: dict[str, Any]) -> None:
+        from mitsonar.files import read_json, write_json
+
+        self.folder = folder
+        if folder is None:
+            return
+        if folder.exists() and any(folder.iterdir()):
+            if not (folder / "compare.json").exists():
+                raise MitsonarError(f"{folder} holds other things and is kept: choose another -o")
+            had = read_json(folder / "compare.json")
+            differ = [key for key, value in settings.items() if had.get(key) != value]
+            if differ:
+                raise MitsonarError(f"{folder} holds a comparison with other {', '.join(differ)}: choose another -o")
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "compare.json", settings)
+
+    def _path(self, level: str, variation: str) -> Path:
+        assert self.folder is not None
+        return self.folder / f"answers {level} {variation}.npz".replace(" ", "-").replace("%", "percent")
+
+    def load(self, level: str, variation: str, methods: dict[str, Estimator]) -> dict[str, Answers] | None:
+        """What an earlier run has found."""
+        from mitsonar.estimation.comparison import Answers
+
+        if self.folder is None or not self._path(level, variation).exists():
+            return None
+        try:
+            with np.load(self._path(level, variation)) as table:
+                return {name: Answers.from_arrays(table, name) for name in methods}
+        except (OSError, ValueError, KeyError) as error:
+            raise MitsonarError(
+                f"{self._path(level, variation)} is damaged ({error}): remove it, it is made again"
+            ) from None
+
+    def keeper(self, level: str, variation: str) -> Any:
+        """What keeps answers as they come."""
+        from mitsonar.files import write_whole
+
+        if self.folder is None:
+            return None
+
+        def keep(answers: dict[str, Answers]) -> None:
+            buffer = io.BytesIO()
+            arrays: dict[str, NDArray[Any]] = {}
+            for name, one in answers.items():
+                arrays |= one.arrays(name)
+            np.savez(buffer, **arrays)  # type: ignore[arg-type]
+            write_whole(self._path(level, variation), buffer.getvalue())
+
+        return keep
+
+    def limits(self, level: str, count: int) -> dict[str, NDArray[np.float64]] | None:
+        """Bounds of an earlier run."""
+        from mitsonar.files import read_json
+
+        path = None if self.folder is None else self.folder / f"limit-{level}-{count}.json"
+        if path is None or not path.exists():
+            return None
+        return {law: np.array(values, dtype=float) for law, values in read_json(path).items()}
+
+    def keep_limits(self, level: str, count: int, bounds: dict[str, NDArray[np.float64]]) -> None:
+        """Keep them."""
+        from mitsonar.files import write_json
+
+        if self.folder is not None:
+            write_json(self.folder / f"limit-{level}-{count}.json", {law: std.tolist() for law, std in bounds.items()})
+
+    def finish(self, lines: list[str], report: dict[str, Any]) -> None:
+        """The tables."""
+        from mitsonar.files import write_json, write_whole
+
+        if self.folder is not None:
+            write_whole(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
+            write_json(self.folder / "table.json", report)
+
+
+COLUMNS = ("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit", "ms", "inputs")
+
+
+def table_lines(table: dict[str, Any]) -> list[str]:
+    """A table of the report as Markdown."""
+    lines = ["", f"noise {table['noise']}, {table['variation']}", ""]
+    rows = [list(COLUMNS), ["---"] * len(COLUMNS)]
+    for row in table["rows"]:
+        rows.append(
+            [
+                row["method"],
+                _three(row["rmse"]),
+                " ".join(
+                    f"{_number(low, k)}..{_number(high, k)}"
+                    for k, (low, high) in enumerate(zip(row["rmse_low"], row["rmse_high"], strict=True))
+                ),
+                _three(row["median"]),
+                _three(row["p95"]),
+                " / ".join(f"{value:.3f}" for value in row["slope"]),
+                _three(row["large"]),
+                str(row["failures"]),
+                " / ".join(f"{value:.2f}" for value in row["skill"]),
+                " / ".join("-" if value is None else f"{value:.1f}" for value in row["over_limit"]),
+                f"{row['ms']:.1f}",
+                row["inputs"],
+            ]
+        )
+    width = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
+    lines += ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in rows]
+    if table["limits"]:
+        known = {law: std for law, std in table["limits"].items() if any(std)}
+        lines += ["", "limit of two frames: " + "; ".join(f"{law} {_three(std)}" for law, std in known.items())]
+    others = [row for row in table["rows"] if row["method"] != table["reference"] and row["method"] != "zero"]
+    for row in others:
+        numbers = zip(row["over_reference"], row["over_reference_low"], row["over_reference_high"], DIGITS, strict=True)
+        spans = (f"{value:+.{d}f} ({low:+.{d}f}..{high:+.{d}f})" for value, low, high, d in numbers)
+        lines.append(
+            f"{'' if row is not others[0] else chr(10)}{row['method']} less {table['reference']}: {' / '.join(spans)}  "
+        )
+    return lines
+
+
+DIGITS = (2, 2, 4)
+
+
+def _number(value: float | None, axis: int) -> str:
+    return "-" if value is None else f"{value:.{DIGITS[axis]}f}"
+
+
+def _three(values: list[float | None]) -> str:
+    return " / ".join(_number(value, k) for k, value in enumerate(values))
