@@ -15,7 +15,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS = PROJECT["tool"]["setuptools"]
 
 STAGES = (
-    *("errors", "files", "sonar", "presets", "motion", "frames", "framestore", "noise", "geometry", "plots"),
+    *("errors", "files", "sonar", "presets", "motion", "frames", "framestore", "noise", "geometry", "metrics", "plots"),
     "simulation.echoes",
     *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")),
     *(f"simulation.worlds.{name}" for name in ("shapes", "perlin", "world")),
@@ -23,13 +23,18 @@ STAGES = (
     *(f"simulation.worlds.{name}" for name in ("user_mesh", "scene_file")),
     "simulation.worlds.families",
     *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "tracing", "views", "segments", "bistatic")),
-    *(f"simulation.{name}" for name in ("binning", "imaging", "runs")),
+    *(f"simulation.{name}" for name in ("binning", "imaging", "runs", "derivatives")),
     *(
         f"dataset.{name}"
         for name in ("recipe", "plan", "split", "place", "store", "rendering", "shards", "workers", "generate")
     ),
-    *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered")),
-    *(f"estimation.{name}" for name in ("estimator", "zero", "direct", "estimators")),
+    *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered", "again")),
+    *(
+        f"estimation.{name}"
+        for name in ("estimator", "zero", "height", "ground", "ecc", "phase", "flow", "direct", "estimators")
+    ),
+    *(f"estimation.{name}" for name in ("limit", "comparison")),
+    *(f"mapping.{name}" for name in ("paths", "assessment", "source", "odometry", "mosaic", "charts", "results")),
     "cli",
     "__main__",
 )
@@ -89,7 +94,7 @@ def stage(name: str) -> int:
     return STAGES.index("cli" if name.split(".")[0] == "cli" else name)
 
 
-PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "estimation", "scenes"}
+PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "estimation", "mapping", "scenes"}
 """Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
 
