@@ -32,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("bench"))
     parser.add_argument("--pairs", type=int, default=1000)
-    parser.add_argument("--perturbed", type=int, default=300, help="pairs of the perturbed rows; 0: none")
+    parser.add_argument("--perturbed", type=int, default=200, help="pairs of the perturbed rows; 0: none")
     parser.add_argument("--only", choices=SETS)
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def main() -> None:
         levels = ("--noise", "none,low,high", "--limit", 10)
         run("compare", *common, *levels, "--prior", "--estimators", METHODS, "--pairs", asked.pairs, "-o", asked.out / name)
         if asked.perturbed:
-            few = ("--pairs", asked.perturbed, "--noise", "none,high", "--limit", 0, "--perturb", "--jitter")
+            few = ("--pairs", asked.perturbed, "--noise", "none", "--limit", 0, "--perturb", "--jitter")
             run("compare", *common, *few, "--estimators", PERTURBED, "-o", asked.out / f"{name}-perturbed")
 
 

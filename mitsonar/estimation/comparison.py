@@ -155,7 +155,8 @@ def answers_of(
         progress(len(numbers) - len(missing))
     for count, (number, frames) in enumerate(frames_of(pairs, missing, variation), start=1):
         for name, estimator in estimators.items():
-            table[name].ask(place[number], estimator, frames)
+            if not table[name].asked[place[number]]:
+                table[name].ask(place[number], estimator, frames)
         if progress is not None:
             progress(1)
         if keep is not None and count % keep_every == 0:

@@ -1,10 +1,10 @@
 """The estimator ``direct``: photometric Gauss-Newton in native polar coordinates, over level ground.
 
-Both frames are drawn half a motion apart from an unknown frame in the middle, so that both are interpolated alike and
-second-order terms of the geometry cancel: cell c is seen at c - D v / 2 in the first and at c + D v / 2 in the second, D the
-exact derivative of (bin, beam) by the motion. The slopes of the mean of both, as far as they rise over the noise, turn
-differences into motion. Single differences, and whole blocks that want to move by themselves, are weighed by Cauchy's law:
-shadow edges and relief are outliers.
+The ground that a cell of one frame shows, the other frame shows where the exact geometry of the motion takes it. Each frame
+is drawn at the cells of the other, and both differences are used: a texture finer than a beam pulls the answer towards whole
+and half beams where both frames are interpolated at once. The slopes of the mean of both, as far as they rise over the noise,
+turn differences into motion. Single differences, and whole blocks that want to move by themselves, are weighed by Cauchy's
+law: shadow edges and relief are outliers.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mitsonar.estimation.estimator import (
 )
 from mitsonar.estimation.height import Standing, standing_of
 from mitsonar.frames import SonarFrames
-from mitsonar.geometry import GroundGeometry
+from mitsonar.geometry import GroundGeometry, moved
 from mitsonar.motion import Motion
 
 __all__ = ["Direct"]
@@ -157,13 +157,12 @@ class Direct:
                 return unbelieved("nothing in the frames to match")
             v, fit = found
         assert fit is not None
-        turn = _to_new_heading(v)
         height = fit.by_height[:3] * standing.height_std_m
-        covariance = turn @ (MODEL * fit.covariance[:3, :3] + np.outer(height, height)) @ turn.T
+        covariance = MODEL * fit.covariance[:3, :3] + np.outer(height, height)
         about = {"correlation": fit.correlation, "height_m": standing.height_m}
         about |= {"heave_m": float(v[3])} if self.heave_std_m else {}
         reason = _doubt(fit, covariance)
-        return Estimate(Motion(*(float(x) for x in turn @ v[:3])), covariance, not reason, reason, about)
+        return Estimate(Motion(*(float(x) for x in v[:3])), covariance, not reason, reason, about)
 
     def _register(
         self, first: Floats, second: Floats, cells: _Cells, start: NDArray[np.float64], level: Level, *, last: bool
@@ -172,7 +171,7 @@ class Direct:
         v, hasten, converged = start.copy(), _Hasten(), False
         look = None
         for _ in range(level.iterations):
-            look = _look(first, second, cells, v, level, by_blocks=last)
+            look = _look(first, second, cells, v, level, last=last)
             if look is None:
                 return None
             held = self._held(look.scale, len(v))
@@ -192,8 +191,8 @@ class Direct:
         return held
 
 
-class _Look(NamedTuple):
-    """Both frames as they look at a motion: what differs, and what a further motion would change."""
+class _Side(NamedTuple):
+    """One frame drawn at the cells of the other: what differs, and what a further motion would change."""
 
     before: Floats
     after: Floats
@@ -202,64 +201,74 @@ class _Look(NamedTuple):
     residual: Floats
     jacobian: Floats
     weight: Floats
+    weighted: Floats
+
+    def sums(self, values: Floats) -> NDArray[np.float64]:
+        """Maps ``(maps, cells)`` summed over blocks of the whole frame ``(maps, blocks)``."""
+        rows, columns = self.before.shape
+        whole = np.zeros((len(values), rows, columns), dtype=np.float32)
+        inside = whole[:, self.inner[0], self.inner[1]]
+        inside[...] = values.reshape(inside.shape)
+        return _by_block(whole)
+
+
+class _Look(NamedTuple):
+    """Both sides at one motion, and the noise of their differences."""
+
+    sides: list[_Side]
     scale: float
-
-    @property
-    def weighted(self) -> Floats:
-        """The weighted Jacobian ``(3 or 4, cells)``."""
-        return self.jacobian * self.weight
-
-    @property
-    def normal(self) -> NDArray[np.float64]:
-        """The normal matrix."""
-        return (self.weighted @ self.jacobian.T).astype(np.float64)
-
-    @property
-    def pull(self) -> NDArray[np.float64]:
-        """The right side of the normal equations."""
-        return (self.weighted @ self.residual).astype(np.float64)
+    normal: NDArray[np.float64]
+    pull: NDArray[np.float64]
 
 
-def _look(
-    first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], level: Level, *, by_blocks: bool
-) -> _Look | None:
-    """Both frames drawn half a motion apart from the middle; None where too little of them remains."""
-    half = cells.shift(v / 2)
-    inner = _inner(half, cells.usable)
-    if inner is None:
+def _look(first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], level: Level, *, last: bool) -> _Look | None:
+    """The second frame drawn at the first's cells, at last also the other way; None where too little remains to compare."""
+    pairs = []
+    for back in (False, True) if last else (False,):
+        there = cells.shift(v, back=back)
+        inner = _inner(there, cells.usable)
+        if inner is None:
+            return None
+        drawn = _drawn(first if back else second, cells.row + there[0], cells.column + there[1])
+        pairs.append((drawn, second, inner) if back else (first, drawn, inner))
+    residuals = [(after - before)[inner].ravel() for before, after, inner in pairs]
+    if residuals[0].size < FEWEST_CELLS:
         return None
-    before = _drawn(first, cells.row - half[0], cells.column - half[1])
-    after = _drawn(second, cells.row + half[0], cells.column + half[1])
-    residual = (after - before)[inner].ravel()
-    scale = max(1.4826 * float(np.median(np.abs(residual[::5]))), FAINTEST)
-    slopes = _slopes((before + after) * np.float32(0.5), level, scale)
-    weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
-    if by_blocks:
-        weight = weight * _block_weight(slopes, after - before, weight, inner)
-    look = _Look(before, after, inner, slopes, residual, cells.along(slopes, inner), weight, scale)
-    return None if residual.size < FEWEST_CELLS or _singular(look.normal) else look
+    scale = max(1.4826 * float(np.median(np.abs(residuals[0][::5]))), FAINTEST)
+    sides = []
+    for (before, after, inner), residual in zip(pairs, residuals, strict=True):
+        slopes = _slopes((before + after) * np.float32(0.5), level, scale)
+        weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
+        if last:
+            weight = weight * _block_weight(slopes, residual, weight, inner)
+        jacobian = cells.along(slopes, inner)
+        sides.append(_Side(before, after, inner, slopes, residual, jacobian, weight, jacobian * weight))
+    normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
+    pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
+    return None if _singular(normal) else _Look(sides, scale, normal, pull)
 
 
 def _fit(
     look: _Look, cells: _Cells, v: NDArray[np.float64], level: Level, held: NDArray[np.float64], converged: bool
 ) -> _Fit:
     """How good the motion is: from the pulls of blocks, and from slopes of one frame times those of the other."""
-    shape = look.before[look.inner].shape
-    true = _cross(look, cells, level)
+    true = np.sum([_cross(side, cells, level) for side in look.sides], axis=0)
     inverse = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else look.normal) + np.diag(held))
-    weighted = look.weighted
-    pulls = _by_block((weighted * look.residual).reshape(len(v), *shape))
-    shares = _by_block((weighted * (inverse.astype(np.float32) @ look.jacobian)).sum(axis=0).reshape(1, *shape))
+    pulls = np.sum([side.sums(side.weighted * side.residual) for side in look.sides], axis=0)
+    side = look.sides[0]
+    shares = side.sums((side.weighted * (inverse.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
     lifted = cells.lifted_shift(v)
-    change = (look.slopes[0] * lifted[0] + look.slopes[1] * lifted[1])[look.inner].ravel()
+    by_height = np.zeros(len(v))
+    for one in look.sides:
+        by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
     # smoothed noise is alike in neighbouring cells: as many count once as a smoothing kernel covers
-    alike = 4 * np.pi * max(level.smoothing[0], 0.28) * max(level.smoothing[1], 0.28)
+    alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
     return _Fit(
         converged=converged,
         covariance=inverse @ (pulls @ pulls.T) @ inverse,
-        by_height=inverse @ (weighted @ change),
-        correlation=correlation_of(look.before[look.inner], look.after[look.inner]),
-        independent=look.residual.size / alike,
+        by_height=inverse @ by_height,
+        correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
+        independent=side.residual.size / alike,
         blocks=spread_of(shares[0]),
     )
 
@@ -271,23 +280,33 @@ class _Cells:
         self.bearing, self.standing, self.heave = frames.sonar.bearing, standing, heave
         self.grid = _grid(tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist()), step)
         self.row, self.column = self.grid.row, self.grid.column
-        self.nodes, self.usable = self._nodes(standing.height_m)
+        self.ground = self._ground(standing.height_m)
+        known = np.asarray(np.isfinite(self.ground.points).all(axis=(1, 2)))
+        self.start = min(int(known.argmax()) if known.any() else len(known), len(known) - 1)
+        self.usable = slice(int(np.searchsorted(self.grid.range_m, self.grid.node_range[self.start])), None)
+        self.nodes = self._nodes(standing.height_m)
         self.derivative = self._on_all(self.nodes)
 
-    def _nodes(self, height: float) -> tuple[Floats, slice]:
-        """The derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``; bins that meet the ground."""
+    def _ground(self, height: float) -> GroundGeometry:
+        """The geometry at the nodes."""
         grid, standing = self.grid, self.standing
-        ground = GroundGeometry(
+        return GroundGeometry(
             grid.node_range, grid.node_bearing, self.bearing, height, standing.pitch_rad, standing.roll_rad
         )
+
+    def _nodes(self, height: float) -> Floats:
+        """The derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``."""
+        ground = self._ground(height)
         nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
         if self.heave:
             nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
-        known = np.asarray(np.isfinite(nodes).all(axis=(0, 1, 3)))
-        start = min(int(known.argmax()) if known.any() else len(known), len(known) - 1)
-        nodes = np.concatenate([np.repeat(nodes[:, :, start : start + 1], start, axis=2), nodes[:, :, start:]], axis=2)
-        usable = slice(int(np.searchsorted(grid.range_m, grid.node_range[start])), None)
-        return np.nan_to_num(nodes).astype(np.float32), usable
+        return self._filled(nodes, self.start).astype(np.float32)
+
+    @staticmethod
+    def _filled(nodes: NDArray[np.float64], start: int) -> NDArray[np.float64]:
+        """Nodes ``(..., ranges, bearings)`` before the first that meets the ground get its values."""
+        held = np.repeat(nodes[..., start : start + 1, :], start, axis=-2)
+        return np.nan_to_num(np.concatenate([held, nodes[..., start:, :]], axis=-2))
 
     def _on_all(self, nodes: Floats) -> Floats:
         """From the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
@@ -296,15 +315,23 @@ class _Cells:
         full[..., 1, :, :] /= self.grid.beam_rad
         return np.asarray(full)
 
-    def shift(self, v: NDArray[np.float64]) -> Floats:
-        """How far each cell moves ``(2, bins, beams)``."""
-        shape = self.derivative.shape
-        return np.asarray((v.astype(np.float32) @ self.derivative.reshape(shape[0], -1)).reshape(shape[1:]))
+    def shift(self, v: NDArray[np.float64], *, back: bool = False) -> Floats:
+        """How far from each cell of the first frame the second shows its ground ``(2, bins, beams)``, in bins and beams; or
+        back: how far from each cell of the second the first shows it."""
+        ground = other = self.ground
+        if self.heave:
+            half = float(v[3]) / (2 if back else -2)
+            ground, other = (self._ground(self.standing.height_m + change) for change in (half, -half))
+        motion = _inverse(v[:3]) if back else v[:3]
+        radius, bearing = other.see(moved(ground.points, motion))
+        grid = self.grid
+        nodes = np.stack([radius - grid.node_range[:, None], bearing - grid.node_bearing])
+        return self._on_all(self._filled(nodes, self.start).astype(np.float32))
 
     def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
-        """The change of :meth:`shift` with the height, a metre."""
+        """The change of :meth:`shift` with the height, a metre, to first order in the motion."""
         change = HEIGHT_STEP * self.standing.height_m
-        other, _ = self._nodes(self.standing.height_m + change)
+        other = self._nodes(self.standing.height_m + change)
         return self._on_all(np.tensordot(v.astype(np.float32) / np.float32(change), other - self.nodes, axes=1))
 
     def along(self, slopes: tuple[Floats, Floats], inner: tuple[slice, slice]) -> Floats:
@@ -411,6 +438,13 @@ class _Hasten:
         return hastened if lengths[0] < LONGEST * lengths[1] else step
 
 
+def _inverse(motion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The motion that undoes one (eq. 3.4)."""
+    sideways, forward, yaw = motion
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.array([-(sideways * cos + forward * sin), -(forward * cos - sideways * sin), -yaw])
+
+
 def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
     """Cells that meet the ground and stay within both images; None where none does."""
     _, bins, beams = half.shape
@@ -430,27 +464,31 @@ def _singular(normal: NDArray[np.float64]) -> bool:
     return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
 
 
-def _cross(look: _Look, cells: _Cells, level: Level) -> NDArray[np.float64]:
+def _cross(side: _Side, cells: _Cells, level: Level) -> NDArray[np.float64]:
     """The normal matrix from slopes of one frame times slopes of the other, whose noise is not the same."""
-    frames = (look.before, look.after)
-    one, other = (cells.along(_differences(_blurred(image, *level.slopes)), look.inner) for image in frames)
-    product = ((one * look.weight) @ other.T).astype(np.float64)
+    frames = (side.before, side.after)
+    one, other = (cells.along(_differences(_blurred(image, *level.slopes)), side.inner) for image in frames)
+    product = ((one * side.weight) @ other.T).astype(np.float64)
     return (product + product.T) / 2
 
 
-def _block_weight(slopes: tuple[Floats, Floats], difference: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
+def _block_weight(slopes: tuple[Floats, Floats], residual: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
     """Weights ``(cells,)`` of whole blocks: one that wants to move by itself shows relief, or a shadow.
 
     How much it wants to is what its own best shift would take off its squared differences (Lucas and Kanade, 1981).
     """
-    r, along, across = difference[inner], slopes[0][inner], slopes[1][inner]
-    w = weight.reshape(r.shape)
-    terms = (along * along, along * across, across * across, along * r, across * r)
-    aa, ab, bb, pull_a, pull_b = _by_block(np.stack([w * term for term in terms]))
+    along, across = slopes[0][inner], slopes[1][inner]
+    r, w = residual.reshape(along.shape), weight.reshape(along.shape)
+    terms = np.empty((5, *r.shape), dtype=np.float32)
+    products = ((along, along), (along, across), (across, across), (along, r), (across, r))
+    for k, (one, other) in enumerate(products):
+        np.multiply(one, other, out=terms[k])
+    terms *= w
+    aa, ab, bb, pull_a, pull_b = _by_block(terms)
     aa, bb = aa + 1e-3 * aa.mean() + 1e-12, bb + 1e-3 * bb.mean() + 1e-12
     unrest = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
     blocks = 1 / (1 + unrest / (BLOCK_CAUCHY**2 * float(np.median(unrest)) + 1e-12))
-    row, column = (_block_of(size, block) for size, block in zip(r.shape, BLOCK, strict=True))
+    row, column = (_block_of(r.shape[k], BLOCK[k]) for k in (0, 1))
     table = blocks.reshape(row[-1] + 1, column[-1] + 1).astype(np.float32)
     return np.asarray(table[row][:, column]).ravel()
 
@@ -465,17 +503,6 @@ def _by_block(maps: Floats) -> NDArray[np.float64]:
     starts = [np.arange(0, max(size // block, 1) * block, block) for size, block in zip(maps.shape[1:], BLOCK, strict=True)]
     sums = np.add.reduceat(np.add.reduceat(maps, starts[0], axis=1), starts[1], axis=2)
     return np.asarray(sums.reshape(len(maps), -1), dtype=np.float64)
-
-
-def _to_new_heading(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The matrix that turns a motion in the middle frame's axes into one along the new heading (eq. 3.4).
-
-    Twice half the way s and half the turn: first s, then the turn, then s again: R(yaw / 2) s + s.
-    """
-    cos, sin = np.cos(v[2] / 2), np.sin(v[2] / 2)
-    turn = np.eye(3)
-    turn[:2, :2] = (np.array([[cos, -sin], [sin, cos]]) + np.eye(2)) / 2
-    return turn
 
 
 def _doubt(fit: _Fit, covariance: NDArray[np.float64]) -> str:
