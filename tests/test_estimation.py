@@ -127,12 +127,12 @@ def test_direct_with_noise(pair: Pair, noise: str, allowed: list[float]) -> None
     assert (np.abs(error) < 4 * std).all(), f"errors {error}, standard deviations {std}"
 
 
-def test_direct_tells_heave_apart_from_forward(rocks: Simulator) -> None:
+def test_direct_tells_heave_apart_from_forward(simulator: Simulator) -> None:
     """A sonar that has risen by 5 mm seems to have gone back by 3 to 5 mm, unless heave is allowed for."""
     motion = Motion(0.005, 0.01, 0.002)
     second = compose(START, motion)
     poses = np.array([START, second._replace(z=second.z + 0.005)])
-    frames = rocks.render(Trajectory(poses, np.array([0.0, 0.1])), seed=3)
+    frames = simulator.render(Trajectory(poses, np.array([0.0, 0.1])), seed=3)
     stiff, free = (np.array(Direct(heave_std_m=std).estimate(frames).motion) - motion for std in (0.0, 0.01))
     assert abs(stiff[1]) > 2e-3
     assert abs(free[1]) < abs(stiff[1]) / 2

@@ -25,6 +25,18 @@ def test_errors_of_a_method_that_shrinks_and_leans() -> None:
     assert np.isnan(found.nees)
 
 
+def test_percentiles_and_large_motions() -> None:
+    """Errors of 0 to 100 mm; and 1 mm for motions beyond half the largest only."""
+    truth = np.zeros((101, 3))
+    found = motion_errors(np.arange(101)[:, None] * np.full(3, 1e-3), truth, np.ones(101, bool))
+    assert np.allclose(found.median[:2], 50)
+    assert np.allclose(found.p95[:2], 95)
+    assert np.isnan(found.large).all(), "there is no large motion"
+    truth = np.linspace(-0.02, 0.02, 41)[:, None] * np.ones(3)
+    large = np.abs(truth) > 0.01 + 1e-9
+    assert np.allclose(motion_errors(truth + 1e-3 * large, truth, np.ones(41, bool)).large[:2], 1)
+
+
 def test_failures_count_as_zero_motion() -> None:
     truth = np.full((4, 3), 0.01)
     wild = np.where(np.arange(4)[:, None] == 2, 5.0, truth)
@@ -48,7 +60,7 @@ def test_honest_covariances_have_a_nees_of_one() -> None:
 
 
 def test_clustered_intervals_cover_where_plain_ones_do_not() -> None:
-    """Scenes with errors of their own: intervals by scene hold the true RMSE in some 95 % of trials, plain ones in far fewer."""
+    """Scenes with errors of their own: intervals by scene hold the true RMSE far more often than plain ones."""
     rng = np.random.default_rng(3)
     held = {"clustered": 0, "plain": 0}
     trials, scene = 40, np.repeat(np.arange(40), 10)
@@ -69,6 +81,16 @@ def test_resamples_keep_scenes_together() -> None:
     table = cluster_resamples(scene, count=50)
     assert table.shape == (50, 12)
     assert all(set(np.bincount(scene[row], minlength=10)[[3, 7, 9]] % 4) == {0} for row in table)
+
+
+def test_resamples_of_scenes_of_different_sizes() -> None:
+    scene = np.repeat([0, 1, 2], [2, 5, 9])
+    table = cluster_resamples(scene, count=200)
+    assert table.shape == (200, 16)
+    assert ((table >= 0) & (table < 16)).all()
+    assert all(len(np.unique(scene[row])) <= 3 for row in table)
+    assert len(np.unique(table)) == 16
+    assert any(len(np.unique(scene[row])) == 1 for row in table), "a scene may be drawn three times"
 
 
 def test_shapes_that_do_not_fit_are_said() -> None:

@@ -9,7 +9,7 @@ def main() -> None:
     """``mitsonar`` and ``python -m mitsonar``."""
     import typer
 
-    from mitsonar.cli import dataset, doctor, image, presets, render, world
+    from mitsonar.cli import compare, dataset, doctor, image, limit, mosaic, odometry, presets, render, world
 
     app = typer.Typer(
         name="mitsonar",
@@ -24,6 +24,10 @@ def main() -> None:
     app.command()(presets.presets)
     app.command()(presets.scenes)
     app.command()(doctor.doctor)
+    app.command()(compare.compare)
+    app.command()(limit.limit)
+    app.command()(odometry.odometry)
+    app.command()(mosaic.mosaic)
     app.add_typer(world.worlds(), name="world")
     app.add_typer(dataset.datasets(), name="dataset")
     app()

@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say
+from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -20,10 +22,14 @@ if TYPE_CHECKING:
     from mitsonar.dataset.pairs import SonarPairs
     from mitsonar.estimation.comparison import Answers
     from mitsonar.estimation.estimator import Estimator
+    from mitsonar.noise import NoiseModel
 
 __all__ = ["compare", "table_lines"]
 
 METHODS = "zero,ecc,flow,phase,direct"
+
+FEWEST_SCENES = 10
+"""With fewer, clustered intervals hold much less than they say."""
 
 
 @answered
@@ -32,7 +38,12 @@ def compare(
     estimators: Annotated[
         str, typer.Option(help="Names with commas between them, each NAME or NAME:key=value:key=value.")
     ] = METHODS,
-    noise: Annotated[str, typer.Option(help="Noise levels with commas: none, low, high, chapter2.")] = "none",
+    noise: Annotated[
+        str,
+        typer.Option(
+            help="Levels with commas between them (or ; where one is m,s,g): none, low, high, chapter2, a YAML file."
+        ),
+    ] = "none",
     part: Annotated[str | None, typer.Option(help="train, validation, test (default where it is), all.")] = None,
     pairs: Annotated[int | None, typer.Option(min=2, help="At most so many, each of a sequence of its own.")] = None,
     perturb: Annotated[
@@ -58,20 +69,34 @@ def compare(
     from mitsonar.estimation.comparison import VARIATIONS, answers_of, limits_of, rows_of, with_prior
     from mitsonar.estimation.estimators import estimator_from
     from mitsonar.metrics import cluster_resamples, in_units
+    from mitsonar.motion import motions
     from mitsonar.noise import load_noise
 
     methods = {text: estimator_from(text) for text in dict.fromkeys(estimators.split(",")) if text}
     if not methods or (reference is not None and reference not in methods):
         raise MitsonarError(f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {reference!r}")
-    levels = {name: load_noise(name) for name in noise.split(",")}
+    levels = {name: load_noise(name) for name in dict.fromkeys(noise.split(";" if ";" in noise else ","))}
     changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if perturb else []
     asked = ["as told", *changed, *(["jitter"] if jitter else [])]
     samples = {name: _pairs(SonarPairs, data, part, name, seed) for name in levels}
     first = next(iter(samples.values()))
     numbers = _chosen(len(first), pairs, seed)
-    truth = np.array([first.target(number) for number in numbers])
+    # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
+    truth = np.array([motions(first.pose[first.frame_numbers(number)])[0] for number in numbers])
     resamples = cluster_resamples(first.scene[first.first[numbers]], seed=seed)
-    settings = {"data": _digest(first), "methods": list(methods), "part": part, "pairs": len(numbers), "seed": seed}
+    if jitter and first.recipe.instrument.jittered:
+        raise MitsonarError("the rays of this data set move already: --jitter is for the thesis's model")
+    scenes = len(np.unique(first.scene[first.first[numbers]]))
+    if scenes < FEWEST_SCENES:
+        warn(f"{scenes} scenes only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more")
+    settings = {
+        "digest": _digest(first),
+        "methods": list(methods),
+        "part": part,
+        "pairs": len(numbers),
+        "seed": seed,
+        "version": version("mitsonar"),
+    }
     store = _Kept(out, settings)
     report: dict[str, Any] = {"data": data, "model": first.recipe.instrument.model, **settings, "tables": []}
     with progress_bar("comparing", len(levels) * len(asked) * len(numbers), "pairs") as progress:
@@ -81,8 +106,8 @@ def compare(
                 samples[level],
                 numbers,
                 variation,
-                known=store.load(level, variation, methods),
-                keep=store.keeper(level, variation),
+                known=store.load(_key(level, levels[level]), variation, methods, len(numbers)),
+                keep=store.keeper(_key(level, levels[level]), variation),
                 progress=progress,
             )
             for level in levels
@@ -90,16 +115,17 @@ def compare(
         }
     inputs = {name: method.inputs for name, method in methods.items()}
     for level, model in levels.items():
-        bounds = store.limits(level, limit)
+        bounds = store.limits(_key(level, model), limit)
         if limit and bounds is None:
             few = [numbers[k] for k in np.linspace(0, len(numbers) - 1, min(limit, len(numbers))).astype(int)]
             with progress_bar("limit", len(few), "pairs") as progress:
                 bounds = limits_of(samples[level], few, model, progress)
-            store.keep_limits(level, limit, bounds)
+            store.keep_limits(_key(level, model), limit, bounds)
         for variation in asked:
             said = dict(answers[level, variation])
             if prior:
-                largest = np.abs(truth).max(axis=0)
+                flight = first.recipe.flight
+                largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
                 known = {k: one for k, one in said.items() if np.isfinite(one.covariance).any()}
                 said |= {f"{k} with prior": with_prior(one, largest) for k, one in known.items()}
             words = {k: inputs[k.removesuffix(" with prior")] + (", prior" if "with prior" in k else "") for k in said}
@@ -109,7 +135,7 @@ def compare(
                 {
                     "noise": level,
                     "variation": variation,
-                    "limits": {law: in_units(std).tolist() for law, std in (bounds or {}).items()},
+                    "limits": {law: _plain(in_units(std)) for law, std in (bounds or {}).items()},
                     "reference": reference or list(methods)[-1],
                     "rows": [row.plain() for row in rows],
                 }
@@ -153,6 +179,16 @@ def _digest(pairs: SonarPairs) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def _key(level: str, model: NoiseModel) -> str:
+    """Names a noise level by what it is: a file of the same name may change."""
+    return f"{level} {hashlib.sha256(model.model_dump_json().encode()).hexdigest()[:8]}"
+
+
+def _plain(values: NDArray[np.float64]) -> list[float | None]:
+    """For JSON: what is not finite is None."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
 class _Kept:
     """Answers on disk, so that a comparison that was broken off goes on; a stub without a folder."""
 
@@ -175,9 +211,9 @@ class _Kept:
 
     def _path(self, level: str, variation: str) -> Path:
         assert self.folder is not None
-        return self.folder / f"answers {level} {variation}.npz".replace(" ", "-").replace("%", "percent")
+        return self.folder / (re.sub(r"[^\w.-]+", "-", f"answers {level} {variation}".replace("%", "percent")) + ".npz")
 
-    def load(self, level: str, variation: str, methods: dict[str, Estimator]) -> dict[str, Answers] | None:
+    def load(self, level: str, variation: str, methods: dict[str, Estimator], count: int) -> dict[str, Answers] | None:
         """What an earlier run has found."""
         from mitsonar.estimation.comparison import Answers
 
@@ -185,8 +221,11 @@ class _Kept:
             return None
         try:
             with np.load(self._path(level, variation)) as table:
-                return {name: Answers.from_arrays(table, name) for name in methods}
-        except (OSError, ValueError, KeyError) as error:
+                found = {name: Answers.from_arrays(table, name) for name in methods}
+            if any(len(values) != count for one in found.values() for values in vars(one).values()):
+                raise ValueError("it holds other numbers of pairs")
+            return found
+        except Exception as error:  # a damaged zip raises whatever its bytes lead to
             raise MitsonarError(
                 f"{self._path(level, variation)} is damaged ({error}): remove it, it is made again"
             ) from None
@@ -210,19 +249,30 @@ class _Kept:
 
     def limits(self, level: str, count: int) -> dict[str, NDArray[np.float64]] | None:
         """Bounds of an earlier run."""
+        from mitsonar.estimation.limit import LAWS
         from mitsonar.files import read_json
 
-        path = None if self.folder is None else self.folder / f"limit-{level}-{count}.json"
+        path = None if self.folder is None else self.folder / (re.sub(r"[^\w.-]+", "-", f"limit-{level}-{count}") + ".json")
         if path is None or not path.exists():
             return None
-        return {law: np.array(values, dtype=float) for law, values in read_json(path).items()}
+        found = read_json(path)
+        try:
+            bounds = {law: np.array(found[law], dtype=float) for law in LAWS}
+            if any(std.shape != (3,) for std in bounds.values()):
+                raise ValueError("a bound is three numbers")
+        except (KeyError, ValueError, TypeError) as error:
+            raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
+        return bounds
 
     def keep_limits(self, level: str, count: int, bounds: dict[str, NDArray[np.float64]]) -> None:
         """Keep them."""
         from mitsonar.files import write_json
 
         if self.folder is not None:
-            write_json(self.folder / f"limit-{level}-{count}.json", {law: std.tolist() for law, std in bounds.items()})
+            write_json(
+                self.folder / (re.sub(r"[^\w.-]+", "-", f"limit-{level}-{count}") + ".json"),
+                {law: std.tolist() for law, std in bounds.items()},
+            )
 
     def finish(self, lines: list[str], report: dict[str, Any]) -> None:
         """The tables."""
@@ -233,7 +283,10 @@ class _Kept:
             write_json(self.folder / "table.json", report)
 
 
-COLUMNS = ("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit", "ms", "inputs")
+COLUMNS = (
+    *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),
+    *("ms", "inputs"),
+)
 
 
 def table_lines(table: dict[str, Any]) -> list[str]:
@@ -251,11 +304,12 @@ def table_lines(table: dict[str, Any]) -> list[str]:
                 ),
                 _three(row["median"]),
                 _three(row["p95"]),
-                " / ".join(f"{value:.3f}" for value in row["slope"]),
+                " / ".join("-" if value is None else f"{value:.3f}" for value in row["slope"]),
                 _three(row["large"]),
                 str(row["failures"]),
-                " / ".join(f"{value:.2f}" for value in row["skill"]),
+                " / ".join("-" if value is None else f"{value:.2f}" for value in row["skill"]),
                 " / ".join("-" if value is None else f"{value:.1f}" for value in row["over_limit"]),
+                "-" if row["nees"] is None else f"{row['nees']:.1f}",
                 f"{row['ms']:.1f}",
                 row["inputs"],
             ]
@@ -263,7 +317,7 @@ def table_lines(table: dict[str, Any]) -> list[str]:
     width = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
     lines += ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in rows]
     if table["limits"]:
-        known = {law: std for law, std in table["limits"].items() if any(std)}
+        known = {law: std for law, std in table["limits"].items() if any(value != 0 for value in std)}
         lines += ["", "limit of two frames: " + "; ".join(f"{law} {_three(std)}" for law, std in known.items())]
     others = [row for row in table["rows"] if row["method"] != table["reference"] and row["method"] != "zero"]
     for row in others:

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 VARIATIONS: dict[str, str] = {
     "as told": "height, pitch, roll and sound speed are right",
-    "height 5 %": "the height told is 5 % too large or too small",
+    "height 5 %": "the height told is 5 % too large or too small (of no effect where first echoes tell it)",
     "pitch 1 deg": "the pitch told is 1 deg off",
     "roll 1 deg": "the roll told is 1 deg off",
     "sound speed 1 %": "ranges are 1 % too long or too short",
@@ -147,7 +147,24 @@ def answers_of(
         keep_every: how many.
         progress: called with how many pairs are done since the last call.
     """
+    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
+    try:
+        return _answers_of(estimators, pairs, numbers, variation, known, keep, keep_every, progress)
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _answers_of(
+    estimators: Mapping[str, Estimator],
+    pairs: SonarPairs,
+    numbers: Sequence[int],
+    variation: str,
+    known: dict[str, Answers] | None,
+    keep: Callable[[dict[str, Answers]], None] | None,
+    keep_every: int,
+    progress: Callable[[int], object] | None,
+) -> dict[str, Answers]:
     table = {name: (known or {}).get(name) or Answers.unasked(len(numbers)) for name in estimators}
     place = {number: k for k, number in enumerate(numbers)}
     missing = [number for number in numbers if not all(table[name].asked[place[number]] for name in estimators)]
@@ -174,10 +191,11 @@ def with_prior(answers: Answers, largest: Array) -> Answers:
         largest: half the edges of the box ``(3,)`` [m, m, rad].
     """
     prior = np.diag(largest**2 / 3)
-    motion = answers.motion.copy()
-    for k in np.flatnonzero(np.isfinite(answers.covariance).all(axis=(1, 2))):
-        motion[k] = prior @ np.linalg.solve(prior + answers.covariance[k], motion[k])
-    return Answers(motion, answers.believe, answers.covariance, answers.ms)
+    motion, covariance = answers.motion.copy(), answers.covariance.copy()
+    for k in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))):
+        motion[k] = prior @ np.linalg.solve(prior + covariance[k], motion[k])
+        covariance[k] = prior @ np.linalg.solve(prior + covariance[k], covariance[k])
+    return Answers(motion, answers.believe, covariance, answers.ms)
 
 
 def limits_of(
@@ -213,7 +231,7 @@ class Row:
         method: its name.
         inputs: what it is given.
         errors: see :class:`mitsonar.metrics.MotionErrors`.
-        ms: median processor time of a pair.
+        ms: median processor time of the believed pairs, all threads.
         over_limit: RMSE over the bound ``(3,)``; nan where there is none.
         over_reference: RMSE less that of the reference method ``(3,)`` [mm, mm, deg], with
         over_reference_low: the lower,
@@ -275,7 +293,8 @@ def rows_of(
         drawn = [np.sqrt(table[resamples].mean(axis=1)) for table in (squares(one), against)]
         low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5], axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(bound > 0, errors.rmse / bound, np.nan)
+            ratio = np.where((bound > 0) & np.isfinite(bound), errors.rmse / bound, np.nan)
         difference = errors.rmse - np.sqrt(against.mean(axis=0))
-        rows.append(Row(name, inputs[name], errors, float(np.median(one.ms)), ratio, difference, low, high))
+        ms = float(np.median(one.ms[one.believe] if one.believe.any() else one.ms))
+        rows.append(Row(name, inputs[name], errors, ms, ratio, difference, low, high))
     return rows

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import Estimate, blank, matching_doubt, two_frames, unbelieved
+from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_doubt, two_frames, unbelieved
 from mitsonar.estimation.ground import GroundView
 from mitsonar.estimation.height import standing_of
 from mitsonar.frames import SonarFrames
@@ -27,19 +27,19 @@ class Ecc:
     """Rigid registration of the frames as seen from above.
 
     Args:
-        height_m: over what is seen; default: as the first echoes or the frames say.
+        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
         pitch_rad: default: what the frames say.
     """
 
     height_m: float | None = None
     pitch_rad: float | None = None
 
-    inputs = "height and pitch"
+    inputs = INPUTS
 
     def estimate(self, frames: SonarFrames) -> Estimate:
         """The motion, and whether to believe it; zero motion where OpenCV finds none."""
-        standing = standing_of(frames, "ecc", self.height_m, self.pitch_rad)
         images = two_frames(frames)
+        standing = standing_of(frames, "ecc", self.height_m, self.pitch_rad)
         if standing.doubt or any(blank(image) for image in images):
             return unbelieved(standing.doubt or "nothing in the frames to match")
         motion = Motion(0.0, 0.0, 0.0)

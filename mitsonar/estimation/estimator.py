@@ -15,6 +15,7 @@ from mitsonar.motion import Motion
 
 __all__ = [
     "FEWEST_BLOCKS",
+    "INPUTS",
     "LEAST_CORRELATION",
     "Estimate",
     "Estimator",
@@ -25,6 +26,12 @@ __all__ = [
     "two_frames",
     "unbelieved",
 ]
+
+INPUTS = "pitch; height where no first echoes show"
+"""What methods that know the geometry are given beside the images; see :mod:`mitsonar.estimation.height`."""
+
+FEWEST_CELLS = 8
+"""Bins and beams of an image that can be registered."""
 
 LEAST_CORRELATION = 8.0
 """Of frames as matched, in standard deviations of the correlation of independent noise in as many cells."""
@@ -81,10 +88,23 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
     """The two images as fractions of the maximum, float32.
 
     Raises:
-        MitsonarError: not two frames.
+        MitsonarError: not two frames, too few bins or beams or in disorder, levels that are not linear or not finite.
     """
     if len(frames) != 2:
         raise MitsonarError(f"an estimator takes two frames: got {len(frames)}")
+    kind = frames.image.dtype
+    if frames.level != "linear" or not (kind == np.uint8 or np.issubdtype(kind, np.floating)):
+        raise MitsonarError(
+            f"estimators take linear images, uint8 or float in 0..1: got {kind}, {frames.level}; convert them first"
+        )
+    rising = (np.diff(frames.range_m) > 0).all() and (np.diff(frames.bearing_rad) > 0).all()
+    if min(frames.image.shape[1:]) < FEWEST_CELLS or not rising:
+        raise MitsonarError(
+            f"estimators need {FEWEST_CELLS} bins and beams or more, ranges and bearings that rise: got "
+            f"{frames.image.shape[1]} x {frames.image.shape[2]}; sort rows and columns"
+        )
+    if not np.isfinite(frames.image).all():
+        raise MitsonarError("the images hold nan or inf: set pixels without echo to 0")
     scale = np.float32(1 / 255 if frames.image.dtype == np.uint8 else 1)
     first, second = (np.asarray(image, dtype=np.float32) * scale for image in frames.image)
     return first, second

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, two_frames
+from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
 from mitsonar.estimation.height import standing_of
 from mitsonar.frames import SonarFrames
 from mitsonar.geometry import GroundGeometry, moved
@@ -141,7 +141,7 @@ class Flow:
     height_std: float | None = None
     levels: tuple[Level, ...] = LEVELS
 
-    inputs = "height and pitch"
+    inputs = INPUTS
 
     def __post_init__(self) -> None:
         if self.match not in ("map", "vector"):

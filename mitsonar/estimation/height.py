@@ -9,6 +9,7 @@ must agree.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -32,6 +33,9 @@ AGREEING = 0.25
 STD_SEEN, STD_TOLD = 0.02, 0.05
 """Standard deviation of the height over what is seen, as part of it: with first echoes, and without."""
 
+EVEN = 0.005
+"""Quartiles of the height under the steepest rays lie closer than this part of it where the ground is even."""
+
 FEWEST_BEAMS = 8
 
 
@@ -45,6 +49,7 @@ class Standing:
         pitch_rad: > 0 looks down.
         roll_rad: > 0 puts starboard down.
         doubt: what speaks against the geometry that was told; empty where nothing does.
+        even: whether first echoes show ground without relief.
     """
 
     height_m: float
@@ -52,12 +57,14 @@ class Standing:
     pitch_rad: float
     roll_rad: float = 0.0
     doubt: str = ""
+    even: bool = False
 
 
 def standing_of(
     frames: SonarFrames, name: str, height_m: float | None, pitch_rad: float | None, relief_m: float | None = None
 ) -> Standing:
-    """Height, pitch and roll of the frames' mean; what is given counts, else what the frames say.
+    """Height, pitch and roll of the frames' mean. First echoes tell the height where the window shows them, unless the
+    relief is given; else what is given counts, else what the frames say.
 
     Args:
         frames: consecutive frames.
@@ -67,16 +74,23 @@ def standing_of(
         relief_m: mean height over the ground of what is seen; None: from the first echoes, where the window shows them.
 
     Raises:
-        MitsonarError: no pitch, or a height neither told nor seen, or not above the relief.
+        MitsonarError: no pitch, or a height neither told nor seen, or not above 0 or the relief.
     """
-    pose = None if frames.poses is None else frames.poses.mean(axis=0)
+    known = frames.poses is not None and bool(np.isfinite(frames.poses[:, 3:5]).all())
+    pose = frames.poses.mean(axis=0) if known and frames.poses is not None else None
     pitch = pitch_rad if pitch_rad is not None else (None if pose is None else float(pose[3]))
     told = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (told is None and relief_m is not None):
         raise MitsonarError(
             f"{name} needs height and pitch: the frames lack height_m or poses; give height_m and pitch_rad to it"
         )
+    if told is not None and not 0 < told < np.inf:
+        raise MitsonarError(f"{name} needs a height above 0 m: got {told:g}; give height_m")
     roll = 0.0 if pose is None else float(pose[4])
+    half = np.radians(frames.sonar.elevation_fov_deg) / 2
+    if told is not None and pitch + half > np.pi / 2:
+        doubt = "the sonar looks past straight down: a cell shows two places of the ground"
+        return Standing(told, STD_TOLD * told, pitch, roll, doubt)
     if told is not None and relief_m is not None:
         if not told - relief_m > 0:
             raise MitsonarError(f"the height over what is seen must be above 0: got {told:g} m less {relief_m:g} m")
@@ -88,13 +102,13 @@ def standing_of(
                 f"{name} needs height and pitch: the frames lack height_m, and their window shows no first echoes; give "
                 "height_m to it"
             )
-        return Standing(seen, STD_SEEN * seen, pitch, roll)
+        return Standing(seen.height_m, STD_SEEN * seen.height_m, pitch, roll, even=seen.even)
     if seen is None:
         return Standing(told, STD_TOLD * told, pitch, roll)
-    if abs(seen - told) > AGREEING * told:
-        doubt = f"first echoes tell a height of {seen:.2f} m, not {told:.2f} m: height or pitch is wrong"
+    if abs(seen.height_m - told) > AGREEING * told:
+        doubt = f"first echoes tell a height of {seen.height_m:.2f} m, not {told:.2f} m: height or pitch is wrong"
         return Standing(told, STD_TOLD * told, pitch, roll, doubt)
-    return Standing(seen, STD_SEEN * seen, pitch, roll)
+    return Standing(seen.height_m, STD_SEEN * seen.height_m, pitch, roll, even=seen.even)
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:
@@ -102,7 +116,14 @@ def _mean(values: NDArray[np.float64] | None) -> float | None:
     return float(known.mean()) if known is not None and len(known) else None
 
 
-def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> float | None:
+class _Seen(NamedTuple):
+    """What first echoes tell."""
+
+    height_m: float
+    even: bool
+
+
+def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Seen | None:
     """From how far below the sonar the steepest ray of each beam ends; None where too few beams begin within the window."""
     image = frames.image.mean(axis=0, dtype=np.float32)
     smooth = cv2.GaussianBlur(image, (3, 13), sigmaX=0.5, sigmaY=2.0, borderType=cv2.BORDER_REPLICATE)
@@ -120,4 +141,5 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> flo
     down = -vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).apply(steepest)[:, 2]
     drop = (frames.range_m[first] * down)[heard]
     height = float(drop.mean() - TOPS * (np.percentile(drop, 90) - drop.mean()))
-    return height if height > 0 else None
+    low, high = np.percentile(drop, [25, 75])
+    return _Seen(height, bool(high - low < EVEN * height)) if height > 0 else None

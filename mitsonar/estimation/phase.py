@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import Estimate, blank, matching_doubt, two_frames, unbelieved
+from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_doubt, two_frames, unbelieved
 from mitsonar.estimation.ground import GroundView
 from mitsonar.estimation.height import standing_of
 from mitsonar.frames import SonarFrames
@@ -43,20 +43,21 @@ class Phase:
     """Registration by phase correlation of the frames as seen from above.
 
     Args:
-        height_m: over what is seen; default: as the first echoes or the frames say.
+        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
         pitch_rad: default: what the frames say.
     """
 
     height_m: float | None = None
     pitch_rad: float | None = None
 
-    inputs = "height and pitch"
+    inputs = INPUTS
 
     def estimate(self, frames: SonarFrames) -> Estimate:
         """The motion, and whether to believe it."""
+        images = two_frames(frames)
         standing = standing_of(frames, "phase", self.height_m, self.pitch_rad)
         view = GroundView(frames, standing, CELL_M)
-        first, second = (view.draw(image) for image in two_frames(frames))
+        first, second = (view.draw(image) for image in images)
         if standing.doubt or blank(first) or blank(second):
             return unbelieved(standing.doubt or "nothing in the frames to match")
         if min(first.shape) < 32 or not view.inside.any():

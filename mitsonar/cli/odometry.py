@@ -1,0 +1,119 @@
+"""``mitsonar odometry``: frames become the path that the sonar took."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.cli.render import SIX
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.mapping.source import FrameSource
+
+__all__ = ["Frames", "frames_from", "odometry"]
+
+Frames = Annotated[
+    str, typer.Argument(metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, or a data set.")
+]
+PAIRS_A_WORKER = 50
+"""Fewer do not pay for starting a process."""
+
+
+@answered
+def odometry(
+    frames: Frames,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to make: path, motions, table, figure.")],
+    estimator: Annotated[
+        str, typer.Option(help="zero, ecc, flow, phase or direct, with options as NAME:key=value:key=value.")
+    ] = "direct",
+    smooth: Annotated[
+        str, typer.Option(help="none, spline or kalman; motions that are not believed are bridged anyway.")
+    ] = "none",
+    scale: Annotated[str | None, typer.Option(help="Factors for sideways,forward,yaw, or `fit` to the true path.")] = None,
+    every: Annotated[int, typer.Option(help="Use every so many frames only.")] = 1,
+    start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX} (default: the true one, or 0).")] = None,
+    height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
+    pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
+    sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
+    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first).")] = None,
+    noise: Annotated[str, typer.Option(help="Added to the frames: none, low, high, m,s,g or a YAML file.")] = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes (default: as many as pay, up to the cores).")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an odometry that is there.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with one that was broken off; path options may change.")
+    ] = False,
+) -> None:
+    """Estimate the motion between all consecutive frames and drive the path that they tell.
+
+    Writes into OUT: estimated.tum, true.tum where poses are known, motions.csv, covariances.npz, table.md, table.json,
+    path.png, run.json, and estimates.jsonl, from which --resume goes on.
+    """
+    from mitsonar.estimation.estimators import estimator_from
+    from mitsonar.mapping.results import run_odometry, table_lines
+    from mitsonar.motion import Pose
+
+    method = estimator_from(estimator)
+    factors = scale if scale is None or scale == "fit" else numbers(scale, 3, "--scale (or fit)")
+    first = numbers(start, 6, "--from")
+    source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+    if source.note:
+        say(source.note)
+    pairs = max(0, len(source) - 1) // max(1, every)
+    crew = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
+    words: dict[str, Any] = {
+        "smooth": smooth,
+        "scale": factors,
+        "start": None if first is None else Pose.from_degrees(first),
+    }
+    with progress_bar("estimating", pairs, "pairs") as progress:
+        found = run_odometry(
+            source,
+            estimator,
+            method,
+            out,
+            **words,
+            every=every,
+            workers=crew,
+            overwrite=overwrite,
+            resume=resume,
+            progress=progress,
+        )
+    for line in table_lines(found.rows()):
+        say(line)
+    for sentence in found.warnings():
+        warn(sentence)
+    count, lost = len(found.estimates), int((~found.believed).sum())
+    say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} not believed and bridged, in {out}")
+    say(f"picture: {out / 'path.png'}")
+
+
+def frames_from(
+    where: str,
+    sequence: int | None,
+    view: str | None,
+    noise: str,
+    seed: int,
+    height: float | None,
+    pitch_deg: float | None,
+) -> FrameSource:
+    """The frames that the options say.
+
+    Raises:
+        MitsonarError: none there, or options that do not fit them.
+    """
+    import math
+
+    from mitsonar.mapping.source import open_frames
+    from mitsonar.noise import load_noise
+
+    added = load_noise(noise)
+    source = open_frames(where, sequence=sequence, view=view)
+    if not len(source):
+        raise MitsonarError(f"{source.name} holds no frames: give those of a finished run")
+    return source.with_noise(added, seed).with_geometry(height, None if pitch_deg is None else math.radians(pitch_deg))
