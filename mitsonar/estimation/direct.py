@@ -22,6 +22,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import (
     FEWEST_BLOCKS,
     INPUTS,
+    LEAST_AT_BEST,
     LEAST_CORRELATION,
     Estimate,
     correlation_of,
@@ -553,7 +554,7 @@ def _doubt(fit: _Fit, covariance: NDArray[np.float64]) -> str:
     std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"
-    if fit.correlation < LEAST_CORRELATION / np.sqrt(fit.independent):
+    if fit.correlation < max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(fit.independent)):
         return f"the frames as matched correlate by {fit.correlation:.2f} only"
     if fit.blocks < FEWEST_BLOCKS:
         return "too small a part of the frames holds anything to match"

@@ -16,6 +16,7 @@ from mitsonar.motion import Motion
 __all__ = [
     "FEWEST_BLOCKS",
     "INPUTS",
+    "LEAST_AT_BEST",
     "LEAST_CORRELATION",
     "Estimate",
     "Estimator",
