@@ -101,6 +101,9 @@ MOSTLY = 0.5
 LIT = 0.9
 """Part of the field of view's elevation that is free of its outline."""
 
+FARTHEST = np.array([0.15, 0.15, np.radians(3)])
+"""Motions that are found with certainty are 100 mm and 2 deg; a maximum far beyond is one among noise."""
+
 FEWEST_CELLS = 500
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
 """What an estimate that is to be believed must have besides: cells; standard deviations."""
@@ -170,7 +173,7 @@ class Direct:
         covariance = MODEL * fit.covariance[:3, :3] + np.outer(height, height)
         about = {"correlation": fit.correlation, "height_m": standing.height_m}
         about |= {"heave_m": float(v[3])} if self.heave_std_m else {}
-        reason = _doubt(fit, covariance)
+        reason = _doubt(fit, covariance, v)
         return Estimate(Motion(*(float(x) for x in v[:3])), covariance, not reason, reason, about)
 
     def _register(
@@ -549,13 +552,15 @@ def _by_block(maps: Floats) -> NDArray[np.float64]:
     return np.asarray(sums.reshape(len(maps), -1), dtype=np.float64)
 
 
-def _doubt(fit: _Fit, covariance: NDArray[np.float64]) -> str:
+def _doubt(fit: _Fit, covariance: NDArray[np.float64], v: NDArray[np.float64]) -> str:
     """Why not to believe an estimate; empty where nothing speaks against it."""
     std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"
     if fit.correlation < max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(fit.independent)):
         return f"the frames as matched correlate by {fit.correlation:.2f} only"
+    if (np.abs(v[:3]) > FARTHEST).any():
+        return "a motion beyond 150 mm or 3 deg is farther than the coarsest level searches"
     if fit.blocks < FEWEST_BLOCKS:
         return "too small a part of the frames holds anything to match"
     if not (std < LARGEST_STD).all():
