@@ -15,7 +15,17 @@ from mitsonar.errors import MitsonarError
 from mitsonar.motion import Pose, vehicle_rotation
 from mitsonar.sonar import Bearing
 
-__all__ = ["CartesianImage", "CartesianMap", "GroundGeometry", "cartesian_map", "directions", "moved", "to_cartesian"]
+__all__ = [
+    "CartesianImage",
+    "CartesianMap",
+    "GroundGeometry",
+    "cartesian_map",
+    "directions",
+    "moved",
+    "nearest_known",
+    "seen",
+    "to_cartesian",
+]
 
 
 def directions(bearing: Bearing, bearing_rad: ArrayLike, elevation_rad: ArrayLike) -> NDArray[np.float64]:
@@ -73,9 +83,9 @@ class GroundGeometry:
 
     def see(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Range [m] and bearing [rad] of ground points ``(..., 2)``."""
-        s, f, u = self._in_sonar(points)
-        radius = np.sqrt(s * s + f * f + u * u)
-        return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
+        turn = self.turn.astype(points.dtype)
+        radius, bearing = seen(points, turn, points.dtype.type(self.height_m), self.bearing)
+        return radius, bearing
 
     def elevation(self, points: NDArray[np.floating]) -> NDArray[Any]:
         """Elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
@@ -114,18 +124,53 @@ class GroundGeometry:
 
     def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], ...]:
         """Starboard, forward, up of ground points in the sonar's own axes."""
-        x, y = points[..., 0], points[..., 1]
-        a = self.turn.astype(points.dtype)
-        drop = points.dtype.type(self.height_m)
-        return tuple(x * a[0, k] + y * a[1, k] - drop * a[2, k] for k in range(3))
+        return _in_sonar(points, self.turn.astype(points.dtype), points.dtype.type(self.height_m))
 
 
-def moved(points: NDArray[np.floating], motion: ArrayLike) -> NDArray[Any]:
-    """Where ground points ``(..., 2)`` lie for a sonar that has moved by (sideways, forward [m], yaw [rad]; eq. 3.4)."""
-    sideways, forward, yaw = (points.dtype.type(value) for value in np.asarray(motion, dtype=float))
-    cos, sin = np.cos(yaw), np.sin(yaw)
+def _in_sonar(points: Any, turn: Any, height: Any) -> tuple[Any, ...]:
+    """Starboard, forward, up of ground points ``(..., 2)`` in the axes of a sonar, turned ``(..., 3, 3)``."""
     x, y = points[..., 0], points[..., 1]
-    return np.stack([x * cos - y * sin - sideways, x * sin + y * cos - forward], axis=-1)
+    return tuple(x * turn[..., 0, k] + y * turn[..., 1, k] - height * turn[..., 2, k] for k in range(3))
+
+
+def seen(points: Any, turn: Any, height: Any, bearing: Bearing) -> tuple[Any, Any]:
+    """Range [m] and bearing [rad] of ground points; NumPy or torch.
+
+    Args:
+        points: (starboard, forward) in level axes ``(..., 2)`` [m].
+        turn: the sonar's starboard, forward and up in these axes, as columns ``(..., 3, 3)``.
+        height: of the sonar ``(...)`` [m].
+        bearing: which angle is meant.
+    """
+    xp = array_namespace(points)
+    s, f, u = _in_sonar(points, turn, height)
+    radius = xp.sqrt(s * s + f * f + u * u)
+    return radius, xp.atan2(s, f) if bearing == "azimuth" else xp.asin(s / radius)
+
+
+def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """For each node the row and column of the one whose values it takes: its own where it meets the ground, else the first
+    farther out, in the nearest column that has one ``(ranges, bearings)``."""
+    rows, columns = known.shape
+    having = np.flatnonzero(known.any(axis=0))
+    if not having.size:
+        return np.zeros_like(known, dtype=np.intp), np.zeros_like(known, dtype=np.intp)
+    column = having[np.abs(np.arange(columns)[:, None] - having).argmin(axis=1)]
+    row = np.maximum(np.arange(rows)[:, None], known.argmax(axis=0)[column])
+    return row, np.broadcast_to(column, row.shape)
+
+
+def moved(points: Any, motion: Any) -> Any:
+    """Where ground points ``(..., 2)`` lie for a sonar that has moved by (sideways, forward [m], yaw [rad]; eq. 3.4).
+
+    NumPy or torch; the motion is three numbers, or an array like the points whose leading axes go with theirs.
+    """
+    xp = array_namespace(points)
+    motion = xp.asarray(motion, dtype=points.dtype)
+    sideways, forward, yaw = (motion[..., k] for k in range(3))
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    x, y = points[..., 0], points[..., 1]
+    return xp.stack([x * cos - y * sin - sideways, x * sin + y * cos - forward], axis=-1)
 
 
 @dataclass(frozen=True)

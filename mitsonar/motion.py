@@ -9,15 +9,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Motion", "Pose", "Trajectory", "compose", "motions", "mounted", "pose_from_to_world", "to_world_matrices"]
+__all__ = [
+    "Motion",
+    "Pose",
+    "Trajectory",
+    "compose",
+    "inverse",
+    "motions",
+    "mounted",
+    "pose_from_to_world",
+    "to_world_matrices",
+]
 
 # Mitsuba's sensor frame in the vehicle's: local x = port, local y = up, local z = forward (columns)
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
@@ -63,6 +74,14 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     x = pose.x + motion.forward * sin + motion.sideways * cos
     y = pose.y + motion.forward * cos - motion.sideways * sin
     return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
+
+
+def inverse(motion: Any) -> Any:
+    """The motions that undo motions ``(..., 3)`` (sideways, forward, yaw; eq. 3.4), NumPy or torch."""
+    xp = array_namespace(motion)
+    sideways, forward, yaw = (motion[..., k] for k in range(3))
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    return xp.stack([-(sideways * cos + forward * sin), -(forward * cos - sideways * sin), -yaw], axis=-1)
 
 
 def motions(poses: ArrayLike) -> NDArray[np.float64]:

@@ -13,10 +13,10 @@ from mitsonar.estimation.direct import Direct
 from mitsonar.estimation.ecc import Ecc
 from mitsonar.estimation.estimators import ESTIMATORS, create_estimator, estimator_from
 from mitsonar.estimation.ground import GroundView
-from mitsonar.estimation.height import Standing, standing_of
 from mitsonar.estimation.zero import Zero
 from mitsonar.frames import SonarFrames
 from mitsonar.geometry import moved
+from mitsonar.height import Standing, standing_of
 from mitsonar.motion import Motion, Pose, Trajectory, compose
 from mitsonar.noise import NOISE_MODELS
 from mitsonar.simulation.imaging import Simulator

@@ -15,7 +15,20 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS = PROJECT["tool"]["setuptools"]
 
 STAGES = (
-    *("errors", "files", "sonar", "presets", "motion", "frames", "framestore", "noise", "geometry", "metrics", "plots"),
+    *(
+        "errors",
+        "files",
+        "sonar",
+        "presets",
+        "motion",
+        "frames",
+        "framestore",
+        "noise",
+        "geometry",
+        "height",
+        "metrics",
+        "plots",
+    ),
     "simulation.echoes",
     *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")),
     *(f"simulation.worlds.{name}" for name in ("shapes", "perlin", "world")),
@@ -28,13 +41,20 @@ STAGES = (
         f"dataset.{name}"
         for name in ("recipe", "plan", "split", "place", "store", "rendering", "shards", "workers", "generate")
     ),
-    *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "pairs", "rendered", "again")),
+    *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "ground", "pairs", "rendered", "again")),
+    *(
+        f"networks.{name}"
+        for name in ("law", "blocks", "posenet", "sfmnet", "cnn1b", "cnn4b", "cnn4posenet", "posenet_dual")
+    ),
+    *(f"networks.{name}" for name in ("corrnet", "create", "checkpoint", "onnx")),
     *(
         f"estimation.{name}"
-        for name in ("estimator", "zero", "height", "ground", "ecc", "phase", "flow", "direct", "estimators")
+        for name in ("estimator", "zero", "ground", "ecc", "phase", "flow", "direct", "network", "estimators")
     ),
     *(f"estimation.{name}" for name in ("limit", "comparison")),
     *(f"mapping.{name}" for name in ("paths", "assessment", "source", "odometry", "mosaic", "charts", "results")),
+    *(f"training.{name}" for name in ("recipe", "loss", "data", "augment", "module", "journal", "run")),
+    *(f"training.{name}" for name in ("evaluation", "tables", "reproduce")),
     "cli",
     "__main__",
 )
@@ -94,7 +114,8 @@ def stage(name: str) -> int:
     return STAGES.index("cli" if name.split(".")[0] == "cli" else name)
 
 
-PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "estimation", "mapping", "scenes"}
+PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "networks", "estimation", "mapping", "training"}
+PACKAGES |= {"scenes", "recipes"}
 """Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
 
@@ -117,7 +138,7 @@ def test_modules_import_from_earlier_stages_only(name: str) -> None:
 
 def test_packages_import_nothing_but_the_register_of_plugins() -> None:
     found = {name: imported(MODULES[name]) for name in PACKAGES}
-    assert found == {name: {"plugins"} if name == "" else set() for name in PACKAGES}
+    assert found == {name: {"": {"plugins"}, "networks": {"networks.create"}}.get(name, set()) for name in PACKAGES}
 
 
 def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
@@ -244,4 +265,7 @@ def test_package_data_names_every_shipped_file() -> None:
     assert shipped == named
     recipes = set((ROOT / "mitsonar" / "dataset").glob(SETUPTOOLS["package-data"]["mitsonar.dataset"][0]))
     assert len(recipes) == 11
+    training = ROOT / "benchmarks" / "recipes"
+    named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.recipes"] for path in training.glob(pattern)}
+    assert {path for path in training.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")} == named
     assert (ROOT / "mitsonar" / "py.typed").is_file()

@@ -9,7 +9,22 @@ def main() -> None:
     """``mitsonar`` and ``python -m mitsonar``."""
     import typer
 
-    from mitsonar.cli import compare, dataset, doctor, image, limit, mosaic, odometry, presets, render, world
+    from mitsonar.cli import (
+        compare,
+        dataset,
+        doctor,
+        evaluate,
+        export,
+        image,
+        limit,
+        mosaic,
+        odometry,
+        presets,
+        render,
+        reproduce,
+        train,
+        world,
+    )
 
     app = typer.Typer(
         name="mitsonar",
@@ -28,6 +43,10 @@ def main() -> None:
     app.command()(limit.limit)
     app.command()(odometry.odometry)
     app.command()(mosaic.mosaic)
+    app.command()(train.train)
+    app.command()(evaluate.evaluate)
+    app.command()(export.export)
+    app.command()(reproduce.reproduce)
     app.add_typer(world.worlds(), name="world")
     app.add_typer(dataset.datasets(), name="dataset")
     app()

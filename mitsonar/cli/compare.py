@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import re
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from mitsonar.estimation.estimator import Estimator
     from mitsonar.noise import NoiseModel
 
-__all__ = ["compare", "table_lines"]
+__all__ = ["compare", "markdown", "table_lines"]
 
 METHODS = "zero,ecc,flow,phase,direct"
 
@@ -36,7 +37,10 @@ FEWEST_SCENES = 10
 def compare(
     data: Annotated[str, typer.Argument(metavar="DATA.zarr", help="Path or URL of a data set of images.")],
     estimators: Annotated[
-        str, typer.Option(help="Names with commas between them, each NAME or NAME:key=value:key=value.")
+        str,
+        typer.Option(
+            help="Names, or checkpoints of networks, with commas between them, each NAME or NAME:key=value:key=value."
+        ),
     ] = METHODS,
     noise: Annotated[
         str,
@@ -68,6 +72,7 @@ def compare(
         raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'") from None
     from mitsonar.estimation.comparison import VARIATIONS, answers_of, limits_of, rows_of, with_prior
     from mitsonar.estimation.estimators import estimator_from
+    from mitsonar.estimation.network import Network
     from mitsonar.metrics import cluster_resamples, in_units
     from mitsonar.motion import motions
     from mitsonar.noise import load_noise
@@ -89,7 +94,7 @@ def compare(
     scenes = len(np.unique(first.scene[first.first[numbers]]))
     if scenes < FEWEST_SCENES:
         warn(f"{scenes} scenes only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more")
-    settings = {
+    settings: dict[str, Any] = {
         "digest": _digest(first),
         "methods": list(methods),
         "part": part,
@@ -97,6 +102,9 @@ def compare(
         "seed": seed,
         "version": version("mitsonar"),
     }
+    networks = {name: method.digest for name, method in methods.items() if isinstance(method, Network)}
+    if networks:
+        settings["networks"] = networks
     store = _Kept(out, settings)
     report: dict[str, Any] = {"data": data, "model": first.recipe.instrument.model, **settings, "tables": []}
     with progress_bar("comparing", len(levels) * len(asked) * len(numbers), "pairs") as progress:
@@ -283,39 +291,9 @@ class _Kept:
             write_json(self.folder / "table.json", report)
 
 
-COLUMNS = (
-    *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),
-    *("ms", "inputs"),
-)
-
-
 def table_lines(table: dict[str, Any]) -> list[str]:
     """A table of the report as Markdown."""
-    lines = ["", f"noise {table['noise']}, {table['variation']}", ""]
-    rows = [list(COLUMNS), ["---"] * len(COLUMNS)]
-    for row in table["rows"]:
-        rows.append(
-            [
-                row["method"],
-                _three(row["rmse"]),
-                " ".join(
-                    f"{_number(low, k)}..{_number(high, k)}"
-                    for k, (low, high) in enumerate(zip(row["rmse_low"], row["rmse_high"], strict=True))
-                ),
-                _three(row["median"]),
-                _three(row["p95"]),
-                " / ".join("-" if value is None else f"{value:.3f}" for value in row["slope"]),
-                _three(row["large"]),
-                str(row["failures"]),
-                " / ".join("-" if value is None else f"{value:.2f}" for value in row["skill"]),
-                " / ".join("-" if value is None else f"{value:.1f}" for value in row["over_limit"]),
-                "-" if row["nees"] is None else f"{row['nees']:.1f}",
-                f"{row['ms']:.1f}",
-                row["inputs"],
-            ]
-        )
-    width = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
-    lines += ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in rows]
+    lines = ["", f"noise {table['noise']}, {table['variation']}", "", *markdown(table["rows"], COLUMNS)]
     if table["limits"]:
         known = {law: std for law, std in table["limits"].items() if any(value != 0 for value in std)}
         lines += ["", "limit of two frames: " + "; ".join(f"{law} {_three(std)}" for law, std in known.items())]
@@ -329,6 +307,13 @@ def table_lines(table: dict[str, Any]) -> list[str]:
     return lines
 
 
+def markdown(rows: list[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+    """Methods as lines of a Markdown table with these columns of :data:`CELLS`."""
+    cells = [list(columns), ["---"] * len(columns), *([CELLS[column](row) for column in columns] for row in rows)]
+    width = [max(len(row[k]) for row in cells) for k in range(len(columns))]
+    return ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in cells]
+
+
 DIGITS = (2, 2, 4)
 
 
@@ -338,3 +323,37 @@ def _number(value: float | None, axis: int) -> str:
 
 def _three(values: list[float | None]) -> str:
     return " / ".join(_number(value, k) for k, value in enumerate(values))
+
+
+def _joined(values: list[float | None], digits: int) -> str:
+    return " / ".join("-" if value is None else f"{value:.{digits}f}" for value in values)
+
+
+def _interval(row: dict[str, Any]) -> str:
+    ends = zip(row["rmse_low"], row["rmse_high"], strict=True)
+    return " ".join(f"{_number(low, k)}..{_number(high, k)}" for k, (low, high) in enumerate(ends))
+
+
+CELLS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "method": lambda row: str(row["method"]),
+    "RMSE": lambda row: _three(row["rmse"]),
+    "as in the thesis": lambda row: _joined(row["thesis"], 2),
+    "95 % interval": _interval,
+    "median": lambda row: _three(row["median"]),
+    "95 %": lambda row: _three(row["p95"]),
+    "slope": lambda row: _joined(row["slope"], 3),
+    "bias": lambda row: _three(row["bias"]),
+    "large": lambda row: _three(row["large"]),
+    "fail": lambda row: str(row["failures"]),
+    "skill": lambda row: _joined(row["skill"], 2),
+    "/ limit (rays)": lambda row: _joined(row["over_limit"], 1),
+    "nees": lambda row: "-" if row["nees"] is None else f"{row['nees']:.1f}",
+    "ms": lambda row: f"{row['ms']:.1f}",
+    "inputs": lambda row: str(row["inputs"]),
+}
+"""What a column says of a row."""
+
+COLUMNS = (
+    *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),
+    *("ms", "inputs"),
+)

@@ -31,7 +31,7 @@ def warn(text: str) -> None:
     typer.echo(f"warning: {text}", err=True)
 
 
-AGAIN = "the same command goes on (`render` and `odometry` with --resume)"
+AGAIN = "the same command goes on (`render`, `odometry` and `train` with --resume)"
 
 
 def say_stopped() -> None:

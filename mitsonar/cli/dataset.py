@@ -13,7 +13,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, say_stopped, warn
 from mitsonar.errors import MitsonarError
 
-__all__ = ["datasets"]
+__all__ = ["changes_of", "datasets"]
 
 Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s3://...) of a data set.")]
 
@@ -44,7 +44,7 @@ def make(
     from mitsonar.dataset.generate import make as make_dataset
     from mitsonar.dataset.recipe import load_recipe
 
-    described = load_recipe(recipe, _changes(change or [], seed))
+    described = load_recipe(recipe, changes_of(change or [], seed))
     if sequences is not None and scale is not None:
         raise MitsonarError("--sequences and --scale contradict each other: give one")
     if scale is not None:
@@ -201,7 +201,7 @@ class _Bar:
             self.inner.__exit__(*error)
 
 
-def _changes(pairs: list[str], seed: int | None) -> dict[str, Any]:
+def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
     """KEY=VALUE pairs, values as YAML."""
     import yaml
 

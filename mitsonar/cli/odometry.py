@@ -29,7 +29,10 @@ def odometry(
     frames: Frames,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to make: path, motions, table, figure.")],
     estimator: Annotated[
-        str, typer.Option(help="zero, ecc, flow, phase or direct, with options as NAME:key=value:key=value.")
+        str,
+        typer.Option(
+            help="zero, ecc, flow, phase, direct, corrnet, a network's checkpoint; with options NAME:key=value:key=value."
+        ),
     ] = "direct",
     smooth: Annotated[
         str, typer.Option(help="none, spline or kalman; motions that are not believed are bridged anyway.")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.dataset.recipe import Recipe
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry import CartesianMap, cartesian_map
-from mitsonar.noise import NoiseModel, load_noise
+from mitsonar.noise import NoiseModel, load_noise, uniform
 
 __all__ = ["LABELS", "Arrangement", "Labels", "arrangement_of"]
 
@@ -22,6 +23,9 @@ LEVELS = 32
 
 SCALE = 10.0
 """Normalised labels lie in +-10 ("Normx10", 3.4.2)."""
+
+WHICH_LEVEL = 0x1E7E1
+"""Between the seed of noise and the seed that draws its level."""
 
 Layout = Literal["side", "stack", "channels"]
 Coordinates = Literal["polar", "cartesian", "both"]
@@ -91,6 +95,7 @@ class Arrangement:
         noise: drawn from (seed, frame, cell).
         beams: of each view.
         maps: of scan conversion, for each view.
+        levels: of noise, of which each sample draws one by (seed, its first frame); empty: ``noise``, the first of them.
     """
 
     views: tuple[str, ...]
@@ -100,6 +105,7 @@ class Arrangement:
     noise: NoiseModel
     beams: dict[str, int]
     maps: dict[str, CartesianMap] = field(default_factory=dict)
+    levels: tuple[NoiseModel, ...] = ()
 
     def __call__(self, frames: dict[str, Any], numbers: Any, seed: int) -> Any:
         """The input of a network.
@@ -110,6 +116,8 @@ class Arrangement:
             numbers: of the frames ``(batch, frames)``, integers: noise is theirs.
             seed: of the noise.
         """
+        if self.levels:
+            return self._each_its_level(frames, numbers, seed)
         xp = array_namespace(numbers)
         parts = [self.noisy(frames, view, numbers, seed + place) for place, view in enumerate(self.views)]
         if self.kind == "vector":
@@ -121,6 +129,29 @@ class Arrangement:
             return polar
         fan = self._laid_out([self.maps[view].apply(part) for view, part in zip(self.views, parts, strict=True)])
         return fan if polar is None else (polar, fan)
+
+    def _each_its_level(self, frames: dict[str, Any], numbers: Any, seed: int) -> Any:
+        """Inputs of a batch whose samples draw their noise levels; made level by level, in the order of the batch."""
+        xp = array_namespace(numbers)
+        drawn, _ = uniform((numbers.shape[0], 1, 1), seed=seed + WHICH_LEVEL, frames=numbers[:, 0], like=numbers)
+        level = xp.floor(drawn[:, 0, 0] * len(self.levels))
+        groups = [(model, xp.nonzero(level == k)[0]) for k, model in enumerate(self.levels)]
+        mine = {name: values for name, values in frames.items() if name.removeprefix("nonzero_") in self.views}
+        parts = [
+            replace(self, noise=model, levels=())(
+                {name: xp.take(values, place, axis=0) for name, values in mine.items()},
+                xp.take(numbers, place, axis=0),
+                seed,
+            )
+            for model, place in groups
+            if place.shape[0]
+        ]
+        back = xp.argsort(xp.concat([place for _, place in groups]))
+
+        def joined(pieces: Any) -> Any:
+            return xp.take(xp.concat(list(pieces), axis=0), back, axis=0)
+
+        return tuple(map(joined, zip(*parts, strict=True))) if isinstance(parts[0], tuple) else joined(parts)
 
     def noisy(self, frames: dict[str, Any], view: str, numbers: Any, seed: int) -> Any:
         """Float32 frames of a view, with noise."""
@@ -157,17 +188,18 @@ def arrangement_of(
     kind: str | None = None,
     layout: str = "side",
     coordinates: str = "polar",
-    noise: str | NoiseModel = "none",
+    noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
     cartesian_rows: int = 512,
 ) -> Arrangement:
-    """The arrangement that these words say, for the frames of a recipe.
+    """The arrangement that these words say, for the frames of a recipe; of several noise levels each sample draws one.
 
     Raises:
         MitsonarError: a word that is not known, or that does not fit the others.
     """
     known = {view.name: view for view in recipe.views}
     chosen = (views,) if isinstance(views, str) else tuple(known if views is None else views)
-    if not isinstance(noise, str | NoiseModel):
+    levels = [noise] if isinstance(noise, str | NoiseModel) else list(noise) if isinstance(noise, Sequence) else []
+    if not levels or not all(isinstance(level, str | NoiseModel) for level in levels):
         raise MitsonarError(f"noise must be a name, three numbers as text, or a NoiseModel: got {noise!r}; 'none' for none")
     kind = kind or recipe.kinds[0]
     for word, name, allowed in (
@@ -195,5 +227,14 @@ def arrangement_of(
             maps[name] = cartesian_map(known[name].sonar.range_m, known[name].bearing_rad, cartesian_rows)
         if len({conversion.index.shape for conversion in maps.values()}) > 1 and layout != "side":
             raise MitsonarError("fans of different sizes stand side by side only")
-    model = load_noise(noise) if isinstance(noise, str) else noise
-    return Arrangement(chosen, kind, layout, coordinates, model, beams, maps)  # type: ignore[arg-type]
+    models = tuple(load_noise(level) if isinstance(level, str) else level for level in levels)
+    return Arrangement(
+        chosen,
+        kind,
+        layout,  # type: ignore[arg-type]
+        coordinates,  # type: ignore[arg-type]
+        models[0],
+        beams,
+        maps,
+        models if len(models) > 1 else (),
+    )

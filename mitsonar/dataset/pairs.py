@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,20 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from mitsonar.dataset.arrangement import Labels, arrangement_of
+from mitsonar.dataset.ground import ground_of
 from mitsonar.dataset.recipe import Recipe, Split, split_from
 from mitsonar.dataset.split import deal, world_of
 from mitsonar.dataset.store import DataStore, array_names
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import SonarFrames
+from mitsonar.height import standing_of
+from mitsonar.motion import motions
 from mitsonar.noise import NoiseModel
 
 __all__ = ["Samples", "SonarPairs"]
+
+GROUND = "ground/"
+"""Before the names of the ground's geometry in a raw sample."""
 
 SEED_STEP = 1_000_003
 """Between the noise seeds of two epochs: more than any number of views."""
@@ -36,6 +42,7 @@ class Samples:
         labels: from targets to labels and back.
         seed: of noise and order.
         epoch: changes both; see :meth:`set_epoch`.
+        ground: whether inputs come with the geometry of the ground.
     """
 
     def __init__(
@@ -48,9 +55,10 @@ class Samples:
         layout: str = "side",
         coordinates: str = "polar",
         cartesian_rows: int = 512,
-        noise: str | NoiseModel = "none",
+        noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
         labels: str = "raw",
         seed: int = 0,
+        ground: bool = False,
     ) -> None:
         self.recipe = recipe
         self.frames = recipe.frames if frames is None else frames
@@ -66,7 +74,12 @@ class Samples:
             cartesian_rows=cartesian_rows,
         )
         self.labels = Labels.of(labels, recipe, self.frames)
-        self.seed, self.epoch = seed, 0
+        self.seed, self.epoch, self.ground = seed, 0, ground
+        if ground and (self.frames != 2 or len(self.arrange.views) != 1 or self.arrange.kind != "image"):
+            raise MitsonarError(
+                "the ground is that of pairs of images of one view: give frames=2, views='NAME' of "
+                f"{', '.join(self.arrange.views)}, kind='image'"
+            )
 
     def set_epoch(self, epoch: int) -> None:
         """Another epoch draws other noise, and another order in :meth:`SonarPairs.loader`."""
@@ -75,8 +88,36 @@ class Samples:
     def finished(self, batch: dict[str, torch.Tensor], device: torch.device | str | None = None) -> tuple[Any, torch.Tensor]:
         """Inputs and labels of a batch of raw samples; noise and layout are made on ``device``."""
         moved = {name: values.to(device, non_blocking=True) for name, values in batch.items()}
+        ground = {name.removeprefix(GROUND): moved.pop(name) for name in list(moved) if name.startswith(GROUND)}
         inputs = self.arrange(moved, moved["frames"], self.seed + SEED_STEP * self.epoch)
-        return inputs, moved["label"]
+        return (inputs, ground) if self.ground else inputs, moved["label"]
+
+    def ground_below(self, image: NDArray[Any], poses: NDArray[np.float64], height_m: NDArray[np.float64]) -> dict[str, Any]:
+        """The geometry of a raw sample's frames, as networks that know it take it; by name, to be added to the sample.
+
+        Args:
+            image: of the one view ``(frames, bins, beams)``, without noise.
+            poses: of the sonar.
+            height_m: over the ground.
+        """
+        frames = self.frames_of(image, poses, height_m, time_s=np.arange(len(image), dtype=float))
+        standing = standing_of(frames, "the ground", None, None)
+        return {f"{GROUND}{name}": values for name, values in ground_of(frames, standing).items()}
+
+    def frames_of(
+        self, image: NDArray[Any], poses: NDArray[np.float64], height_m: NDArray[np.float64], **more: Any
+    ) -> SonarFrames:
+        """Frames of the one view."""
+        view = next(view for view in self.recipe.views if view.name == self.arrange.views[0])
+        return SonarFrames(
+            image=image,
+            range_m=view.sonar.range_m,
+            bearing_rad=view.bearing_rad,
+            sonar=view.sonar,
+            poses=poses,
+            height_m=height_m,
+            **more,
+        )
 
     def batches(
         self, raw: Dataset[Any], batch_size: int, device: torch.device | str | None, workers: int, **words: Any
@@ -99,7 +140,7 @@ class Samples:
         """Input and label of one raw sample."""
         batch = {name: torch.as_tensor(values)[None] for name, values in sample.items()}
         inputs, label = self.finished(batch)
-        return (tuple(part[0] for part in inputs) if isinstance(inputs, tuple) else inputs[0]), label[0]
+        return _first(inputs), label[0]
 
 
 class SonarPairs(Dataset[Any], Samples):
@@ -120,9 +161,11 @@ class SonarPairs(Dataset[Any], Samples):
         layout: ``side``, ``stack`` or ``channels``; see :class:`~mitsonar.dataset.arrangement.Arrangement`.
         coordinates: ``polar``, ``cartesian`` or ``both`` (then the input is a pair).
         cartesian_rows: pixels of a fan in the forward direction.
-        noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model.
+        noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model; of a list each sample draws one.
         labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` goes back.
         seed: of noise and order; the split has its own (``Split.seed``), so that another seed never mixes its parts.
+        ground: the input is a pair of images and the geometry of the ground below them, as ``corrnet`` takes it; labels are
+            then the sonar's motions, not those of a vehicle that it is mounted on.
         one_a_sequence: only one sample of each sequence, for independent tests.
 
     Raises:
@@ -144,6 +187,7 @@ class SonarPairs(Dataset[Any], Samples):
         self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
         self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
         worlds = world_of(self.recipe, self.store.scenes)[self.scene]
+        self._grounds: dict[int, dict[str, Any]] = {}
         self.first = self._samples(deal(worlds, self.sequence, self.split, part), one_a_sequence)
         if not len(self.first):
             raise MitsonarError(
@@ -178,6 +222,8 @@ class SonarPairs(Dataset[Any], Samples):
         here = self.frame_numbers(index)
         if self.frames == 1:
             return self.pose[here, 2]
+        if self.ground:  # in the axes of the sonar, which its geometry has
+            return motions(self.pose[here]).mean(axis=0)
         return np.asarray(self.motion[here.start : here.stop - 1].mean(axis=0))
 
     def raw(self, index: int) -> dict[str, Any]:
@@ -192,6 +238,11 @@ class SonarPairs(Dataset[Any], Samples):
                 sample[view] = self.store.read(name, here)
             elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
                 sample[f"nonzero_{view}"] = self.store.read(name, here).astype(np.int32)
+        if self.ground:
+            if index not in self._grounds:  # an epoch later it is the same
+                image = sample[self.arrange.views[0]]
+                self._grounds[index] = self.ground_below(image, self.pose[here], self.store.read("height_m", here))
+            sample |= self._grounds[index]
         return sample
 
     def sonar_frames(self, index: int, image: NDArray[Any] | None = None) -> SonarFrames:
@@ -204,19 +255,15 @@ class SonarPairs(Dataset[Any], Samples):
         if len(self.arrange.views) > 1 or self.arrange.kind != "image":
             raise MitsonarError(f"frames hold images of one view: choose one of {', '.join(self.arrange.views)}")
         here, (name,) = self.frame_numbers(index), self.arrange.views
-        view = next(view for view in self.recipe.views if view.name == name)
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
         if image is not None:
             sample[name] = image[None]
         image = self.arrange.noisy(sample, name, sample["frames"], self.seed + SEED_STEP * self.epoch)[0]
-        return SonarFrames(
-            image=np.asarray(image),
-            range_m=view.sonar.range_m,
-            bearing_rad=view.bearing_rad,
-            time_s=self.store.read("time_s")[here],
-            sonar=view.sonar,
-            poses=self.pose[here],
-            height_m=self.store.read("height_m")[here],
+        return self.frames_of(
+            np.asarray(image),
+            self.pose[here],
+            self.store.read("height_m", here),
+            time_s=self.store.read("time_s", here),
             level_scale=float(self.store.about["level_scale"]),
         )
 
@@ -233,6 +280,13 @@ class SonarPairs(Dataset[Any], Samples):
         order = torch.Generator().manual_seed(self.seed + SEED_STEP * self.epoch)
         words = {"shuffle": shuffle, "generator": order, "drop_last": drop_last}
         yield from self.batches(_Raw(self), batch_size, device, workers, **words)
+
+
+def _first(inputs: Any) -> Any:
+    """The first sample of a batch."""
+    if isinstance(inputs, tuple):
+        return tuple(map(_first, inputs))
+    return {name: values[0] for name, values in inputs.items()} if isinstance(inputs, dict) else inputs[0]
 
 
 @dataclass(frozen=True)

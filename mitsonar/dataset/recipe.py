@@ -21,7 +21,7 @@ from mitsonar.simulation.worlds.families import create_family
 from mitsonar.simulation.worlds.world import Family, Interval
 from mitsonar.sonar import Sonar
 
-__all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "shipped_recipes", "split_from"]
+__all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "set_key", "shipped_recipes", "split_from"]
 
 
 class _Part(BaseModel):
@@ -258,7 +258,7 @@ def load_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None)
     if not isinstance(fields, dict):
         raise MitsonarError(f"{path} must hold the keys of a recipe: {', '.join(Recipe.model_fields)}")
     for key, value in (changes or {}).items():
-        _change(fields, key, value)
+        set_key(fields, key, value)
     _find_files(fields, path.parent)
     return recipe_from({"name": path.stem, **fields})
 
@@ -301,7 +301,12 @@ def _find_files(fields: dict[str, Any], folder: Path) -> None:
             world["file"] = str((folder / world["file"]).resolve())
 
 
-def _change(fields: dict[str, Any], key: str, value: Any) -> None:
+def set_key(fields: dict[str, Any], key: str, value: Any) -> None:
+    """Set a key of a recipe, dots between the levels.
+
+    Raises:
+        MitsonarError: a level that is no group of keys.
+    """
     *levels, last = key.split(".")
     for level in levels:
         fields = fields.setdefault(level, {})

@@ -21,7 +21,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.motion import motions, mounted
 from mitsonar.simulation.variant import ensure_variant, release_memory, use_threads
 
-__all__ = ["RenderedPairs"]
+__all__ = ["RawStream", "RenderedPairs"]
 
 
 class RenderedPairs(IterableDataset[Any], Samples):
@@ -74,21 +74,46 @@ class RenderedPairs(IterableDataset[Any], Samples):
         for sample in self.raw():
             yield self.one(sample)
 
-    def raw(self) -> Iterator[dict[str, Any]]:
-        """Raw samples of this worker; :meth:`~mitsonar.dataset.pairs.Samples.finished` makes inputs of a batch of them."""
-        worker, workers = self._ready()
-        self._calibrate()
-        rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
-        mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
-        waiting: list[dict[str, Any]] = []
+    def raw(self, skip: int = 0, share: tuple[int, int] | None = None) -> Iterator[dict[str, Any]]:
+        """Raw samples of this worker; :meth:`~mitsonar.dataset.pairs.Samples.finished` makes inputs of a batch of them.
 
-        def drawn() -> dict[str, Any]:
+        Args:
+            skip: so many samples, which are not rendered, but for those among which the next ones were still waiting.
+            share: number of the worker and how many there are; default: as torch says.
+        """
+        known = self._ready()
+        worker, workers = share or known
+        self._calibrate()
+        mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
+        order = self._order(worker, mine)
+        gone: set[int] = set()
+        first = 0
+        for number in itertools.islice(order, skip):
+            gone.add(number)
+            while first in gone:
+                gone.remove(first)
+                first += 1
+        rendered = self._rendered(worker, workers, first)
+        waiting: dict[int, dict[str, Any]] = {}
+        for number in order:
+            while number not in waiting:
+                place, sample = next(rendered)
+                if place >= first and place not in gone:
+                    waiting[place] = sample
+            yield waiting.pop(number)
+
+    def _order(self, worker: int, length: int | None) -> Iterator[int]:
+        """Numbers of the samples as rendered, in the order in which they are given: one of ``buffer`` that wait."""
+        rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
+        waiting: list[int] = []
+
+        def drawn() -> int:
             place = int(rng.integers(len(waiting)))
             waiting[place], waiting[-1] = waiting[-1], waiting[place]
             return waiting.pop()
 
-        for sample in itertools.islice(self._rendered(worker, workers), mine):
-            waiting.append(sample)
+        for number in itertools.count() if length is None else range(length):
+            waiting.append(number)
             if len(waiting) >= self.buffer:
                 yield drawn()
         while waiting:
@@ -101,7 +126,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
         if workers:  # once here, not in each of them
             ensure_variant()
             self._calibrate()
-        yield from self.batches(_Raw(self), batch_size, device, workers)
+        yield from self.batches(RawStream(self, batch_size), batch_size, device, workers)
 
     def _calibrate(self) -> None:
         if self.gain is None:
@@ -122,38 +147,48 @@ class RenderedPairs(IterableDataset[Any], Samples):
         use_threads(1)
         return info.id, info.num_workers
 
-    def _rendered(self, worker: int, workers: int) -> Iterator[dict[str, Any]]:
-        """Samples in the order in which they are rendered, world after world."""
+    def _rendered(self, worker: int, workers: int, first: int = 0) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Samples with their numbers in the order in which they are rendered, world after world, from ``first`` on or a few
+        before it, where its sequence begins."""
         weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
-        number = worker + self.epoch * 10**6 * workers
+        of_sequence = self.worlds.flight.pings - self.frames + 1
+        turn, sequence = divmod(first // of_sequence, self.sequences_a_world)
+        number = worker + (turn + self.epoch * 10**6) * workers
+        count = (first // of_sequence) * of_sequence
         while True:
             rng = np.random.default_rng([self.seed, 8, number])
             group = int(rng.choice(len(weights), p=weights / weights.sum()))
             scene = Scene(number, group, world_seed(self.worlds.seed, number), self.sequences_a_world)
             release_memory()
-            yield from self._of_world(SceneRenderer(self.worlds, scene))
-            number += workers
+            for sample in self._of_world(SceneRenderer(self.worlds, scene), sequence):
+                yield count, sample
+                count += 1
+            number, sequence = number + workers, 0
 
-    def _of_world(self, renderer: SceneRenderer) -> Iterator[dict[str, Any]]:
-        """Samples of one world, as many sequences a launch as fit."""
+    def _of_world(self, renderer: SceneRenderer, begin: int = 0) -> Iterator[dict[str, Any]]:
+        """Samples of one world from a sequence on, as many sequences a launch as fit."""
         assert self.gain is not None
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
         together = max(1, renderer.simulator.pings_per_launch // pings)
-        sequences = sequences_of(recipe, renderer.scene)
+        sequences = itertools.islice(sequences_of(recipe, renderer.scene), begin, None)
         before = renderer.scene.number * self.sequences_a_world * pings
-        for start in range(0, self.sequences_a_world, together):
+        for start in range(begin, self.sequences_a_world, together):
             flown = [next(sequences).vehicle for _ in range(min(together, self.sequences_a_world - start))]
             poses = mounted(np.concatenate(flown), recipe.mount.pose)
             values = renderer.frames(poses, start * pings, self.gain)
             for k, vehicle in enumerate(flown):
                 for first in range(pings - self.frames + 1):
-                    yield self._sample(values, vehicle, k * pings, first, before + start * pings)
+                    yield self._sample(values, vehicle, poses, k * pings, first, before + start * pings)
 
-    def _sample(self, values: dict[str, Any], vehicle: Any, begin: int, first: int, number: int) -> dict[str, Any]:
+    def _sample(
+        self, values: dict[str, Any], vehicle: Any, poses: Any, begin: int, first: int, number: int
+    ) -> dict[str, Any]:
         """One sample of a batch of frames."""
         here = slice(begin + first, begin + first + self.frames)
         if self.frames == 1:
             target = vehicle[first : first + 1, 2]
+        elif self.ground:
+            target = motions(poses[here]).mean(axis=0)
         else:
             target = motions(vehicle[first : first + self.frames]).mean(axis=0)
         sample: dict[str, Any] = {
@@ -165,14 +200,28 @@ class RenderedPairs(IterableDataset[Any], Samples):
             sample[view] = values[f"{self.stored_kind}{suffix}"][here].copy()
             if self.stored_kind == "vector":
                 sample[f"nonzero_{view}"] = values[f"nonzero{suffix}"][here].astype(np.int32)
+        if self.ground:
+            sample |= self.ground_below(sample[self.arrange.views[0]], poses[here], values["height_m"][here])
         return sample
 
 
-class _Raw(IterableDataset[Any]):
-    """The raw samples, for workers that only render."""
+class RawStream(IterableDataset[Any]):
+    """The raw samples, for workers that only render.
 
-    def __init__(self, pairs: RenderedPairs) -> None:
-        self.pairs = pairs
+    Args:
+        pairs: what to render.
+        batch_size: of the loader.
+        skip: batches that were read before: with as many workers as then, the loader goes on with the next.
+        share: number of this loader and how many there are, where several processes train together.
+    """
+
+    def __init__(self, pairs: RenderedPairs, batch_size: int = 1, skip: int = 0, share: tuple[int, int] = (0, 1)) -> None:
+        self.pairs, self.batch_size, self.skip, self.share = pairs, batch_size, skip, share
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return self.pairs.raw()
+        info = get_worker_info()
+        worker, workers = (info.id, info.num_workers) if info else (0, 1)
+        worker = (worker + self.skip) % workers  # torch asks worker 0 first, whoever's turn it was
+        had = len(range(worker, self.skip, workers))  # batches come from the workers in turn
+        loader, loaders = self.share
+        return self.pairs.raw(self.batch_size * had, (loader * workers + worker, loaders * workers))

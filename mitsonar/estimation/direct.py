@@ -30,10 +30,10 @@ from mitsonar.estimation.estimator import (
     two_frames,
     unbelieved,
 )
-from mitsonar.estimation.height import Standing, standing_of
 from mitsonar.frames import SonarFrames
-from mitsonar.geometry import GroundGeometry, moved
-from mitsonar.motion import Motion
+from mitsonar.geometry import GroundGeometry, moved, nearest_known
+from mitsonar.height import Standing, standing_of
+from mitsonar.motion import Motion, inverse
 
 __all__ = ["Direct"]
 
@@ -265,10 +265,10 @@ def _fit(
 ) -> _Fit:
     """How good the motion is: from the pulls of blocks, and from slopes of one frame times those of the other."""
     true = np.sum([_cross(side, cells, level) for side in look.sides], axis=0)
-    inverse = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else look.normal) + np.diag(held))
+    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else look.normal) + np.diag(held))
     pulls = np.sum([side.sums(side.weighted * side.residual) for side in look.sides], axis=0)
     side = look.sides[0]
-    shares = side.sums((side.weighted * (inverse.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
+    shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
     lifted = cells.lifted_shift(v)
     by_height = np.zeros(len(v))
     for one in look.sides:
@@ -277,8 +277,8 @@ def _fit(
     alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
     return _Fit(
         converged=converged,
-        covariance=inverse @ (pulls @ pulls.T) @ inverse,
-        by_height=inverse @ by_height,
+        covariance=undone @ (pulls @ pulls.T) @ undone,
+        by_height=undone @ by_height,
         correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
         independent=side.residual.size / alike,
         blocks=spread_of(shares[0]),
@@ -296,7 +296,7 @@ class _Cells:
         self.row, self.column = self.grid.row, self.grid.column
         self.ground = self._ground(standing.height_m)
         known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
-        self.from_node = _nearest_known(known)
+        self.from_node = nearest_known(known)
         first = int(known.any(axis=1).argmax()) if known.any() else len(known)
         self.usable = slice(
             int(np.searchsorted(self.grid.range_m, self.grid.node_range[first])) if known.any() else 10**9, None
@@ -354,7 +354,7 @@ class _Cells:
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
             ground, other = (self._ground(self.standing.height_m + change) for change in (half, -half))
-        motion = _inverse(v[:3]) if back else v[:3]
+        motion = inverse(v[:3]) if back else v[:3]
         radius, bearing = other.see(moved(ground.points, motion))
         grid = self.grid
         nodes = np.stack([radius - grid.node_range[:, None], bearing - grid.node_bearing])
@@ -471,25 +471,6 @@ class _Hasten:
         hastened = np.asarray(step - (places + steps) @ past)
         lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (hastened, step)]
         return hastened if lengths[0] < LONGEST * lengths[1] else step
-
-
-def _nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each node the row and column of the one whose values it takes: its own where it meets the ground, else the first
-    farther out, in the nearest column that has one ``(ranges, bearings)``."""
-    rows, columns = known.shape
-    having = np.flatnonzero(known.any(axis=0))
-    if not having.size:
-        return np.zeros_like(known, dtype=np.intp), np.zeros_like(known, dtype=np.intp)
-    column = having[np.abs(np.arange(columns)[:, None] - having).argmin(axis=1)]
-    row = np.maximum(np.arange(rows)[:, None], known.argmax(axis=0)[column])
-    return row, np.broadcast_to(column, row.shape)
-
-
-def _inverse(motion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The motion that undoes one (eq. 3.4)."""
-    sideways, forward, yaw = motion
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([-(sideways * cos + forward * sin), -(forward * cos - sideways * sin), -yaw])
 
 
 def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_doubt, two_frames, unbelieved
 from mitsonar.estimation.ground import GroundView
-from mitsonar.estimation.height import standing_of
 from mitsonar.frames import SonarFrames
+from mitsonar.height import standing_of
 from mitsonar.motion import Motion
 
 __all__ = ["Ecc"]

@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 INPUTS = "pitch; height where no first echoes show"
-"""What methods that know the geometry are given beside the images; see :mod:`mitsonar.estimation.height`."""
+"""What methods that know the geometry are given beside the images; see :mod:`mitsonar.height`."""
 
 FEWEST_CELLS = 8
 """Bins and beams of an image that can be registered."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from mitsonar.errors import MitsonarError, nearest_names
@@ -15,7 +18,7 @@ from mitsonar.estimation.flow import Flow
 from mitsonar.estimation.phase import Phase
 from mitsonar.estimation.zero import Zero
 
-__all__ = ["ESTIMATORS", "create_estimator", "estimator_from"]
+__all__ = ["ESTIMATORS", "TRAINED", "create_estimator", "estimator_from"]
 
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     "zero": Zero,
@@ -26,14 +29,20 @@ ESTIMATORS: dict[str, Callable[..., Estimator]] = {
 }
 
 
+TRAINED = {"corrnet": "corrnet.ckpt"}
+"""Networks that are shipped with their weights; computing with them needs torch."""
+
+
 def create_estimator(name: str, **options: Any) -> Estimator:
     """The estimator of that name.
 
     Raises:
         MitsonarError: unknown name or option.
     """
+    if name in TRAINED:
+        return _trained(str(files("mitsonar.networks") / "weights" / TRAINED[name]))(**options)
     if name not in ESTIMATORS:
-        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, ESTIMATORS)}")
+        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, [*ESTIMATORS, *TRAINED])}")
     try:
         return ESTIMATORS[name](**options)
     except TypeError as error:
@@ -41,36 +50,61 @@ def create_estimator(name: str, **options: Any) -> Estimator:
 
 
 def estimator_from(text: str) -> Estimator:
-    """What the command line says: ``NAME``, or with numbers ``NAME:key=value:key=value``; angles as ``..._deg``.
+    """What the command line says: ``NAME``, a checkpoint or the folder of a training run, or either with options,
+    ``NAME:key=value:key=value``; angles as ``..._deg``.
 
     Raises:
-        MitsonarError: unknown name or option, or not a number.
+        MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
     """
     name, *words = text.split(":")
-    if name not in ESTIMATORS and ("/" in name or "." in name):
-        raise MitsonarError(
-            f"no estimator {name!r}: networks from a checkpoint are not there yet; use {', '.join(ESTIMATORS)}"
-        )
-    if name not in ESTIMATORS:
-        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, ESTIMATORS)}")
-    known = _number_options(name)
-    options = {}
+    if name in ESTIMATORS:
+        return create_estimator(name, **_options(name, words, ESTIMATORS[name]))
+    if name not in TRAINED and "/" not in name and "." not in name and not Path(name).is_dir():
+        names = nearest_names(name, [*ESTIMATORS, *TRAINED])
+        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
+    made = _trained(str(files("mitsonar.networks") / "weights" / TRAINED[name]) if name in TRAINED else name)
+    return made(**_options(name, words, made))
+
+
+def _trained(path: str) -> Callable[..., Estimator]:
+    """What makes an estimator of a checkpoint, from options.
+
+    Raises:
+        MitsonarError: no torch, no such checkpoint or one that cannot be used.
+    """
+    try:
+        from mitsonar.estimation.network import Network
+        from mitsonar.networks.checkpoint import Checkpoint
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        raise MitsonarError("a network computes with torch: pip install 'mitsonar[learn]'") from None
+    return partial(Network, Checkpoint.load(path))
+
+
+def _options(name: str, words: list[str], made: Callable[..., Estimator]) -> dict[str, Any]:
+    """Options of what makes an estimator, from words as the command line gives them."""
+    known, options = _numbers(made), {}
     for word in words:
         key, _, value = word.partition("=")
         if not value:
-            raise MitsonarError(f"an estimator is NAME or NAME:key=value:key=value: got {text!r}")
+            raise MitsonarError(f"an estimator is NAME or NAME:key=value:key=value: got {':'.join([name, *words])!r}")
         if key not in known:
             raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}")
         try:
             number = float(value)
         except ValueError:
             raise MitsonarError(f"{name}: {key} must be a number: got {value!r}") from None
-        options[known[key]] = math.radians(number) if key.endswith("_deg") else number
-    return create_estimator(name, **options)
+        option, kind = known[key]
+        if "bool" in kind and number not in (0, 1):
+            raise MitsonarError(f"{name}: {key} must be 0 or 1: got {value!r}")
+        options[option] = bool(number) if "bool" in kind else math.radians(number) if key.endswith("_deg") else number
+    return options
 
 
-def _number_options(name: str) -> dict[str, str]:
-    """Options that are numbers, as the command line names them."""
-    parameters = inspect.signature(ESTIMATORS[name]).parameters.values()
-    numbers = [p.name for p in parameters if "float" in str(p.annotation) and "tuple" not in str(p.annotation)]
-    return {option.replace("_rad", "_deg") if option.endswith("_rad") else option: option for option in numbers}
+def _numbers(made: Callable[..., Estimator]) -> dict[str, tuple[str, str]]:
+    """Options that are numbers or yes and no, as the command line names them, with their own name and type."""
+    parameters = inspect.signature(made).parameters.values()
+    kinds = {one.name: str(one.annotation) for one in parameters}
+    numbers = {name: kind for name, kind in kinds.items() if ("float" in kind or kind == "bool") and "tuple" not in kind}
+    return {name.replace("_rad", "_deg") if name.endswith("_rad") else name: (name, kind) for name, kind in numbers.items()}

@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
-from mitsonar.estimation.height import standing_of
 from mitsonar.frames import SonarFrames
 from mitsonar.geometry import GroundGeometry, moved
+from mitsonar.height import standing_of
 from mitsonar.motion import Motion
 from mitsonar.sonar import Bearing
 
@@ -127,7 +127,7 @@ class Flow:
         relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
         match: ``map``, each window by what it knows; or ``vector``, three means and slopes of all windows.
         height_std: how well the height over what is seen is known, as part of it; 0: exactly; default: as
-            :func:`~mitsonar.estimation.height.standing_of` says. Only for ``map``.
+            :func:`~mitsonar.height.standing_of` says. Only for ``map``.
         levels: coarse to fine.
 
     Raises:

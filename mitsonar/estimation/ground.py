@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.height import Standing
 from mitsonar.frames import SonarFrames
 from mitsonar.geometry import GroundGeometry, moved
+from mitsonar.height import Standing
 from mitsonar.motion import Motion
 
 __all__ = ["GroundView"]

@@ -1,0 +1,426 @@
+"""A trained network in one file that explains itself: weights, input, labels, sonar, training, and how well it did."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import zipfile
+from dataclasses import dataclass, field, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mitsonar.dataset.arrangement import LABELS, Labels
+from mitsonar.dataset.pairs import Samples
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.files import write_whole
+from mitsonar.metrics import AXES
+from mitsonar.networks.create import NETWORKS, create_network
+from mitsonar.networks.law import MotionLaw
+from mitsonar.noise import NOISE_MODELS, NoiseModel
+from mitsonar.sonar import Sonar
+
+__all__ = ["FILE", "FORMAT", "WORDS", "Checkpoint"]
+
+FORMAT = 1
+"""Version of what is in the file; a reader knows its own only."""
+
+FILE = "network.ckpt"
+"""Its name in the folder of a training run."""
+
+KIND = "mitsonar checkpoint"
+
+WORDS = {
+    "frames": int,
+    "views": list,
+    "kind": str,
+    "layout": str,
+    "coordinates": str,
+    "cartesian_rows": int,
+    "ground": bool,
+}
+"""The words of :class:`~mitsonar.dataset.pairs.SonarPairs` that say what a network is given, with their types."""
+
+LARGEST = 8 * 2**30
+"""Bytes of a checkpoint once unpacked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A trained network and all that is needed to use it.
+
+    Attributes:
+        network: its name, for :func:`~mitsonar.networks.create.create_network`.
+        options: of it.
+        weights: its state, on the CPU.
+        arrangement: what it is given: the words of :data:`WORDS`.
+        labels: what it says: kind, low, high, names; see :attr:`coder`.
+        sonar: fields of the sonar of each view, by name; empty where the network works with any.
+        stands: how the sonar stood in training: ``height_m`` [low, high] over z = 0, ``pitch_deg``, ``roll_deg``.
+        model: ``thesis`` or ``physical``.
+        noise: of training, as text.
+        data: name of the recipe of the data set.
+        data_recipe: that recipe.
+        recipe: of the training.
+        metrics: of validation by noise level: ``{"none": {"rmse": [sideways mm, forward mm, yaw deg], "pairs": 500}}``;
+            for heights rmse is ``[mm]``.
+        trained: pairs seen, minutes, epochs, seed ...
+        version: of the mitsonar that wrote it.
+        format: :data:`FORMAT`.
+    """
+
+    network: str
+    options: dict[str, Any]
+    weights: dict[str, Tensor] = field(repr=False)
+    arrangement: dict[str, Any]
+    labels: dict[str, Any]
+    sonar: dict[str, dict[str, Any]]
+    stands: dict[str, Any]
+    model: str
+    noise: str
+    data: str
+    data_recipe: dict[str, Any] = field(default_factory=dict)
+    recipe: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    trained: dict[str, Any] = field(default_factory=dict)
+    version: str = field(default_factory=lambda: version("mitsonar"))
+    format: int = FORMAT
+
+    @classmethod
+    def of(cls, network: nn.Module, samples: Samples, **about: Any) -> Self:
+        """The checkpoint of a network of :data:`~mitsonar.networks.create.NETWORKS` as it is now.
+
+        Args:
+            network: whose weights are copied.
+            samples: it was trained on: they tell input, labels, sonar, geometry, noise.
+            about: further fields: recipe, metrics, trained; noise, where it is not that of the samples.
+
+        Raises:
+            MitsonarError: a module that is not one of ours, or a value that a file cannot hold.
+        """
+        names = [name for name, made in NETWORKS.items() if type(network) is made]
+        if not names:
+            raise MitsonarError(
+                f"a checkpoint holds one of our networks: got {type(network).__name__}; make it with create_network, or "
+                "keep its state_dict yourself"
+            )
+        recipe, mount, coder = samples.recipe, samples.recipe.mount, samples.labels
+        sonars = {view.name: view.sonar for view in recipe.views if view.name in samples.arrange.views}
+        told: dict[str, Any] = {
+            "network": names[0],
+            "options": network.options,
+            "weights": {name: values.detach().cpu().clone() for name, values in network.state_dict().items()},
+            "arrangement": _words_of(samples),
+            "labels": {"kind": coder.kind, "low": coder.low, "high": coder.high, "names": coder.names},
+            "sonar": {}
+            if NETWORKS[names[0]].any_sonar
+            else {key: one.model_dump(mode="json") for key, one in sonars.items()},
+            "stands": {
+                "height_m": [height + mount.up_m for height in recipe.flight.heights],
+                "pitch_deg": mount.pitch_deg,
+                "roll_deg": mount.roll_deg,
+            },
+            "model": recipe.instrument.model,
+            "noise": "; ".join(map(_said, samples.arrange.levels or [samples.arrange.noise])),
+            "data": recipe.name,
+            "data_recipe": recipe.model_dump(mode="json"),
+            **about,
+        }
+        return cls(**{key: value if key == "weights" else _plain(value, key) for key, value in told.items()})
+
+    def build(self) -> nn.Module:
+        """The network with its weights, in evaluation mode; torch's random numbers stay as they were.
+
+        Raises:
+            MitsonarError: an unknown network or option, or weights that do not fit it.
+        """
+        written = f"the checkpoint was written by mitsonar {self.version}, this is {version('mitsonar')}"
+        with torch.random.fork_rng(devices=[]):
+            try:
+                network = create_network(self.network, **self.options)
+            except MitsonarError as error:
+                raise MitsonarError(f"{error} ({written})") from None
+            except (RuntimeError, TypeError, ValueError, ArithmeticError) as error:
+                raise MitsonarError(f"no {self.network} has these options, {self.options}: {_first_line(error)}") from None
+        try:
+            network.load_state_dict(self.weights)
+        except RuntimeError as error:
+            raise MitsonarError(
+                f"the weights do not fit a {self.network} with options {self.options}: {_mismatch(error)} ({written})"
+            ) from None
+        return network.eval().requires_grad_(False)
+
+    # ---------------------------------------------------------------- what it says
+
+    @property
+    def coder(self) -> Labels:
+        """From targets to its labels and back."""
+        low, high = (np.array(self.labels[end], dtype=float) for end in ("low", "high"))
+        return Labels(self.labels["kind"], low, high, tuple(self.labels["names"]))
+
+    @property
+    def sonars(self) -> dict[str, Sonar]:
+        """The sonar of each view; empty where the network works with any."""
+        return {name: Sonar.create(**fields) for name, fields in self.sonar.items()}
+
+    @property
+    def fixed(self) -> str:
+        """What training has fixed, in words: ``height 2.5 m, pitch 35 deg``."""
+        low, high = self.stands["height_m"]
+        height = f"{low:g} m" if low == high else f"{low:g}..{high:g} m"
+        roll = f", roll {self.stands['roll_deg']:g} deg" if self.stands["roll_deg"] else ""
+        return f"height {height}, pitch {self.stands['pitch_deg']:g} deg{roll}"
+
+    @property
+    def covariance(self) -> NDArray[np.float64] | None:
+        """Of a motion [m, m, rad] ``(3, 3)``, for networks that do not say it: by the errors in validation, at the noise of
+        training where that was validated, else over all levels. None where they are not known."""
+        known = {level: found.get("rmse") for level, found in self.metrics.items() if isinstance(found, dict)}
+        chosen = [known[self.noise]] if self.noise in known else list(known.values())
+        if not chosen or not all(_are_numbers(rmse, len(AXES)) for rmse in chosen):
+            return None
+        errors = np.array(chosen) / [axis.scale for axis in AXES]
+        return np.diag((errors**2).mean(axis=0))
+
+    def decode(self, answer: Tensor | MotionLaw) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Targets ``(batch, n)`` [m, rad] of what the network answers; covariances ``(batch, n, n)``, if it says them."""
+        if isinstance(answer, MotionLaw):
+            mean, covariance = (values.detach().cpu().double().numpy() for values in answer)
+            return mean, covariance
+        return self.coder.decode(answer.detach().cpu().numpy()), None
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of network, options and weights."""
+        total = hashlib.sha256(f"{self.network} {self.options}".encode())
+        for name, values in sorted(self.weights.items()):
+            total.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+            total.update(values.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+        return total.hexdigest()
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Name and value of what a user wants to know, for a console."""
+        words = self.arrangement
+        shape = [words[word] for word in ("kind", "layout", "coordinates")] + ["ground"] * words["ground"]
+        count = sum(values.numel() for values in self.weights.values())
+        options = "".join(f", {key} {value}" for key, value in self.options.items())
+        sonars = [
+            f"{one.name}, {one.beams} beams, {one.range_bins} bins, {one.range_min:g}..{one.range_max:g} m"
+            for one in self.sonars.values()
+        ]
+        spans = zip(self.labels["names"], self.labels["low"], self.labels["high"], strict=True)
+        rows = [
+            ("network", f"{self.network}{options}"),
+            ("weights", f"{count:,}"),
+            ("input", f"{words['frames']} frames of {', '.join(words['views'])}: {', '.join(shape)}"),
+            ("labels", f"{self.labels['kind']}: " + ", ".join(f"{name} {low:.4g}..{high:.4g}" for name, low, high in spans)),
+            ("sonar", "; ".join(dict.fromkeys(sonars)) or "any"),
+            ("trained on", f"{self.data}, {self.model} model, noise {self.noise}; {self.fixed}"),
+            ("trained for", ", ".join(f"{name} {_number(value)}" for name, value in self.trained.items()) or "not said"),
+        ]
+        for level, found in self.metrics.items():
+            rmse = found.get("rmse") if isinstance(found, dict) else None
+            if isinstance(rmse, list):
+                units = [axis.unit for axis in AXES] if len(rmse) == len(AXES) else ["mm"] * len(rmse)
+                values = " / ".join(f"{value:.3g} {unit}" for value, unit in zip(rmse, units, strict=True))
+                rows.append((f"RMSE, noise {level}", f"{values} in validation"))
+        return [*rows, ("written by", f"mitsonar {self.version}")]
+
+    # ---------------------------------------------------------------- files
+
+    def to_bytes(self) -> bytes:
+        """What the file holds."""
+        table = {one.name: getattr(self, one.name) for one in fields(self)}
+        plain = {key: value if key == "weights" else _plain(value, key) for key, value in table.items()}
+        buffer = io.BytesIO()
+        torch.save({"kind": KIND, **plain}, buffer)
+        return buffer.getvalue()
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, whole or not at all."""
+        write_whole(path, self.to_bytes())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """The checkpoint in a file, or in the folder of a training run. Nothing in the file is executed.
+
+        Raises:
+            MitsonarError: no such file, not a checkpoint, damaged, or of another format.
+        """
+        path = Path(path)
+        if path.is_dir():
+            if not (path / FILE).is_file():
+                raise MitsonarError(
+                    f"{path} holds no {FILE}: give the folder of a training that has validated once, or a checkpoint"
+                )
+            path = path / FILE
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            raise MitsonarError(f"no checkpoint {path}: give a {FILE}, or the folder of `mitsonar train`") from None
+        return cls.from_bytes(content, str(path))
+
+    @classmethod
+    def from_bytes(cls, content: bytes, source: str = "the checkpoint") -> Self:
+        """What :meth:`to_bytes` gave; ``source`` is named in errors.
+
+        Raises:
+            MitsonarError: not a checkpoint, damaged, or of another format.
+        """
+        table = _unpacked(content, source)
+        if table.get("kind") != KIND:
+            lightning = any(str(key).startswith("pytorch-lightning") for key in table)
+            held = "Lightning's state, from which `mitsonar train --resume` goes on" if lightning else "something else"
+            raise MitsonarError(f"{source} is not a checkpoint of mitsonar, it holds {held}: give a {FILE}")
+        if table.get("format") != FORMAT:
+            raise MitsonarError(
+                f"{source} is a checkpoint of format {table.get('format')!r}, written by mitsonar {table.get('version')}; "
+                f"this is mitsonar {version('mitsonar')}, which reads format {FORMAT}: use the version that wrote it, or "
+                "train again"
+            )
+        faults = _faults({key: value for key, value in table.items() if key != "kind"})
+        if faults:
+            raise MitsonarError(f"{source} is damaged: {faults[0]}; train again, or take a copy that is whole")
+        return cls(**{one.name: table[one.name] for one in fields(cls)})
+
+
+def _unpacked(content: bytes, source: str) -> dict[Any, Any]:
+    """The table in a file of torch; its parts are checked, which torch does not do."""
+    buffer = io.BytesIO(content)
+    if not zipfile.is_zipfile(buffer):
+        raise MitsonarError(f"{source} is not a checkpoint, or was cut off: give a {FILE} of `mitsonar train`")
+    try:
+        with zipfile.ZipFile(buffer) as parts:
+            if sum(part.file_size for part in parts.infolist()) > LARGEST:
+                raise MitsonarError(
+                    f"{source} would unpack to more than {LARGEST >> 30} GiB: it is no checkpoint of mitsonar"
+                )
+            wrong = parts.testzip()
+        if wrong is not None:
+            raise ValueError(f"the checksum of {wrong} is wrong")
+        buffer.seek(0)
+        table = torch.load(buffer, map_location="cpu", weights_only=True)
+    except MitsonarError:
+        raise
+    except Exception as error:  # a damaged zip or pickle raises whatever its bytes lead to
+        raise MitsonarError(
+            f"{source} is damaged, or not a checkpoint of mitsonar ({_first_line(error)}): give a {FILE} of `mitsonar train`"
+        ) from None
+    return table if isinstance(table, dict) else {}
+
+
+def _faults(table: dict[Any, Any]) -> list[str]:
+    """What is wrong with the fields of a file, in words."""
+    names = {one.name for one in fields(Checkpoint)}
+    found = [f"it lacks {name}" for name in sorted(names - set(table))]
+    found += [f"{key!r} is unknown" for key in table if key not in names]
+    if found:
+        return found
+    texts, tables = ("network", "model", "noise", "data", "version"), ("options", "arrangement", "labels", "sonar", "stands")
+    found += [f"{name} is not a text" for name in texts if not isinstance(table[name], str)]
+    for name in (*tables, "weights", "data_recipe", "recipe", "metrics", "trained"):
+        if not (isinstance(table[name], dict) and all(isinstance(key, str) for key in table[name])):
+            found.append(f"{name} is not a table")
+    if found:
+        return found
+    for name, values in table["weights"].items():
+        if not isinstance(values, Tensor):
+            found.append(f"weights {name} are not numbers")
+        elif not torch.isfinite(values).all():
+            found.append(f"weights {name} hold nan or inf")
+    words = table["arrangement"]
+    found += [f"arrangement {word} is not said" for word, kind in WORDS.items() if not isinstance(words.get(word), kind)]
+    found += [f"arrangement {word} is unknown ({nearest_names(word, WORDS)})" for word in words if word not in WORDS]
+    if not found and not (words["views"] and all(isinstance(view, str) for view in words["views"])):
+        found.append("arrangement views are not names")
+    return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["stands"])
+
+
+def _faults_of_labels(labels: dict[str, Any]) -> list[str]:
+    ends, names = [labels.get("low"), labels.get("high")], labels.get("names")
+    if labels.get("kind") not in LABELS:
+        return [f"labels are {labels.get('kind')!r}, not one of {', '.join(LABELS)}"]
+    if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
+        return ["labels have no names"]
+    if not all(_are_numbers(end, len(names)) for end in ends):
+        return ["the limits of the labels are not numbers, one a name"]
+    return []
+
+
+def _faults_of_sonar(sonar: dict[str, Any], stands: dict[str, Any]) -> list[str]:
+    for view, own in sonar.items():
+        if not isinstance(own, dict):
+            return [f"sonar {view} is not a table"]
+        try:
+            Sonar.create(**own)
+        except (MitsonarError, TypeError) as error:
+            return [f"sonar {view}: {error}"]
+    angles = [stands.get("pitch_deg"), stands.get("roll_deg")]
+    if not (_are_numbers(stands.get("height_m"), 2) and _are_numbers(angles, 2)):
+        return ["stands must hold height_m (low, high), pitch_deg and roll_deg"]
+    return []
+
+
+def _are_numbers(values: Any, count: int) -> bool:
+    """Whether this is a list of so many finite numbers."""
+    numbers = isinstance(values, list) and len(values) == count
+    return numbers and all(type(value) in (int, float) and math.isfinite(value) for value in values)
+
+
+def _words_of(samples: Samples) -> dict[str, Any]:
+    """The words of :data:`WORDS` that samples were made with."""
+    arrange = samples.arrange
+    rows = {conversion.index.shape[1] for conversion in arrange.maps.values()}
+    return {
+        "frames": samples.frames,
+        "views": list(arrange.views),
+        "kind": arrange.kind,
+        "layout": arrange.layout,
+        "coordinates": arrange.coordinates,
+        "cartesian_rows": rows.pop() if rows else 512,
+        "ground": samples.ground,
+    }
+
+
+def _said(noise: NoiseModel) -> str:
+    names = [name for name, model in NOISE_MODELS.items() if model == noise]
+    return names[0] if names else f"{noise.mean:g},{noise.std:g},{noise.scale:g}"
+
+
+def _plain(value: Any, name: str) -> Any:
+    """Numbers, texts, lists and tables only.
+
+    Raises:
+        MitsonarError: something else.
+    """
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, list | tuple):
+        return [_plain(one, name) for one in value]
+    if isinstance(value, dict):
+        return {str(key): _plain(one, name) for key, one in value.items()}
+    raise MitsonarError(f"{name} of a checkpoint holds numbers, texts, lists and tables only: got {value!r}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _mismatch(error: RuntimeError) -> str:
+    """What torch says of the first weight that does not fit."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join((lines[1] if len(lines) > 1 else lines[0]).split())[:300]
+
+
+def _number(value: Any) -> str:
+    return f"{value:,.4g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)

@@ -1,0 +1,79 @@
+"""All networks by name."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from torch import Tensor, nn
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.networks.cnn1b import Cnn1b
+from mitsonar.networks.cnn4b import Cnn4b
+from mitsonar.networks.cnn4posenet import Cnn4PoseNet
+from mitsonar.networks.corrnet import CorrNet
+from mitsonar.networks.posenet import PoseNet
+from mitsonar.networks.posenet_dual import PoseNetDual
+from mitsonar.networks.sfmnet import SfMNet
+
+__all__ = ["NETWORKS", "create_network", "options_for", "options_of"]
+
+NETWORKS: dict[str, Any] = {
+    "posenet": PoseNet,
+    "sfmnet": SfMNet,
+    "cnn1b": Cnn1b,
+    "cnn4b": Cnn4b,
+    "cnn4posenet": Cnn4PoseNet,
+    "posenet_dual": PoseNetDual,
+    "corrnet": CorrNet,
+}
+"""Classes of networks; of each: ``needs``, ``any_sonar``, ``says_law``, as in :class:`~mitsonar.networks.blocks.Network`."""
+
+
+def create_network(name: str, **options: Any) -> nn.Module:
+    """The network of that name, with weights drawn from torch's generator.
+
+    Args:
+        name: of :data:`NETWORKS`.
+        options: of that network; see its class. Those of the thesis's networks are outputs, width, dropout, size and, where
+            frames may come as channels, channels.
+
+    Raises:
+        MitsonarError: unknown name or option, or a value out of its range.
+    """
+    known = options_of(name)
+    for option in options:
+        if option not in known:
+            raise MitsonarError(f"unknown option {option!r} of {name}: {nearest_names(option, known)}")
+    network: nn.Module = NETWORKS[name](**options)
+    return network
+
+
+def options_of(name: str) -> list[str]:
+    """The options of the network of that name.
+
+    Raises:
+        MitsonarError: unknown name.
+    """
+    if name not in NETWORKS:
+        raise MitsonarError(f"unknown network {name!r}: {nearest_names(str(name), NETWORKS)}")
+    return list(inspect.signature(NETWORKS[name]).parameters)
+
+
+def options_for(name: str, inputs: Any, labels: Tensor) -> dict[str, Any]:
+    """The options of a network that samples settle: number of labels, sizes and channels of the input.
+
+    Args:
+        name: of :data:`NETWORKS`.
+        inputs: of a batch, as :class:`~mitsonar.dataset.pairs.SonarPairs` gives them: one tensor or a tuple.
+        labels: ``(batch, outputs)``.
+
+    Raises:
+        MitsonarError: unknown name.
+    """
+    first, *others = inputs if isinstance(inputs, tuple) else (inputs,)
+    settled: dict[str, Any] = {"outputs": labels.shape[-1], "size": list(first.shape[-2:]), "channels": first.shape[-3]}
+    if others and isinstance(others[0], Tensor):
+        settled["cartesian_size"] = list(others[0].shape[-2:])
+    known = options_of(name)
+    return {option: value for option, value in settled.items() if option in known}

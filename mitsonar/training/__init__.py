@@ -1,0 +1,1 @@
+"""Training of networks, their evaluation, and the thesis's tables again."""

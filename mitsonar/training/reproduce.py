@@ -1,0 +1,413 @@
+"""A table of the thesis again: data made at a scale, its rows trained and evaluated one after the other, all on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import platform
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from mitsonar.dataset.generate import make
+from mitsonar.dataset.place import Place
+from mitsonar.dataset.recipe import Recipe, load_recipe, recipe_from
+from mitsonar.errors import MitsonarError, complaint
+from mitsonar.files import read_json, write_json, write_whole
+from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.training.evaluation import evaluate
+from mitsonar.training.recipe import TrainingRecipe, load_training_recipe, training_recipe_from
+from mitsonar.training.run import Report, train
+from mitsonar.training.tables import (
+    NOISES,
+    Found,
+    Reached,
+    Score,
+    load_tables,
+    plain_table,
+    rows_named,
+    table_figure,
+    table_lines,
+    table_named,
+)
+
+__all__ = ["Effort", "Watch", "reproduce"]
+
+ABOUT = "reproduce.json"
+"""What the folder was begun with."""
+
+FORMAT = 1
+"""Version of a folder."""
+
+UNSEEN_SEED = 7919
+"""Added to a data set's seed: worlds that training never saw."""
+
+UNSEEN_SEQUENCES = (100, 1000)
+"""Fewest (ten scenes, if the recipe has as many) and most sequences of unseen scenes; between, a twentieth of training's."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What is spent on each row; a folder has one and keeps it.
+
+    Attributes:
+        scale: part of the recipe's sequences that are made, 0..1.
+        minutes: of training at most; None: until the recipe's epochs are done.
+        batch: samples of a step instead of the recipe's; Adam's rate grows with its square root. None: the recipe's.
+        changes: keys of the training recipes to change, dots between the levels.
+
+    Raises:
+        MitsonarError: values outside these limits.
+    """
+
+    scale: float = 0.02
+    minutes: float | None = 30.0
+    batch: int | None = None
+    changes: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.scale <= 1:
+            raise MitsonarError(f"scale is a part of the thesis's data, above 0 and at most 1: got {self.scale:g}")
+        if self.minutes is not None and not (self.minutes > 0 and math.isfinite(self.minutes)):
+            raise MitsonarError(f"minutes of training of a row must be above 0: got {self.minutes:g}")
+        if self.batch is not None and self.batch < 1:
+            raise MitsonarError(f"a batch has 1 sample or more: got {self.batch}")
+
+    def recipe(self, name: str) -> TrainingRecipe:
+        """The training recipe of that name, changed as this says.
+
+        Raises:
+            MitsonarError: keys that it has not, values outside their limits.
+        """
+        recipe = load_training_recipe(name, self.changes)
+        if self.batch is None or self.batch == recipe.batch:
+            return recipe
+        rate = recipe.optimiser.rate * math.sqrt(self.batch / recipe.batch)
+        return recipe.replace(batch=self.batch, optimiser=recipe.optimiser.model_dump() | {"rate": rate})
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON gives it back."""
+        return dict(json.loads(json.dumps(asdict(self))))
+
+    def sentence(self) -> str:
+        """For people."""
+        said = [f"scale {self.scale:g} of the recipes' data"]
+        said.append("all epochs" if self.minutes is None else f"at most {self.minutes:g} minutes of training a row")
+        if self.batch is not None:
+            said.append(f"batches of {self.batch}, the rate scaled by the square root")
+        if self.changes:
+            said.append("recipes changed: " + ", ".join(f"{key} {json.dumps(value)}" for key, value in self.changes.items()))
+        return "; ".join(said)
+
+
+Told = Callable[[int], None]
+"""Called with how many more are done."""
+
+
+class Watch(Protocol):
+    """Who is told how far things are."""
+
+    def begin(self, what: str, total: int, unit: str) -> Told:
+        """Something begins that has so many parts."""
+
+    def training(self, what: str) -> AbstractContextManager[tuple[Callable[[Report], None], Callable[[], bool]]]:
+        """While a network is trained; yields what is called after each step, and what is asked then: whether to stop."""
+
+
+class Nobody:
+    """A watch that nobody keeps."""
+
+    def begin(self, what: str, total: int, unit: str) -> Told:
+        """Nothing is told."""
+        return lambda done: None
+
+    @contextmanager
+    def training(self, what: str) -> Iterator[tuple[Callable[[Report], None], Callable[[], bool]]]:
+        """Nothing is told, and training goes on."""
+        yield lambda report: None, lambda: False
+
+
+def reproduce(
+    table: str,
+    out: str | Path,
+    effort: Effort,
+    *,
+    rows: list[str] | None = None,
+    workers: int = 1,
+    accelerator: str = "auto",
+    devices: str | int = "auto",
+    watch: Watch | None = None,
+) -> dict[str, Any]:
+    """Make the data of a table's rows, train each, evaluate it, and write the table; or go on with one that was broken off.
+
+    ``out`` holds ``table.md``, ``table.json`` and ``table-NUMBER.png``, written anew after each row; ``data/``, one data set
+    for all rows that learn from the same, and one of unseen scenes; ``runs/``, one training a row; ``rows/``, what each
+    row reached. Other tables may be asked for in the same folder: a row that is in both is trained once.
+
+    Args:
+        table: its number.
+        out: the folder.
+        effort: what is spent on each row.
+        rows: names of recipes; default: all of the table.
+        workers: processes that render.
+        accelerator: Lightning's word.
+        devices: Lightning's word.
+        watch: who is told how far things are.
+
+    Returns:
+        What ``table.json`` holds.
+
+    Raises:
+        MitsonarError: unknown names; a folder that holds other things, or was begun with other numbers or recipes.
+    """
+    asked = rows_named(table_named(table), rows)
+    recipes = {row.recipe: effort.recipe(row.recipe) for row in asked}
+    data = {name: load_recipe(recipe.data, recipe.data_changes) for name, recipe in recipes.items()}
+    crew = Crew(workers, accelerator, devices, watch or Nobody())
+    with Place(out).locked():
+        bench = Bench.begun(Path(out), effort)
+        bench.ask(table, recipes)
+        report = bench.report()
+        for name, recipe in recipes.items():
+            if name not in bench.found():
+                bench.work(name, recipe, data[name], crew)
+                report = bench.report()
+    return report
+
+
+class About(BaseModel):
+    """What ``reproduce.json`` holds: the effort, the tables that are wanted, and the recipes of the rows that were begun."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: int
+    version: str
+    scale: float
+    minutes: float | None
+    batch: int | None
+    changes: dict[str, Any]
+    tables: list[str]
+    recipes: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Who does the work, which changes nothing in the folder: see :func:`reproduce`."""
+
+    workers: int
+    accelerator: str
+    devices: str | int
+    watch: Watch
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The folder.
+
+    Attributes:
+        folder: where it is.
+        effort: what it was begun with.
+    """
+
+    folder: Path
+    effort: Effort
+
+    @classmethod
+    def begun(cls, folder: Path, effort: Effort) -> Bench:
+        """A new folder, or the one that is there, if it was begun alike.
+
+        Raises:
+            MitsonarError: it was not, or holds other things.
+        """
+        path = folder / ABOUT
+        if not path.exists():
+            others = [name for name in Place(folder).sizes() if name != f".{ABOUT}.part"]
+            if others:
+                raise MitsonarError(f"{folder} holds other things ({others[0]}) and is kept: choose another -o")
+            about = About(format=FORMAT, version=version("mitsonar"), **effort.plain(), tables=[], recipes={})
+            write_json(path, about.model_dump())
+            return cls(folder, effort)
+        if read_json(path).get("format") != FORMAT:
+            raise MitsonarError(f"{path} is not of format {FORMAT}, which this mitsonar reads: choose another -o")
+        bench = cls(folder, effort)
+        had = bench.about()
+        differ = [
+            f"{key} {getattr(had, key)}, not {value}" for key, value in effort.plain().items() if getattr(had, key) != value
+        ]
+        if differ:
+            raise MitsonarError(f"{folder} was begun with {'; '.join(differ)}: ask for the same, or choose another -o")
+        return bench
+
+    def about(self) -> About:
+        """What the folder was begun with.
+
+        Raises:
+            MitsonarError: the file is damaged.
+        """
+        path = self.folder / ABOUT
+        try:
+            return About(**read_json(path))
+        except ValidationError as error:
+            raise MitsonarError(f"{path} is damaged: {complaint(error, About, 'file')}") from None
+
+    def ask(self, table: str, recipes: dict[str, TrainingRecipe]) -> None:
+        """Keep which tables are wanted, and the recipes of their rows.
+
+        Raises:
+            MitsonarError: a row was begun with another recipe.
+        """
+        about = self.about()
+        for name, recipe in recipes.items():
+            had = about.recipes.get(name)
+            other = None if had is None else training_recipe_from(had).differs(recipe)
+            if other is not None:
+                raise MitsonarError(f"row {name} of {self.folder} was begun with {other}: choose another -o")
+        tables = [name for name in load_tables() if name == table or name in about.tables]
+        begun = about.recipes | {name: recipe.plain() for name, recipe in recipes.items()}
+        write_json(self.folder / ABOUT, about.model_copy(update={"tables": tables, "recipes": begun}).model_dump())
+
+    def work(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
+        """Data, training and evaluation of one row; each stays on disk when it is done, and is not done again."""
+        sequences = max(1, round(self.effort.scale * data.sequences))
+        few, most = UNSEEN_SEQUENCES
+        fresh = min(data.sequences, max(few, min(most, sequences // 20)))
+        named = {"name": f"{data.name}-unseen", "seed": (data.seed + UNSEEN_SEED) % 2**31}
+        other = recipe_from({**data.model_dump(mode="json"), **named})
+        seen, unseen = self._made(data, sequences, crew), self._made(other, fresh, crew)
+        checkpoint = self._trained(name, recipe, seen, crew)
+        scores = [
+            _scores(evaluate(checkpoint, url, noise=list(NOISES), part=part, begin=_teller(crew.watch, f"{name}, {said}")))
+            for url, part, said in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
+        ]
+        reached = _reached(checkpoint, recipe, self._run(name) / "run.json")
+        found = Found(recipe=name, validation=scores[0], unseen=scores[1], reached=reached)
+        (self.folder / "rows").mkdir(exist_ok=True)
+        write_json(self.folder / "rows" / f"{name}.json", found.model_dump(mode="json"))
+
+    def _made(self, data: Recipe, sequences: int, crew: Crew) -> Path:
+        """A data set; all rows of the same recipe read the same one."""
+        digest = hashlib.sha256(data.model_dump_json().encode()).hexdigest()[:8]
+        path = self.folder / "data" / f"{data.name}-{digest}.zarr"
+        told: list[Told] = []
+
+        def begun(frames: int, done: int) -> None:
+            told.append(crew.watch.begin(f"rendering {path.stem}", frames, "frames"))
+            told[0](done)
+
+        make(data, str(path), sequences=sequences, workers=crew.workers, begun=begun, progress=lambda more: told[0](more))
+        return path
+
+    def _run(self, name: str) -> Path:
+        return self.folder / "runs" / name
+
+    def _trained(self, name: str, recipe: TrainingRecipe, data: Path, crew: Crew) -> Checkpoint:
+        """The network of a row; what a kill left of a run before it had begun is removed."""
+        run = self._run(name)
+        if run.exists() and not (run / "run.json").exists():
+            shutil.rmtree(run)
+        words: dict[str, Any] = {"minutes": self.effort.minutes, "accelerator": crew.accelerator, "devices": crew.devices}
+        with crew.watch.training(name) as (progress, stop):
+            return train(recipe, data, run, resume=run.exists(), progress=progress, stop=stop, **words)
+
+    def found(self) -> dict[str, Found]:
+        """Rows that are done.
+
+        Raises:
+            MitsonarError: a file that is damaged.
+        """
+        rows = {}
+        for path in sorted((self.folder / "rows").glob("*.json")):
+            try:
+                rows[path.stem] = Found(**read_json(path))
+            except (ValidationError, TypeError) as error:
+                said = complaint(error, Found, "row") if isinstance(error, ValidationError) else str(error)
+                raise MitsonarError(f"{path} is damaged ({said}): remove it, and the row is evaluated again") from None
+        return rows
+
+    def report(self) -> dict[str, Any]:
+        """Write the tables and figures of what there is."""
+        about, found = self.about(), self.found()
+        tables = [table_named(name) for name in about.tables]
+        lines = [f"`mitsonar reproduce`, mitsonar {version('mitsonar')}: {self.effort.sentence()}."]
+        for table in tables:
+            lines += ["", *table_lines(table, found)]
+            figure = table_figure(table, found, title=f"Table {table.name}, {table.title}; {self.effort.sentence()}")
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format="png", dpi=80)
+            write_whole(self.folder / f"table-{table.name}.png", buffer.getvalue())
+        report = {**about.model_dump(), "tables": {table.name: plain_table(table, found) for table in tables}}
+        write_whole(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
+        write_json(self.folder / "table.json", report)
+        return report
+
+
+def _teller(watch: Watch, what: str) -> Callable[[int], Told]:
+    """For :func:`~mitsonar.training.evaluation.evaluate`."""
+    return lambda total: watch.begin(f"evaluating {what}", total, "pairs")
+
+
+def _scores(report: dict[str, Any]) -> dict[str, Score]:
+    """What an evaluation found, by noise."""
+    scores = {}
+    for table in report["tables"]:
+        row = next(row for row in table["rows"] if row["method"] == report["network"])
+        scores[table["noise"]] = Score(
+            pairs=report["pairs"],
+            scenes=report["scenes"],
+            low=row["rmse_low"],
+            high=row["rmse_high"],
+            **{key: row[key] for key in ("rmse", "slope", "zero")},
+        )
+    return scores
+
+
+def _reached(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Reached:
+    """The scale of a training that has ended, from what it wrote.
+
+    Raises:
+        MitsonarError: that file is damaged.
+    """
+    try:
+        return _as_told(checkpoint, recipe, read_json(path))
+    except (KeyError, TypeError, ZeroDivisionError, ValidationError) as error:
+        raise MitsonarError(f"{path} is damaged ({error}): remove its folder, and the row is trained again") from None
+
+
+def _as_told(checkpoint: Checkpoint, recipe: TrainingRecipe, run: dict[str, Any]) -> Reached:
+    seen = run["steps_done"] * recipe.batch
+    machine = run["machine"]
+    return Reached(
+        training_pairs=run["epoch_samples"],
+        pairs_seen=seen,
+        pairs_best=checkpoint.trained["pairs"],
+        epochs=seen / run["epoch_samples"],
+        epochs_asked=run["steps"] * recipe.batch / run["epoch_samples"],
+        minutes=run["minutes"],
+        device=machine["gpu"] if "CUDA" in run["accelerator"] else "CPU",
+        machine=f"{_processor()}, {machine['cores']} cores",
+        threads=run["threads"],
+        batch=recipe.batch,
+        rate=recipe.optimiser.rate,
+        precision=recipe.precision,
+        split=recipe.split if isinstance(recipe.split, str) else str(recipe.split["by"]),
+        date=date.today().isoformat(),
+    )
+
+
+def _processor() -> str:
+    """The name of this machine's processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
