@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import array_namespace, device, is_array_api_obj
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
@@ -166,7 +166,7 @@ def moved(points: Any, motion: Any) -> Any:
     NumPy or torch; the motion is three numbers, or an array like the points whose leading axes go with theirs.
     """
     xp = array_namespace(points)
-    motion = xp.asarray(motion, dtype=points.dtype)
+    motion = xp.astype(motion if is_array_api_obj(motion) else xp.asarray(motion), points.dtype, copy=False)
     sideways, forward, yaw = (motion[..., k] for k in range(3))
     cos, sin = xp.cos(yaw), xp.sin(yaw)
     x, y = points[..., 0], points[..., 1]

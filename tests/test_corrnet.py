@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from mitsonar.dataset.ground import NODES, ground_at
 from mitsonar.errors import MitsonarError
@@ -14,6 +13,8 @@ from mitsonar.networks import create_network
 
 torch = pytest.importorskip("torch")
 corrnet = pytest.importorskip("mitsonar.networks.corrnet")
+look = pytest.importorskip("mitsonar.networks.look")
+matching = pytest.importorskip("mitsonar.networks.matching")
 law = pytest.importorskip("mitsonar.networks.law")
 augment = pytest.importorskip("mitsonar.training.augment")
 
@@ -56,7 +57,7 @@ def seen_pair(motion: np.ndarray, noise: float = 0.0, bearing: str = "azimuth") 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 def test_displacements_are_those_of_the_exact_geometry(bearing: str) -> None:
     ground = batch(bearing)
-    found = corrnet.displacement(ground, torch.tensor(MOTION[None], dtype=torch.float32))[0].numpy()
+    found = look.displacement(ground, torch.tensor(MOTION[None], dtype=torch.float32))[0].numpy()
     nodes = [
         np.interp(np.linspace(0, len(a) - 1, n), np.arange(len(a)), a) for a, n in zip((RANGE, BEARING), NODES, strict=True)
     ]
@@ -73,20 +74,20 @@ def test_displacements_are_those_of_the_exact_geometry(bearing: str) -> None:
 def test_cells_have_the_geometry_of_their_middles() -> None:
     ground, size = batch(), (len(RANGE), len(BEARING))
     unit = corrnet._units(ground)
-    look = corrnet.Look(ground, unit, (8, 1), size, (size[0] // 8, size[1]), None)
+    cells = look.Look(ground, unit, (8, 1), size, (size[0] // 8, size[1]), None)
     motion = torch.tensor(MOTION[None], dtype=torch.float32) / unit
-    shift = look._shift(motion)[0].numpy()
+    shift = cells._shift(motion)[0].numpy()
     middle = RANGE.reshape(-1, 8).mean(axis=1)
     exact = GroundGeometry(middle, BEARING, "azimuth", STAND["height_m"], STAND["pitch_rad"], STAND["roll_rad"])
     radius, angle = exact.see(moved(exact.points, MOTION))
     assert shift[0] == pytest.approx((radius - middle[:, None]) / (8 * (RANGE[1] - RANGE[0])), abs=1e-3)
     assert shift[1] == pytest.approx((angle - BEARING) / (BEARING[1] - BEARING[0]), abs=3e-3)
-    linear = (look.derivative[0] * motion[0, None, :, None, None]).sum(dim=1).numpy()
+    linear = (cells.derivative[0] * motion[0, None, :, None, None]).sum(dim=1).numpy()
     assert linear == pytest.approx(shift, abs=float(0.02 * np.abs(shift).max()))
 
 
 def test_weights_of_nodes_draw_straight_lines_exactly() -> None:
-    weights = corrnet._from_nodes(17, 512, 8, 64, torch.device("cpu")).numpy()
+    weights = look._from_nodes(17, 512, 8, 64, torch.device("cpu")).numpy()
     assert weights.sum(axis=1) == pytest.approx(np.ones(64))
     assert weights @ np.linspace(0, 511, 17) == pytest.approx(np.arange(64) * 8 + 3.5, abs=1e-4)
 
@@ -106,23 +107,12 @@ def test_the_derivative_of_correlations_is_torchs() -> None:
     torch.manual_seed(0)
     one = torch.rand(2, 3, 4, 5, dtype=torch.float64, requires_grad=True)
     wide = torch.rand(2, 3, 6, 9, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(corrnet._Correlations.apply, (one, wide))
+    assert torch.autograd.gradcheck(matching._Correlations.apply, (one, wide))
     weight = torch.rand(2, 15, 4, 5, dtype=torch.float64)
-    own = torch.autograd.grad((corrnet._Correlations.apply(one, wide) * weight).sum(), (one, wide))
-    other = torch.autograd.grad((corrnet._correlations(one, wide) * weight).sum(), (one, wide))
+    own = torch.autograd.grad((matching._Correlations.apply(one, wide) * weight).sum(), (one, wide))
+    other = torch.autograd.grad((matching._correlations(one, wide) * weight).sum(), (one, wide))
     for a, b in zip(own, other, strict=True):
         assert torch.allclose(a, b)
-
-
-def test_likelihood_is_that_of_a_gaussian() -> None:
-    rng = np.random.default_rng(2)
-    mean, target = rng.normal(size=(2, 5, 3)) * law.SCALE
-    factor = rng.normal(size=(5, 3, 3)) * np.array(law.SCALE)[:, None]
-    covariance = factor @ factor.swapaxes(1, 2) + np.diag(np.square(law.SCALE))
-    said = law.MotionLaw(torch.tensor(mean), torch.tensor(covariance))
-    expected = [-multivariate_normal(m, c).logpdf(t) for m, c, t in zip(mean, covariance, target, strict=True)]
-    constant = 1.5 * np.log(2 * np.pi) + np.log(law.SCALE).sum()
-    assert float(law.likelihood(said, torch.tensor(target))) == pytest.approx(np.mean(expected) - constant, rel=1e-6)
 
 
 def test_later_iterations_count_more() -> None:
@@ -162,7 +152,7 @@ def test_it_learns() -> None:
     rng = np.random.default_rng(0)
     motions = rng.uniform(-1, 1, (4, 3)) * [0.02, 0.02, np.radians(0.45)]
     images = torch.cat([seen_pair(motion, noise=0.1) for motion in motions])
-    network, ground, target = create_network("corrnet", looks=1), batch(count=4), torch.tensor(motions, dtype=torch.float32)
+    network, ground, target = create_network("corrnet", finer=1), batch(count=4), torch.tensor(motions, dtype=torch.float32)
     optimiser = torch.optim.AdamW(network.parameters(), lr=5e-4)
     losses = []
     for _ in range(14):
@@ -186,7 +176,7 @@ def test_images_that_are_too_small_or_no_pairs_are_refused(shape: tuple[int, ...
         create_network("corrnet")(torch.zeros(shape), batch())
 
 
-@pytest.mark.parametrize("options", [{"width": 0}, {"looks": 0}, {"looks": 1.5}, {"width": "half"}])
+@pytest.mark.parametrize("options", [{"width": 0}, {"looks": -1}, {"looks": 1.5}, {"width": "half"}])
 def test_options_that_no_network_can_have(options: dict[str, object]) -> None:
     with pytest.raises(MitsonarError, match="corrnet takes"):
         create_network("corrnet", **options)

@@ -346,6 +346,7 @@ def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: P
     assert best[0].digest == best[1].digest
 
 
+@pytest.mark.slow
 def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**TINY, "scenes": [{"count": 1, "sequences": 4}]}))
     told = tmp_path / "mine.yaml"
@@ -555,9 +556,9 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
         if report.step == 9:
             os.kill(os.getpid(), signal.SIGINT)
 
-    from mitsonar.cli.train import _asked_to_stop
+    from mitsonar.cli.train import asked_to_stop
 
-    with _asked_to_stop() as stop, pytest.raises(KeyboardInterrupt):
+    with asked_to_stop() as stop, pytest.raises(KeyboardInterrupt):
         train(told, made, out, progress=interrupt, stop=stop, threads=1)
     assert torch.load(out / "last.ckpt", weights_only=True)["global_step"] in (9, 10)
     train(told, made, out, resume=True, threads=1)
@@ -583,3 +584,16 @@ def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert Checkpoint.load(tmp_path / "run").trained["pairs"] % 8 == 0
     assert torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["global_step"] == 20
+
+
+def test_a_training_begins_with_the_weights_that_it_is_told(made: Path, whole: Path, tmp_path: Path) -> None:
+    """One step at no rate to speak of leaves them; those of another network are refused."""
+    kept = Checkpoint.load(whole).build().state_dict()
+    told = {"start": str(whole), "seed": 5, "steps": 1, "optimiser": {"rate": 1e-12}}
+    again = train(recipe(**told), made, tmp_path / "again", threads=1, workers=0).build().state_dict()
+    other = train(recipe(**{**told, "start": None}), made, tmp_path / "other", threads=1, workers=0).build().state_dict()
+    learnt = [name for name in kept if "running" not in name and "num_batches" not in name]
+    assert all(torch.allclose(again[name], kept[name], atol=1e-9) for name in learnt)
+    assert not all(torch.allclose(other[name], kept[name], atol=1e-3) for name in learnt)
+    with pytest.raises(MitsonarError, match="start holds the weights of posenet"):
+        train(recipe(**told, network={"name": "sfmnet", "width": 1 / 16}), made, tmp_path / "no")

@@ -200,7 +200,8 @@ def curve_figure(rows: list[dict[str, Any]], zero: list[float], axes: tuple[Axis
             panel.plot(pairs, curve, marker=".", label=f"noise {level}")
         panel.axhline(still, color="0.6", linestyle=":", label="no motion" if len(axes) > 1 else "zero")
         panel.set(title=f"validation, {axis.name}", ylabel=f"RMSE ({axis.unit})", yscale="log")
-        panel.set_ylim(min(np.min(curves), still / 5) / 1.2, max(np.max(curves), still) * 1.2)
+        if min(np.min(curves), still) > 0:
+            panel.set_ylim(min(np.min(curves), still / 5) / 1.2, max(np.max(curves), still) * 1.2)
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         panel.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         panel.yaxis.set_minor_formatter(NullFormatter())

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from mitsonar.dataset.arrangement import Labels
 from mitsonar.errors import MitsonarError
 from mitsonar.metrics import AXES, Axis
+from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import NETWORKS, create_network, options_for
 from mitsonar.networks.law import MotionLaw
 from mitsonar.training.augment import augmented
@@ -68,6 +69,8 @@ def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
         network = create_network(name, **{**options_for(name, inputs, labels), **options})
+    if recipe.start is not None:
+        _begin_with(network, name, Checkpoint.load(recipe.start))
     try:
         with torch.no_grad():
             shape = said(called(network.eval(), inputs), material.samples.labels).shape
@@ -85,6 +88,21 @@ def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
             f"({', '.join(material.samples.labels.names)}): leave out its outputs, or set it to {labels.shape[1]}"
         )
     return network.train()
+
+
+def _begin_with(network: nn.Module, name: str, checkpoint: Checkpoint) -> None:
+    """Take the weights of a network that has learnt before.
+
+    Raises:
+        MitsonarError: they are another network's.
+    """
+    told: dict[str, Any] = network.options  # type: ignore[assignment]
+    if checkpoint.network != name or checkpoint.options != told:
+        raise MitsonarError(
+            f"start holds the weights of {checkpoint.network} {checkpoint.options}, the recipe is of {name} {told}: give a "
+            "checkpoint of the same network"
+        )
+    network.load_state_dict(checkpoint.build().state_dict())
 
 
 class NetworkTraining(lightning.LightningModule):

@@ -118,6 +118,7 @@ class TrainingRecipe(_Part):
 
     about: str = Field("", description="a sentence on it")
     network: dict[str, Any] = Field(description="name of the network, or name and options: {name: posenet, width: 0.25}")
+    start: str | None = Field(None, description="checkpoint or run with whose weights it begins; null: drawn at random")
     data: str = Field("rocky-field", description="data set recipe, name or file, for --render and reproduce")
     data_changes: dict[str, Any] = Field(default_factory=dict, description="keys of it to change: {sonar.range_bins: 256}")
     part_of_data: float = Field(1.0, gt=0, le=1, description="only samples of the first so large a part of the frames")

@@ -1,0 +1,133 @@
+"""Cells matched by correlation: how far each is displaced, how sure that is, and the step of the motion that they tell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mitsonar.networks.look import Look
+
+__all__ = ["Matching", "Pair", "quiet"]
+
+Pair = tuple[Tensor, ...]
+"""Cells of the first and of the second frame."""
+
+FAINT = 1e-2
+"""Mean square of a description below which it counts as nothing."""
+
+
+class Matching(nn.Module):
+    """Displacement of each cell and its information, from the correlation with the cells around its place.
+
+    Args:
+        reach: cells searched each way, along range and beams.
+        channels: of the descriptions.
+        hidden: channels of the layers between.
+    """
+
+    def __init__(self, reach: tuple[int, int], channels: int, hidden: int) -> None:
+        super().__init__()
+        self.reach = reach
+        down, across = (torch.arange(-far, far + 1.0) for far in reach)
+        places = torch.stack([down.repeat_interleave(len(across)), across.repeat(len(down))])
+        self.places: Tensor
+        self.register_buffer("places", places[:, :, None, None], persistent=False)
+        count = places.shape[1]
+        self.sharpness = nn.Parameter(torch.tensor(2.0))
+        self.smooth = nn.Conv2d(count, count, 3, padding=1, bias=False)
+        self.judge = nn.Sequential(
+            nn.Conv2d(count + 2, hidden, 1),
+            nn.ReLU(),
+            nn.Conv2d(hidden, hidden, 3, padding=1),
+            nn.ReLU(),
+            quiet(nn.Conv2d(hidden, count + 3, 1)),
+        )
+        with torch.no_grad():  # at first correlations are averaged over 3 x 3 cells, and nothing is judged
+            self.smooth.weight.zero_()
+            self.smooth.weight[range(count), range(count)] = 1 / 9
+
+    def forward(self, cells: Pair, look: Look, motion: Tensor) -> tuple[Tensor, Tensor]:
+        """A better motion ``(batch, 3)`` in units, and the normal matrix ``(batch, 3, 3)`` behind it.
+
+        Args:
+            cells: descriptions of both frames ``(batch, channels, rows, columns)``.
+            look: where these cells are.
+            motion: found so far.
+        """
+        second, inside = look.draw(cells[1], motion)
+        displaced, sure = self.displaced(cells[0], second)
+        l11, l22, l21 = (sure * inside[:, None]).unbind(dim=1)
+        down, across = look.derivative.unbind(dim=1)
+        # rows of L' J and of L' d
+        rows = torch.stack([l11[:, None] * down + l21[:, None] * across, l22[:, None] * across], dim=2)
+        wanted = torch.stack([l11 * displaced[:, 0] + l21 * displaced[:, 1], l22 * displaced[:, 1]], dim=1)
+        step, normal = look.solved(rows, wanted)
+        return motion + step, normal
+
+    def displaced(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """Displacements ``(batch, 2, rows, columns)`` [cells], and the factor L of their information L L'
+        ``(batch, 3, rows, columns)``: its 11, 22 and 21."""
+        one, one_size = _unit_descriptions(first)
+        other, other_size = _unit_descriptions(second)
+        volume = self._volume(one, other)
+        judged = self.judge(torch.cat([volume, one_size, other_size], dim=1))
+        count = volume.shape[1]
+        share = torch.softmax(torch.exp(self.sharpness) * self.smooth(volume) + judged[:, :count], dim=1)
+        moved_by = torch.stack([(share * place).sum(dim=1) for place in self.places], dim=1)
+        sure = functional.softplus(judged[:, count : count + 2] - 1)
+        return moved_by, torch.cat([sure, 0.3 * judged[:, count + 2 :]], dim=1)
+
+    def _volume(self, one: Tensor, other: Tensor) -> Tensor:
+        """Correlations ``(batch, places, rows, columns)`` of each cell with the cells around its place."""
+        down, across = self.reach
+        wide = functional.pad(other, (across, across, down, down))
+        if torch.is_grad_enabled() and (one.requires_grad or other.requires_grad):
+            return _Correlations.apply(one, wide)  # type: ignore[no-any-return, no-untyped-call]
+        return _correlations(one, wide)
+
+
+def quiet(layer: nn.Conv2d) -> nn.Conv2d:
+    """A layer that says nothing before it has learnt."""
+    for values in layer.parameters():
+        nn.init.zeros_(values)
+    return layer
+
+
+def _unit_descriptions(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Descriptions of mean square 1, and the logarithm of what it was."""
+    power = (cells * cells).mean(dim=1, keepdim=True) + FAINT
+    return cells * torch.rsqrt(power), torch.log(power)
+
+
+def _shifted(one: Tensor, wide: Tensor) -> list[Tensor]:
+    """Views of the wide frame, each as large as the other one, along range first."""
+    rows, columns = one.shape[-2:]
+    down, across = (large - small + 1 for large, small in zip(wide.shape[-2:], (rows, columns), strict=True))
+    return [wide[:, :, r : r + rows, c : c + columns] for r in range(down) for c in range(across)]
+
+
+def _correlations(one: Tensor, wide: Tensor) -> Tensor:
+    """Of each cell with all shifts of the other frame, mean over the channels."""
+    return torch.stack([(one * part).sum(dim=1) for part in _shifted(one, wide)], dim=1) / one.shape[1]
+
+
+class _Correlations(torch.autograd.Function):
+    """:func:`_correlations` with a derivative that touches memory a third as often as torch's own."""
+
+    @staticmethod
+    def forward(context: Any, one: Tensor, wide: Tensor) -> Tensor:
+        context.save_for_backward(one, wide)
+        return _correlations(one, wide)
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+        one, wide = context.saved_tensors
+        by_volume = gradients[0] / one.shape[1]
+        by_one, by_wide = torch.zeros_like(one), torch.zeros_like(wide)
+        for k, (part, by_part) in enumerate(zip(_shifted(one, wide), _shifted(one, by_wide), strict=True)):
+            by_one.addcmul_(by_volume[:, k : k + 1], part)
+            by_part.addcmul_(by_volume[:, k : k + 1], one)
+        return by_one, by_wide
