@@ -176,7 +176,7 @@ def test_images_that_are_too_small_or_no_pairs_are_refused(shape: tuple[int, ...
         create_network("corrnet")(torch.zeros(shape), batch())
 
 
-@pytest.mark.parametrize("options", [{"width": 0}, {"looks": -1}, {"looks": 1.5}, {"width": "half"}])
+@pytest.mark.parametrize("options", [{"width": 0}, {"looks": 0}, {"looks": 1.5}, {"width": "half"}])
 def test_options_that_no_network_can_have(options: dict[str, object]) -> None:
     with pytest.raises(MitsonarError, match="corrnet takes"):
         create_network("corrnet", **options)

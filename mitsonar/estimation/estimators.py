@@ -6,7 +6,6 @@ import inspect
 import math
 from collections.abc import Callable
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from mitsonar.estimation.flow import Flow
 from mitsonar.estimation.phase import Phase
 from mitsonar.estimation.zero import Zero
 
-__all__ = ["ESTIMATORS", "TRAINED", "create_estimator", "estimator_from"]
+__all__ = ["ESTIMATORS", "create_estimator", "estimator_from"]
 
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     "zero": Zero,
@@ -29,20 +28,14 @@ ESTIMATORS: dict[str, Callable[..., Estimator]] = {
 }
 
 
-TRAINED = {"corrnet": "corrnet.ckpt"}
-"""Networks that are shipped with their weights; computing with them needs torch."""
-
-
 def create_estimator(name: str, **options: Any) -> Estimator:
     """The estimator of that name.
 
     Raises:
         MitsonarError: unknown name or option.
     """
-    if name in TRAINED:
-        return _trained(str(files("mitsonar.networks") / "weights" / TRAINED[name]))(**options)
     if name not in ESTIMATORS:
-        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, [*ESTIMATORS, *TRAINED])}")
+        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, ESTIMATORS)}")
     try:
         return ESTIMATORS[name](**options)
     except TypeError as error:
@@ -59,10 +52,10 @@ def estimator_from(text: str) -> Estimator:
     name, *words = text.split(":")
     if name in ESTIMATORS:
         return create_estimator(name, **_options(name, words, ESTIMATORS[name]))
-    if name not in TRAINED and "/" not in name and "." not in name and not Path(name).is_dir():
-        names = nearest_names(name, [*ESTIMATORS, *TRAINED])
+    if "/" not in name and "." not in name and not Path(name).is_dir():
+        names = nearest_names(name, ESTIMATORS)
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
-    made = _trained(str(files("mitsonar.networks") / "weights" / TRAINED[name]) if name in TRAINED else name)
+    made = _trained(name)
     return made(**_options(name, words, made))
 
 

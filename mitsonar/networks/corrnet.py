@@ -1,11 +1,11 @@
 """CorrNet: two frames are matched cell by cell, and the known geometry turns what the cells say into one motion (ours).
 
-A shared encoder, which strides along range only, describes the cells of both frames. The second frame's cells are drawn
-where the motion found so far takes those of the first; a local correlation volume gives each cell a displacement
-(soft-argmax) and how sure it is of it (a 2 x 2 information matrix). One weighted least-squares problem with the sonar's
-derivative turns all of them into a step of the motion, in closed form; its normal matrix tells the covariance. Two coarse
-looks begin, one at all cells follows, and finer ones take what is left from the frames' differences and slopes. Rocks stand
-above the ground that the geometry knows: a few layers guess from both frames by how much.
+A shared encoder describes blocks of both frames. The second frame's blocks are drawn where the motion found so far takes
+those of the first; a local correlation volume gives each block a displacement (soft-argmax) and how sure it is of it (a
+2 x 2 information matrix). One weighted least-squares problem with the sonar's derivative turns all of them into a step of
+the motion, in closed form; its normal matrix tells the covariance. Finer looks, one beam wide, take what is left from the
+frames' differences and slopes. Rocks stand above the ground that the geometry knows: a few layers guess from both frames
+by how much.
 
 Correlation volumes and their lookup are from PWC-Net (Sun et al. 2018) and RAFT (Teed and Deng 2020); here flow has
 three parameters, and their derivative is known. The volume's second axis is the beam: how far a motion shifts each cell
@@ -29,16 +29,10 @@ from mitsonar.networks.slopes import STEP, Slopes
 
 __all__ = ["CorrNet"]
 
-STRIDE = 8
-"""Bins of a cell; a cell is one beam wide."""
+BLOCK = (16, 2)
+"""Bins and beams that are described together."""
 
-COARSE = 2
-"""Cells that one cell of the first looks is long and wide."""
-
-COARSE_LOOKS = 2
-"""The second reaches what was beyond the first one's cells."""
-
-FEWEST = (16 * STRIDE, 16)
+FEWEST = (128, 16)
 """Bins and beams of an image that gives the first look something to match."""
 
 RANGE_M = 4.4
@@ -56,8 +50,8 @@ class CorrNet(nn.Module):
 
     Args:
         width: scales the channels.
-        looks: at all cells, after the coarse ones; their weights are tied.
-        finer: looks at the frames' differences and slopes, tied as well.
+        looks: at blocks, their weights tied: the second reaches what was beyond the first one's blocks.
+        finer: looks at differences and slopes, tied as well.
         relief: whether the height of what is seen above the ground is guessed for each cell.
 
     Raises:
@@ -68,26 +62,25 @@ class CorrNet(nn.Module):
     any_sonar: ClassVar[bool] = True
     says_law: ClassVar[bool] = True
 
-    def __init__(self, *, width: float = 1.0, looks: int = 1, finer: int = 3, relief: bool = True) -> None:
+    def __init__(self, *, width: float = 1.0, looks: int = 2, finer: int = 3, relief: bool = True) -> None:
         super().__init__()
-        counts = all(isinstance(count, int) and count >= 0 for count in (looks, finer))
+        counts = all(isinstance(count, int) and count >= 1 for count in (looks, finer))
         if not isinstance(width, int | float) or not 0 < width < math.inf or not counts:
             raise MitsonarError(
-                f"corrnet takes a width above 0 and whole numbers of looks: got {width!r}, {looks!r} and {finer!r}"
+                f"corrnet takes a width above 0, looks and finer of at least 1: got {width!r}, {looks!r} and {finer!r}"
             )
         self.options = {"width": width, "looks": looks, "finer": finer, "relief": relief}
         first, second, channels, hidden, filters = (max(2, round(width * count)) for count in (12, 24, 16, 16, 6))
         self.encoder = nn.Sequential(
             nn.Conv2d(1, first, (8, 3), stride=(4, 1), padding=(2, 1)),
             nn.ReLU(),
-            nn.Conv2d(first, second, (4, 3), stride=(2, 1), padding=(1, 1)),
+            nn.Conv2d(first, second, (8, 4), stride=(4, 2), padding=(2, 1)),
             nn.ReLU(),
             nn.Conv2d(second, channels, 1),
         )
         self.relief = Relief(channels) if relief else None
-        self.coarse = Matching((1, 2), channels, hidden)
-        self.fine = Matching((1, 1), channels, hidden) if looks else None
-        self.slopes = Slopes(filters, hidden) if finer else None
+        self.matching = Matching((1, 2), channels, hidden)
+        self.slopes = Slopes(filters, hidden)
         self.scale = nn.Parameter(torch.tensor(0.0))
         self.floor = nn.Parameter(torch.tensor([-1.0, -2.0, -1.0]))
         self.share = nn.Parameter(torch.tensor(-4.0))
@@ -112,19 +105,15 @@ class CorrNet(nn.Module):
             )
         batch, size = images.shape[0], (images.shape[2], images.shape[3])
         frames = _even(images).reshape(2 * batch, 1, *size)
-        cells = _pair(self.encoder(frames))
-        blocks = tuple(functional.avg_pool2d(frame, COARSE) for frame in cells)
+        blocks = _pair(self.encoder(frames))
+        cells = self.slopes.prepared(*_pair(self.slopes.filter(frames)))
         unit = _units(ground)
         relief = None if self.relief is None else self.relief(*blocks)
-        filtered = None if self.slopes is None else _pair(self.slopes.filter(frames))
         motion, laws = images.new_zeros(batch, 3), []
         for stage, views, step, count in (
-            (self.coarse, blocks, (STRIDE * COARSE, COARSE), COARSE_LOOKS),
-            (self.fine, cells, (STRIDE, 1), self.options["looks"]),
-            (self.slopes, filtered, (STEP, 1), self.options["finer"]),
+            (self.matching, blocks, BLOCK, self.options["looks"]),
+            (self.slopes, cells, (STEP, 1), self.options["finer"]),
         ):
-            if stage is None or views is None:
-                continue
             look = Look(ground, unit, step, size, views[0].shape[-2:], _resized(relief, views[0]))
             for _ in range(int(count)):
                 motion, normal = stage(views, look, motion)

@@ -13,7 +13,7 @@ from mitsonar.networks.look import Look
 __all__ = ["Matching", "Pair", "quiet"]
 
 Pair = tuple[Tensor, ...]
-"""Cells of the first and of the second frame."""
+"""Cells of the first and of the second frame, and what else is known of them."""
 
 FAINT = 1e-2
 """Mean square of a description below which it counts as nothing."""

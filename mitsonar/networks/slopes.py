@@ -55,19 +55,23 @@ class Slopes(nn.Module):
         self.across = nn.Parameter((wide[:, None] * narrow).expand(filters, 1, 5, 3).clone())
         self.scale = nn.Parameter(torch.tensor(0.0))
 
+    def prepared(self, first: Tensor, second: Tensor) -> Pair:
+        """Both filtered frames, and the slopes of the first ``(batch, filters, rows, columns)``."""
+        return first, second, *self._slopes(first)
+
     def forward(self, frames: Pair, look: Look, motion: Tensor) -> tuple[Tensor, Tensor]:
         """A better motion ``(batch, 3)`` in units, and the normal matrix ``(batch, 3, 3)`` behind it.
 
         Args:
-            frames: both frames, filtered ``(batch, filters, rows, columns)``.
+            frames: of :meth:`prepared`.
             look: where these cells are.
             motion: found so far.
         """
-        first = frames[0]
+        first, own = frames[0], frames[2:]
         second, inside = look.draw(frames[1], motion)
         residual = second - first
         root = torch.sqrt(self._weight(first, second, residual)) * inside[:, None]
-        own, others = self._slopes(first), self._slopes(second)
+        others = self._slopes(second)
         slopes = [(a + b) / 2 for a, b in zip(own, others, strict=True)]
         down, across = look.derivative.unbind(dim=1)
         rows = torch.stack([root * (slopes[0] * down[:, k, None] + slopes[1] * across[:, k, None]) for k in range(3)], dim=1)
