@@ -57,17 +57,23 @@ class Look:
         """The second frame where a motion takes the cells of the first, and 1 where that is within it."""
         return drawn(second, self._shift(motion))
 
-    def solved(self, rows: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+    def solved(self, information: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
         """The step of the motion ``(batch, 3)`` in units that least squares tells, and its normal matrix.
 
         Args:
-            rows: weighted derivatives by the motion ``(batch, 3, ...)``.
-            wanted: what they should add up to, weighted alike ``(batch, ...)``.
+            information: about each cell's displacement: along range, across beams, of both ``(batch, 3, rows, columns)``.
+            pull: information times displacement, along range and across beams ``(batch, 2, rows, columns)``.
         """
-        batch = rows.shape[0]
-        rows = rows.reshape(batch, 3, -1)
-        normal = rows @ rows.mT + HELD * torch.eye(3, dtype=rows.dtype, device=rows.device)
-        return torch.linalg.solve(normal, rows @ wanted.reshape(batch, -1, 1))[..., 0], normal
+        batch = information.shape[0]
+        along, across, both = (part[:, None] for part in information.unbind(dim=1))
+        down, aside = self.derivative.unbind(dim=1)
+        weighed = [along * down + both * aside, both * down + across * aside]
+        flat = [part.reshape(batch, 3, -1) for part in (down, aside)]
+        normal = HELD * torch.eye(3, dtype=pull.dtype, device=pull.device)
+        for part, derivative in zip(weighed, flat, strict=True):
+            normal = normal + part.reshape(batch, 3, -1) @ derivative.mT
+        wanted = sum(d @ q.reshape(batch, -1, 1) for d, q in zip(flat, pull.unbind(dim=1), strict=True))
+        return torch.linalg.solve(normal, wanted)[..., 0], normal
 
     def _shift(self, motion: Tensor) -> Tensor:
         """How far from each cell of the first frame the second shows its ground ``(batch, 2, rows, columns)`` [cells]."""

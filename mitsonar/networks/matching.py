@@ -60,11 +60,10 @@ class Matching(nn.Module):
         second, inside = look.draw(cells[1], motion)
         displaced, sure = self.displaced(cells[0], second)
         l11, l22, l21 = (sure * inside[:, None]).unbind(dim=1)
-        down, across = look.derivative.unbind(dim=1)
-        # rows of L' J and of L' d
-        rows = torch.stack([l11[:, None] * down + l21[:, None] * across, l22[:, None] * across], dim=2)
-        wanted = torch.stack([l11 * displaced[:, 0] + l21 * displaced[:, 1], l22 * displaced[:, 1]], dim=1)
-        step, normal = look.solved(rows, wanted)
+        along, across, both = l11 * l11, l21 * l21 + l22 * l22, l11 * l21
+        down, aside = displaced.unbind(dim=1)
+        pull = torch.stack([along * down + both * aside, both * down + across * aside], dim=1)
+        step, normal = look.solved(torch.stack([along, across, both], dim=1), pull)
         return motion + step, normal
 
     def displaced(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

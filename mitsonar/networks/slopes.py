@@ -40,7 +40,11 @@ class Slopes(nn.Module):
     def __init__(self, filters: int, hidden: int) -> None:
         super().__init__()
         self.filters = filters
-        self.filter = nn.Conv2d(1, filters, (6, 3), stride=(STEP, 1), padding=(2, 1), bias=False)
+        self.filter = nn.Sequential(  # levels first: noise that only adds tells most by what is faint
+            nn.Conv2d(1, filters, 1),
+            nn.ReLU(),
+            nn.Conv2d(filters, filters, (6, 3), stride=(STEP, 1), padding=(2, 1), bias=False),
+        )
         self.judge = nn.Sequential(
             nn.Conv2d(3 * filters, hidden, 1),
             nn.ReLU(),
@@ -70,18 +74,19 @@ class Slopes(nn.Module):
         first, own = frames[0], frames[2:]
         second, inside = look.draw(frames[1], motion)
         residual = second - first
-        root = torch.sqrt(self._weight(first, second, residual)) * inside[:, None]
+        weight = self._weight(first, second, residual) * inside[:, None]
         others = self._slopes(second)
-        slopes = [(a + b) / 2 for a, b in zip(own, others, strict=True)]
-        down, across = look.derivative.unbind(dim=1)
-        rows = torch.stack([root * (slopes[0] * down[:, k, None] + slopes[1] * across[:, k, None]) for k in range(3)], dim=1)
-        step, normal = look.solved(rows, -root * residual)
-        weight = root.square()
+        down, aside = ((a + b) / 2 for a, b in zip(own, others, strict=True))
+        by_down, by_aside = weight * down, weight * aside
+        along, across = (by_down * down).sum(dim=1), (by_aside * aside).sum(dim=1)
+        information = torch.stack([along, across, (by_down * aside).sum(dim=1)], dim=1)
+        pull = -torch.stack([(by_down * residual).sum(dim=1), (by_aside * residual).sum(dim=1)], dim=1)
+        step, normal = look.solved(information, pull)
         true = (weight * (own[0] * others[0] + own[1] * others[1])).sum(dim=(1, 2, 3))
-        all_ = (weight * (slopes[0].square() + slopes[1].square())).sum(dim=(1, 2, 3))
-        part = (true / all_.clamp(min=1e-12)).clamp(LEAST_TRUE, 1.0)[:, None]
+        part = (true / (along + across).sum(dim=(1, 2)).clamp(min=1e-12)).clamp(LEAST_TRUE, 1.0)[:, None]
         step = (step / part).clamp(-LONGEST, LONGEST)
-        return motion + step, normal * part[:, None] * torch.exp(self.scale)
+        normal = normal * part[:, None] * torch.exp(self.scale)
+        return motion + step, normal
 
     def _weight(self, first: Tensor, second: Tensor, residual: Tensor) -> Tensor:
         """Of each cell and filter, from what both frames have in common there."""
