@@ -70,7 +70,7 @@ def compare(
         from mitsonar.dataset.pairs import SonarPairs
     except ModuleNotFoundError:
         raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'") from None
-    from mitsonar.estimation.comparison import VARIATIONS, answers_of, limits_of, rows_of, with_prior
+    from mitsonar.estimation.comparison import VARIATIONS, answers_of, chosen, limits_of, rows_of, with_prior
     from mitsonar.estimation.estimators import estimator_from
     from mitsonar.estimation.network import Network
     from mitsonar.metrics import cluster_resamples, in_units
@@ -85,7 +85,9 @@ def compare(
     asked = ["as told", *changed, *(["jitter"] if jitter else [])]
     samples = {name: _pairs(SonarPairs, data, part, name, seed) for name in levels}
     first = next(iter(samples.values()))
-    numbers = _chosen(len(first), pairs, seed)
+    if len(first) < 2:
+        raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
+    numbers = chosen(len(first), pairs, seed)
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     truth = np.array([motions(first.pose[first.frame_numbers(number)])[0] for number in numbers])
     resamples = cluster_resamples(first.scene[first.first[numbers]], seed=seed)
@@ -168,17 +170,8 @@ def _pairs(reader: type[SonarPairs], data: str, part: str | None, noise: str, se
     from mitsonar.dataset.store import DataStore
 
     recipe = DataStore.open(data).recipe
-    part = part or ("test" if recipe.split.test > 0 else "validation")
+    part = part or recipe.split.unseen
     return reader(data, part=part, frames=2, noise=noise, seed=seed, one_a_sequence=True)
-
-
-def _chosen(count: int, pairs: int | None, seed: int) -> list[int]:
-    """Which samples: all, or some at random, in order."""
-    if count < 2:
-        raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
-    if pairs is None or pairs >= count:
-        return list(range(count))
-    return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
 def _digest(pairs: SonarPairs) -> str:

@@ -200,7 +200,7 @@ def _of_data(source: str, pairs: int, part: str | None, gain: float | None, seed
     store = DataStore.open(source)
     recipe = store.recipe
     scene, sequence, pose, height = (store.read(name) for name in ("scene", "sequence", "pose", "height_m"))
-    part = part or ("test" if recipe.split.test > 0 else "validation")
+    part = part or recipe.split.unseen
     mine = np.flatnonzero(deal(world_of(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height))
     first = mine[np.unique(sequence[mine], return_index=True)[1]]
     if not len(first):

@@ -23,7 +23,7 @@ from mitsonar.height import standing_of
 from mitsonar.motion import motions
 from mitsonar.noise import NoiseModel
 
-__all__ = ["Samples", "SonarPairs"]
+__all__ = ["Samples", "SonarPairs", "split_for"]
 
 GROUND = "ground/"
 """Before the names of the ground's geometry in a raw sample."""
@@ -183,7 +183,7 @@ class SonarPairs(Dataset[Any], Samples):
     ) -> None:
         self.store = DataStore.open(url)
         Samples.__init__(self, self.store.recipe, **arrangement)
-        self.split = _split(split, self.recipe)
+        self.split = split_for(split, self.recipe)
         self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
         self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
         worlds = world_of(self.recipe, self.store.scenes)[self.scene]
@@ -302,7 +302,12 @@ class _Raw(Dataset[Any]):
         return self.pairs.raw(index)
 
 
-def _split(split: str | Split | dict[str, Any] | None, recipe: Recipe) -> Split:
+def split_for(split: str | Split | dict[str, Any] | None, recipe: Recipe) -> Split:
+    """The split that is asked for, of a data set of this recipe; see :class:`SonarPairs`.
+
+    Raises:
+        MitsonarError: a word or keys that are not known.
+    """
     if isinstance(split, Split):
         return split
     if isinstance(split, dict):

@@ -21,7 +21,18 @@ from mitsonar.simulation.worlds.families import create_family
 from mitsonar.simulation.worlds.world import Family, Interval
 from mitsonar.sonar import Sonar
 
-__all__ = ["Flight", "Mount", "Recipe", "Scenes", "Split", "load_recipe", "set_key", "shipped_recipes", "split_from"]
+__all__ = [
+    "Flight",
+    "Mount",
+    "Recipe",
+    "Scenes",
+    "Split",
+    "load_recipe",
+    "recipe_fields",
+    "set_key",
+    "shipped_recipes",
+    "split_from",
+]
 
 
 class _Part(BaseModel):
@@ -128,6 +139,11 @@ class Split(_Part):
                 f"train, validation and test must add up to 1: got {self.train + self.validation + self.test:g}"
             )
         return self
+
+    @property
+    def unseen(self) -> str:
+        """The part that is neither learnt from nor, where there is another, chosen by."""
+        return "test" if self.test > 0 else "validation"
 
 
 class Recipe(_Part):
@@ -238,29 +254,48 @@ def load_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None)
     Raises:
         MitsonarError: no such recipe, not YAML, an unknown key, a value outside its limits.
     """
+    fields, path = recipe_fields(
+        name_or_file, shipped_recipes(), "recipe", Recipe, " or a name of `mitsonar dataset recipes`"
+    )
+    for key, value in (changes or {}).items():
+        set_key(fields, key, value)
+    _find_files(fields, path.parent)
+    return recipe_from({"name": path.stem, **fields})
+
+
+def recipe_fields(
+    name_or_file: str | Path, shipped: dict[str, Path], what: str, model: type[BaseModel], else_: str = ""
+) -> tuple[dict[str, Any], Path]:
+    """The keys in a YAML file, or in the shipped one of that name, and that file.
+
+    Args:
+        name_or_file: ``rocky-field``, or ``mine.yaml``.
+        shipped: files by name.
+        what: it is, for errors.
+        model: whose fields are the known keys.
+        else_: what may be given besides a YAML file, for errors.
+
+    Raises:
+        MitsonarError: no such recipe, not YAML, not a table.
+    """
     path = Path(name_or_file)
     if path.suffix.lower() not in (".yaml", ".yml"):
-        shipped = shipped_recipes()
         if str(name_or_file) not in shipped:
             names = nearest_names(str(name_or_file), shipped)
             raise MitsonarError(
-                f"no recipe {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
+                f"no {what} {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
             )
         path = shipped[str(name_or_file)]
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise MitsonarError(
-            f"cannot read recipe {path}: {error.strerror}; give a YAML file or a name of `mitsonar dataset recipes`"
-        ) from None
+        raise MitsonarError(f"cannot read {what} {path}: {error.strerror}; give a YAML file{else_}") from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise MitsonarError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
     if not isinstance(fields, dict):
-        raise MitsonarError(f"{path} must hold the keys of a recipe: {', '.join(Recipe.model_fields)}")
-    for key, value in (changes or {}).items():
-        set_key(fields, key, value)
-    _find_files(fields, path.parent)
-    return recipe_from({"name": path.stem, **fields})
+        keys = ", ".join(field.alias or name for name, field in model.model_fields.items())
+        raise MitsonarError(f"{path} must hold the keys of a {what}: {keys}")
+    return fields, path
 
 
 def recipe_from(fields: dict[str, Any]) -> Recipe:

@@ -23,7 +23,7 @@ from mitsonar.metrics import MotionErrors, in_units, motion_errors
 from mitsonar.noise import NoiseModel
 from mitsonar.simulation.variant import release_memory
 
-__all__ = ["VARIATIONS", "Answers", "Row", "answers_of", "frames_of", "limits_of", "rows_of", "with_prior"]
+__all__ = ["VARIATIONS", "Answers", "Row", "answers_of", "chosen", "frames_of", "limits_of", "rows_of", "with_prior"]
 
 Array = NDArray[np.float64]
 
@@ -85,6 +85,13 @@ class Answers:
     def from_arrays(cls, table: Mapping[str, NDArray[Any]], prefix: str) -> Answers:
         """What :meth:`arrays` gave."""
         return cls(*(np.array(table[f"{prefix}/{field.name}"]) for field in fields(cls)))
+
+
+def chosen(count: int, pairs: int | None, seed: int) -> list[int]:
+    """Numbers of samples: all, or some at random, in order."""
+    if pairs is None or pairs >= count:
+        return list(range(count))
+    return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
 def frames_of(pairs: SonarPairs, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, SonarFrames]]:

@@ -24,6 +24,7 @@ from mitsonar.height import Standing, standing_of
 from mitsonar.metrics import AXES, in_units
 from mitsonar.motion import Motion
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.create import called
 from mitsonar.noise import NoiseModel
 from mitsonar.sonar import Sonar
 
@@ -277,7 +278,7 @@ def answer_of(network: nn.Module, inputs: Any) -> Any:
         MitsonarError: inputs of a size that it cannot take.
     """
     try:
-        return network(*inputs) if isinstance(inputs, tuple) else network(inputs)
+        return called(network, inputs)
     except RuntimeError as error:
         raise MitsonarError(f"the network cannot take these frames: {error}") from None
 

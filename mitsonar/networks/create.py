@@ -16,7 +16,7 @@ from mitsonar.networks.posenet import PoseNet
 from mitsonar.networks.posenet_dual import PoseNetDual
 from mitsonar.networks.sfmnet import SfMNet
 
-__all__ = ["NETWORKS", "create_network", "options_for", "options_of"]
+__all__ = ["NETWORKS", "called", "create_network", "options_for", "options_of"]
 
 NETWORKS: dict[str, Any] = {
     "posenet": PoseNet,
@@ -47,6 +47,11 @@ def create_network(name: str, **options: Any) -> nn.Module:
             raise MitsonarError(f"unknown option {option!r} of {name}: {nearest_names(option, known)}")
     network: nn.Module = NETWORKS[name](**options)
     return network
+
+
+def called(network: nn.Module, inputs: Any) -> Any:
+    """The network's output; several inputs, a tuple, are given one by one."""
+    return network(*inputs) if isinstance(inputs, tuple) else network(inputs)
 
 
 def options_of(name: str) -> list[str]:

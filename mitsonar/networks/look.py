@@ -11,7 +11,7 @@ from torch.nn import functional
 from mitsonar.dataset.ground import NODES
 from mitsonar.geometry import moved, seen
 
-__all__ = ["HELD", "Ground", "Look", "displacement", "drawn"]
+__all__ = ["Ground", "Look", "displacement", "drawn"]
 
 Ground = dict[str, Tensor]
 """A batch of :func:`mitsonar.dataset.ground.ground_at`."""

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
-from mitsonar.dataset.pairs import SonarPairs
+from mitsonar.dataset.pairs import SonarPairs, split_for
 from mitsonar.dataset.recipe import Recipe, Split
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.comparison import Answers, rows_of
+from mitsonar.estimation.comparison import Answers, chosen, rows_of
 from mitsonar.estimation.network import ANGLE_OFF_DEG, HEIGHT_OFF, Instrument, answer_of, inputs_of, one_thread
 from mitsonar.metrics import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
@@ -113,7 +113,7 @@ def evaluate(
     levels = list(dict.fromkeys(noise))
     samples = {level: samples_for(checkpoint, data, part=part, split=split, noise=level, seed=seed) for level in levels}
     first = samples[levels[0]]
-    numbers = _chosen(len(first), pairs, seed)
+    numbers = chosen(len(first), pairs, seed)
     truth = np.array([first.target(number) for number in numbers])
     scenes = first.scene[first.first[numbers]]
     resamples = cluster_resamples(scenes, seed=seed)
@@ -130,7 +130,7 @@ def evaluate(
         "data": str(data),
         "recipe": recipe.name,
         "model": recipe.instrument.model,
-        "part": part or _part_of(first.split),
+        "part": part or first.split.unseen,
         "split": first.split.by,
         "pairs": len(numbers),
         "scenes": len(np.unique(scenes)),
@@ -157,20 +157,8 @@ def samples_for(
     """
     words = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": True}
     if part is None:
-        part = _part_of(SonarPairs(data, part="all", split=split, frames=1).split)
+        part = split_for(split, DataStore.open(data).recipe).unseen
     return SonarPairs(data, part=part, split=split, **checkpoint.arrangement, **words)
-
-
-def _part_of(split: Split) -> str:
-    """The part that was not seen in training, nor chosen by."""
-    return "test" if split.test > 0 else "validation"
-
-
-def _chosen(count: int, pairs: int | None, seed: int) -> list[int]:
-    """Which samples: all, or some at random, in order."""
-    if pairs is None or pairs >= count:
-        return list(range(count))
-    return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
 def _device(device: torch.device | str | None) -> torch.device:

@@ -16,7 +16,7 @@ from mitsonar.dataset.arrangement import Labels
 from mitsonar.errors import MitsonarError
 from mitsonar.metrics import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.networks.create import NETWORKS, create_network, options_for
+from mitsonar.networks.create import NETWORKS, called, create_network, options_for
 from mitsonar.networks.law import MotionLaw
 from mitsonar.training.augment import augmented
 from mitsonar.training.data import STEP, Material, Validation, batches, finished, seed_of
@@ -39,11 +39,6 @@ def said(output: Tensor | MotionLaw, labels: Labels) -> Array:
         mean = output.mean if output.mean.dim() == 2 else output.mean[-1]
         return np.asarray(mean.detach().cpu().double().numpy())
     return labels.decode(output.detach().cpu().double().numpy())
-
-
-def called(network: nn.Module, inputs: Any) -> Any:
-    """The network's output; several inputs are given one by one."""
-    return network(*inputs) if isinstance(inputs, tuple) else network(inputs)
 
 
 def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:

@@ -9,11 +9,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from mitsonar.dataset.recipe import Split, set_key, split_from
-from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.dataset.recipe import Split, recipe_fields, set_key, split_from
+from mitsonar.errors import MitsonarError, complaint
 from mitsonar.noise import load_noise
 
 __all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
@@ -236,24 +235,7 @@ def load_training_recipe(name_or_file: str | Path, changes: dict[str, Any] | Non
     Raises:
         MitsonarError: no such recipe, not YAML, an unknown key, a value outside its limits.
     """
-    path = Path(name_or_file)
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        shipped = shipped_training_recipes()
-        if str(name_or_file) not in shipped:
-            names = nearest_names(str(name_or_file), shipped)
-            raise MitsonarError(
-                f"no training recipe {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
-            )
-        path = shipped[str(name_or_file)]
-    try:
-        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MitsonarError(f"cannot read training recipe {path}: {error.strerror}; give a YAML file") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise MitsonarError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(fields, dict):
-        keys = ", ".join(field.alias or name for name, field in TrainingRecipe.model_fields.items())
-        raise MitsonarError(f"{path} must hold the keys of a training recipe: {keys}")
+    fields, path = recipe_fields(name_or_file, shipped_training_recipes(), "training recipe", TrainingRecipe)
     if isinstance(fields.get("network"), str):
         fields["network"] = {"name": fields["network"]}
     for key, value in (changes or {}).items():

@@ -7,7 +7,6 @@ import io
 import json
 import math
 import platform
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -310,10 +309,8 @@ class Bench:
         return self.folder / "runs" / name
 
     def _trained(self, name: str, recipe: TrainingRecipe, data: Path, crew: Crew) -> Checkpoint:
-        """The network of a row; what a kill left of a run before it had begun is removed."""
+        """The network of a row."""
         run = self._run(name)
-        if run.exists() and not (run / "run.json").exists():
-            shutil.rmtree(run)
         words: dict[str, Any] = {"minutes": self.effort.minutes, "accelerator": crew.accelerator, "devices": crew.devices}
         with crew.watch.training(name) as (progress, stop):
             return train(recipe, data, run, resume=run.exists(), progress=progress, stop=stop, **words)
