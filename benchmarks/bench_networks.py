@@ -1,6 +1,6 @@
 """Networks beside methods without training: the same 1,000 pairs of unseen scenes, and geometries that no network saw.
 
-    python benchmarks/bench_networks.py --out bench --networks out/posenet --corrnet out/corrnet [--pairs 1000]
+    python benchmarks/bench_networks.py --out bench --networks out/posenet [--pairs 1000]
 
 Takes the data sets of `bench_compare.py` (made where they are missing), and makes others: heights of 1.5 to 6 m, pitches of
 20 and 50 deg, another sonar, hulls. What is there is kept, so that a run that was broken off goes on. The tables lie in
@@ -41,7 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("bench"))
     parser.add_argument("--networks", default="", help="runs or checkpoints with commas between them, of home only")
-    parser.add_argument("--corrnet", default="", help="likewise, those that know the geometry: for all sets")
+    parser.add_argument("--corrnet", default="corrnet", help="those that know the geometry: for all sets")
     parser.add_argument("--pairs", type=int, default=1000)
     parser.add_argument("--perturbed", type=int, default=200, help="pairs of the perturbed rows; 0: none")
     parser.add_argument("--elsewhere", type=int, default=200, help="pairs of other geometries; 0: none")

@@ -23,7 +23,6 @@ __all__ = [
     "directions",
     "moved",
     "nearest_known",
-    "seen",
     "to_cartesian",
 ]
 
@@ -83,9 +82,9 @@ class GroundGeometry:
 
     def see(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Range [m] and bearing [rad] of ground points ``(..., 2)``."""
-        turn = self.turn.astype(points.dtype)
-        radius, bearing = seen(points, turn, points.dtype.type(self.height_m), self.bearing)
-        return radius, bearing
+        s, f, u = self._in_sonar(points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
 
     def elevation(self, points: NDArray[np.floating]) -> NDArray[Any]:
         """Elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
@@ -127,25 +126,11 @@ class GroundGeometry:
         return _in_sonar(points, self.turn.astype(points.dtype), points.dtype.type(self.height_m))
 
 
-def _in_sonar(points: Any, turn: Any, height: Any) -> tuple[Any, ...]:
-    """Starboard, forward, up of ground points ``(..., 2)`` in the axes of a sonar, turned ``(..., 3, 3)``."""
+def _in_sonar(points: Any, turn: Any, height: Any) -> tuple[Any, Any, Any]:
+    """Starboard, forward, up of ground points ``(..., 2)`` in the axes of a sonar, turned ``(3, 3)``."""
     x, y = points[..., 0], points[..., 1]
-    return tuple(x * turn[..., 0, k] + y * turn[..., 1, k] - height * turn[..., 2, k] for k in range(3))
-
-
-def seen(points: Any, turn: Any, height: Any, bearing: Bearing) -> tuple[Any, Any]:
-    """Range [m] and bearing [rad] of ground points; NumPy or torch.
-
-    Args:
-        points: (starboard, forward) in level axes ``(..., 2)`` [m].
-        turn: the sonar's starboard, forward and up in these axes, as columns ``(..., 3, 3)``.
-        height: of the sonar ``(...)`` [m].
-        bearing: which angle is meant.
-    """
-    xp = array_namespace(points)
-    s, f, u = _in_sonar(points, turn, height)
-    radius = xp.sqrt(s * s + f * f + u * u)
-    return radius, xp.atan2(s, f) if bearing == "azimuth" else xp.asin(s / radius)
+    starboard, forward, up = (x * turn[..., 0, k] + y * turn[..., 1, k] - height * turn[..., 2, k] for k in range(3))
+    return starboard, forward, up
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

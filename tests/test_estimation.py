@@ -18,6 +18,7 @@ from mitsonar.frames import SonarFrames
 from mitsonar.geometry import moved
 from mitsonar.height import Standing, standing_of
 from mitsonar.motion import Motion, Pose, Trajectory, compose
+from mitsonar.networks.shipped import SHIPPED
 from mitsonar.noise import NOISE_MODELS
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scenes import load_scene
@@ -32,13 +33,15 @@ pytestmark = [
 
 START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
 UNITS = np.array([1e3, 1e3, 180 / np.pi])
-METHODS = [name for name in ESTIMATORS if name != "zero"]
+CLASSICAL = [name for name in ESTIMATORS if name != "zero"]
+METHODS = [*CLASSICAL, *(pytest.param(name, marks=pytest.mark.learn) for name in SHIPPED)]
 
 ALLOWED = {
     "direct": [3.0, 1.5, 0.07],
     "ecc": [3.0, 1.5, 0.07],
     "phase": [5.0, 2.0, 0.10],
     "flow": [8.0, 4.0, 0.25],
+    "corrnet": [3.0, 1.5, 0.07],
 }
 """Errors on flat objects in mm, mm, deg. Large plates of one reflectivity, whose brightness belongs to the range and not to
 the ground, hold estimates back."""
@@ -99,6 +102,9 @@ def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, sign: in
     motion = np.zeros(3)
     motion[axis] = sign * size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
     found = create_estimator(method).estimate(pair(Motion(*motion)))
+    if method in SHIPPED and size > 1:  # beyond what it has learnt
+        assert not found.believe
+        return
     error = (np.array(found.motion) - motion) * UNITS
     assert found.believe, found.reason
     assert (np.abs(error) < ALLOWED[method]).all(), f"mm, mm, deg: {error}"
@@ -115,9 +121,11 @@ def test_all_three_at_once_on_rocks(rocks: Simulator, method: str) -> None:
 
 
 @pytest.mark.parametrize(("noise", "allowed"), [("none", [3.0, 1.0, 0.07]), ("high", [6.0, 2.0, 0.12])])
-def test_direct_with_noise(pair: Pair, noise: str, allowed: list[float]) -> None:
+@pytest.mark.parametrize("method", ["direct", *(name for name in METHODS if name not in CLASSICAL)])
+def test_covariances_hold_with_noise(pair: Pair, rocks: Simulator, method: str, noise: str, allowed: list[float]) -> None:
+    """A network's hold on what it has learnt only: rocks; on large plates they are too small."""
     motion = Motion(0.015, -0.012, np.radians(0.4))
-    found = Direct().estimate(pair(motion, noise))
+    found = create_estimator(method).estimate(pair(motion, noise) if method == "direct" else two(rocks, motion, noise))
     error = (np.array(found.motion) - motion) * UNITS
     assert found.believe, found.reason
     assert (np.abs(error) < allowed).all(), f"{noise}, mm, mm, deg: {error}"
@@ -209,7 +217,7 @@ def test_height_comes_from_first_echoes(pair: Pair) -> None:
 def test_what_is_missing_is_said() -> None:
     sonar = Sonar(beams=8, range_bins=16)
     bare = SonarFrames(np.zeros((2, 16, 8), np.float32), sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
-    for method in METHODS:
+    for method in CLASSICAL:
         with pytest.raises(MitsonarError, match=f"{method} needs height and pitch"):
             create_estimator(method).estimate(bare)
         with pytest.raises(MitsonarError, match="takes two frames: got 1"):

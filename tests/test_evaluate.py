@@ -258,6 +258,23 @@ def test_networks_that_know_the_geometry_are_given_it(
     assert "first echoes tell a height" in wrong.reason
 
 
+def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: SonarPairs) -> None:
+    """By name: as an estimator, here and in other processes, and for `evaluate`; a path is a path."""
+    checkpoint = Checkpoint.load("corrnet")
+    assert (checkpoint.network, checkpoint.recipe["data"]) == ("corrnet", "rocky-field")
+    assert checkpoint.trained["pairs"] > 10_000
+    estimator = create_estimator("corrnet")
+    assert estimator_from("corrnet:force=0").digest == checkpoint.digest  # type: ignore[attr-defined]
+    frames = pairs.sonar_frames(2)
+    there = pickle.loads(pickle.dumps(estimator)).estimate(frames)
+    assert there.motion == estimator.estimate(frames).motion
+    assert there.covariance is not None
+    done = mitsonar("evaluate", "corrnet", made, "--part", "all", "--pairs", "4", "--noise", "none")
+    assert done.code == 0, done.err
+    assert "corrnet" in done.out
+    refused(mitsonar("evaluate", "./corrnet", made), "no checkpoint", "or corrnet")
+
+
 def test_its_own_covariances_are_judged(geometric: Checkpoint, made: Path) -> None:
     row, _ = evaluate(geometric, made, noise=["none"], part="all")["tables"][0]["rows"]
     own = samples_for(geometric, made, part="all")
@@ -529,15 +546,18 @@ def test_every_network_becomes_onnx(name: str) -> None:
 
 @pytest.mark.slow
 def test_the_geometry_goes_into_onnx(geometric: Checkpoint, made: Path) -> None:
-    """Motion and covariance, for the ground of a sample that the tracer has not seen."""
+    """Motion and covariance, for any number of samples, on ground that the tracer has not seen."""
     onnxruntime = pytest.importorskip("onnxruntime")
-    session = onnxruntime.InferenceSession(onnx_of(geometric), providers=["CPUExecutionProvider"])
-    image, ground = samples_for(geometric, made, part="all")[3][0]
-    table = {name: values[None].numpy() for name, values in {"image": image, **ground}.items()}
-    found = session.run(["motion", "covariance"], {one.name: table[one.name] for one in session.get_inputs()})
-    wanted = geometric.build()(image[None], {name: values[None] for name, values in ground.items()})
-    for got, want in zip(found, wanted, strict=True):
-        assert np.abs(got - want.numpy()).max() < 1e-4 * np.abs(want.numpy()).max()
+    session = onnxruntime.InferenceSession(onnx_of(geometric, None), providers=["CPUExecutionProvider"])
+    samples = samples_for(geometric, made, part="all")
+    for numbers in ([3], [0, 4, 7, 9]):
+        images, grounds = zip(*(samples[number][0] for number in numbers), strict=True)
+        image, ground = torch.stack(images), {name: torch.stack([one[name] for one in grounds]) for name in grounds[0]}
+        table = {name: values.numpy() for name, values in {"image": image, **ground}.items()}
+        found = session.run(["motion", "covariance"], {one.name: table[one.name] for one in session.get_inputs()})
+        wanted = geometric.build()(image, ground)
+        for got, want in zip(found, wanted, strict=True):
+            assert np.abs(got - want.numpy()).max() < 1e-4 * np.abs(want.numpy()).max()
 
 
 def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

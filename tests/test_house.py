@@ -46,7 +46,7 @@ STAGES = (
         f"networks.{name}"
         for name in ("law", "blocks", "posenet", "sfmnet", "cnn1b", "cnn4b", "cnn4posenet", "posenet_dual")
     ),
-    *(f"networks.{name}" for name in ("look", "matching", "slopes", "corrnet", "create", "checkpoint", "onnx")),
+    *(f"networks.{name}" for name in ("look", "matching", "slopes", "corrnet", "create", "shipped", "checkpoint", "onnx")),
     *(
         f"estimation.{name}"
         for name in ("estimator", "zero", "ground", "ecc", "phase", "flow", "direct", "network", "estimators")

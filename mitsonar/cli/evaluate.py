@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Run", "checkpoint_from", "evaluate", "report_lines"]
 
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a training, or a checkpoint.")]
+Run = Annotated[str, typer.Argument(metavar="RUN", help="Folder of a training, a checkpoint, or corrnet.")]
 
 COLUMNS = (
     *("method", "RMSE", "as in the thesis", "95 % interval", "median", "95 %", "slope", "bias", "large", "skill", "nees"),
@@ -64,7 +64,7 @@ def evaluate(
             **words,
             begin=lambda count: bar.enter_context(progress_bar("evaluating", count, "pairs")),
         )
-    report = {"run": str(run), **report}
+    report = {"run": run, **report}
     for sentence in report["notes"]:
         warn(sentence)
     if report["scenes"] < FEWEST_SCENES:
@@ -84,7 +84,7 @@ def evaluate(
         say(f"\ntables: {out / RESULTS[0]}, {out / RESULTS[1]}")
 
 
-def checkpoint_from(run: Path) -> Checkpoint:
+def checkpoint_from(run: str) -> Checkpoint:
     """The checkpoint that the command line names.
 
     Raises:

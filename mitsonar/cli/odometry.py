@@ -31,7 +31,7 @@ def odometry(
     estimator: Annotated[
         str,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, or a network's checkpoint; with options NAME:key=value:key=value."
+            help="zero, ecc, flow, phase, direct, corrnet, or a network's checkpoint; with options NAME:key=value:key=value."
         ),
     ] = "direct",
     smooth: Annotated[

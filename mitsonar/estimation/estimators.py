@@ -16,8 +16,9 @@ from mitsonar.estimation.estimator import Estimator
 from mitsonar.estimation.flow import Flow
 from mitsonar.estimation.phase import Phase
 from mitsonar.estimation.zero import Zero
+from mitsonar.networks.shipped import SHIPPED, shipped_path
 
-__all__ = ["ESTIMATORS", "create_estimator", "estimator_from"]
+__all__ = ["ESTIMATORS", "NAMES", "create_estimator", "estimator_from"]
 
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     "zero": Zero,
@@ -26,18 +27,21 @@ ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     "phase": Phase,
     "direct": Direct,
 }
+"""Those that nothing was trained for."""
+
+NAMES = (*ESTIMATORS, *SHIPPED)
 
 
 def create_estimator(name: str, **options: Any) -> Estimator:
     """The estimator of that name.
 
     Raises:
-        MitsonarError: unknown name or option.
+        MitsonarError: unknown name or option; no torch for a trained one.
     """
-    if name not in ESTIMATORS:
-        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, ESTIMATORS)}")
+    if name not in NAMES:
+        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, NAMES)}")
     try:
-        return ESTIMATORS[name](**options)
+        return _maker(name)(**options)
     except TypeError as error:
         raise MitsonarError(f"estimator {name}: {error}") from None
 
@@ -50,16 +54,21 @@ def estimator_from(text: str) -> Estimator:
         MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
     """
     name, *words = text.split(":")
-    if name in ESTIMATORS:
-        return create_estimator(name, **_options(name, words, ESTIMATORS[name]))
+    if name in NAMES:
+        return create_estimator(name, **_options(name, words, _maker(name)))
     if "/" not in name and "." not in name and not Path(name).is_dir():
-        names = nearest_names(name, ESTIMATORS)
+        names = nearest_names(name, NAMES)
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
     made = _trained(name)
     return made(**_options(name, words, made))
 
 
-def _trained(path: str) -> Callable[..., Estimator]:
+def _maker(name: str) -> Callable[..., Estimator]:
+    """What makes the estimator of that name, from options."""
+    return ESTIMATORS[name] if name in ESTIMATORS else _trained(shipped_path(name))
+
+
+def _trained(path: str | Path) -> Callable[..., Estimator]:
     """What makes an estimator of a checkpoint, from options.
 
     Raises:

