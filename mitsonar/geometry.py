@@ -123,14 +123,10 @@ class GroundGeometry:
 
     def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], ...]:
         """Starboard, forward, up of ground points in the sonar's own axes."""
-        return _in_sonar(points, self.turn.astype(points.dtype), points.dtype.type(self.height_m))
-
-
-def _in_sonar(points: Any, turn: Any, height: Any) -> tuple[Any, Any, Any]:
-    """Starboard, forward, up of ground points ``(..., 2)`` in the axes of a sonar, turned ``(3, 3)``."""
-    x, y = points[..., 0], points[..., 1]
-    starboard, forward, up = (x * turn[..., 0, k] + y * turn[..., 1, k] - height * turn[..., 2, k] for k in range(3))
-    return starboard, forward, up
+        x, y, turn = points[..., 0], points[..., 1], self.turn.astype(points.dtype)
+        below = points.dtype.type(self.height_m)
+        starboard, forward, up = (x * turn[0, k] + y * turn[1, k] - below * turn[2, k] for k in range(3))
+        return starboard, forward, up
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -300,16 +300,16 @@ def _doubt_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
     """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
     rows, beams = images[0].shape[0] // CELL, images[0].shape[1]
     means = (image[: rows * CELL].reshape(rows, CELL, beams).mean(axis=1) for image in images)
-    first, second = (cv2.GaussianBlur(mean, (0, 0), sigmaX=SMOOTH[1], sigmaY=SMOOTH[0] / CELL) for mean in means)
+    first, second = (smooth(mean, CELL) for mean in means)
     look = Look(ground, torch.ones(1, 3), (CELL, 1), images[0].shape, first.shape, None)
     back, inside = look.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
     alike = 4 * math.pi * math.hypot(SMOOTH[0] / CELL, 12**-0.5) * SMOOTH[1]
     return matching_doubt(first, back[0, 0].numpy(), inside[0].numpy() > 0, alike=alike, block=BLOCK)
 
 
-def smooth(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """With less noise."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=SMOOTH[1], sigmaY=SMOOTH[0]), dtype=np.float32)
+def smooth(image: NDArray[np.float32], step: int = 1) -> NDArray[np.float32]:
+    """With less noise; ``step`` bins are a cell."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=SMOOTH[1], sigmaY=SMOOTH[0] / step), dtype=np.float32)
 
 
 def without_slow(image: NDArray[np.float32]) -> NDArray[np.float32]:
