@@ -1,11 +1,15 @@
 """Which details of two noisy frames tell how far they are shifted, by their fineness.
 
-    python benchmarks/bench_spectrum.py DATA.zarr [--noise high] [--frames 40]
+    python benchmarks/bench_spectrum.py DATA.zarr [--noise high] [--frames 40] [--poses 20]
 
 Information about a small shift across beams, or along range, of a signal that is not known, in two frames with independent
 noise (Knapp and Carter 1976): the sum over frequencies of (2 pi f)^2 S^2 / (N^2 + 2 S N). S is the spectrum of tiles of 32
 bins and 32 beams of the noiseless frames, N the noise of their pixels as a Gaussian of the same variance. Beside it, how
 much larger the errors of simple slopes are: they take the wrong weight of each frequency.
+
+With --poses the limit of the motion that follows: tiles tell shifts, and the geometry of level ground tells motions by them.
+S is then of the mean over many draws of the rays, and their variance in one ping is noise. Whoever knows the scene has
+S / (2 N) instead: the ratio of both is what not knowing it costs. Beside them stands the oracle of `mitsonar limit`.
 """
 
 from __future__ import annotations
@@ -14,12 +18,25 @@ import argparse
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
+from mitsonar.dataset.pairs import SonarPairs
+from mitsonar.dataset.plan import scenes_of
+from mitsonar.dataset.rendering import SceneRenderer
 from mitsonar.dataset.store import DataStore
+from mitsonar.estimation.limit import bound, overall
+from mitsonar.geometry import GroundGeometry
+from mitsonar.metrics import in_units
+from mitsonar.motion import Pose
 from mitsonar.noise import NoiseModel, load_noise
+from mitsonar.simulation.derivatives import Derivative, differentiate, jittered
 
 TILE = 32
 BANDS = 4
+ROUNDING = 1 / 12 / 255**2
+
+WINDOW = np.outer(np.hanning(TILE + 2)[1:-1], np.hanning(TILE + 2)[1:-1])
+WINDOW /= np.sqrt(np.mean(WINDOW**2))
 
 SLOPES = {
     "differences of neighbours": lambda w: np.sin(w),
@@ -33,15 +50,21 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("--noise", default="high")
     parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--poses", type=int, default=0, help="for the limit of the motion; 0: none")
     asked = parser.parse_args()
     noise = load_noise(asked.noise)
     store = DataStore.open(asked.data)
-    window = np.hanning(TILE + 2)[1:-1]
-    window = np.outer(window, window) / np.sqrt(np.mean(np.outer(window, window) ** 2))
+    shifts(store, noise, asked.frames)
+    if asked.poses:
+        motions(asked.data, noise, asked.poses)
+
+
+def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
+    """What tells shifts, by fineness."""
     spectra, levels = [], []
-    for number in np.linspace(0, len(store) - 1, asked.frames).astype(int):
+    for number in np.linspace(0, len(store) - 1, frames).astype(int):
         for tile in tiles(store.read("image", int(number))):
-            spectra.append(np.abs(np.fft.fft2((tile - tile.mean()) * window)) ** 2 / tile.size)
+            spectra.append(spectrum(tile))
             levels.append(variance(tile, noise))
     signal, level = np.array(spectra), np.array(levels)[:, None, None]
     frequency = np.fft.fftfreq(TILE)
@@ -58,16 +81,74 @@ def main() -> None:
             print(f"  slopes by {kind}: errors {np.sqrt(information.sum() * spread) / told:.2f} of the bound")
 
 
+def motions(data: str, noise: NoiseModel, poses: int) -> None:
+    """The limit of the motion between two frames of a scene that is not known, over the first poses of some pairs."""
+    pairs = SonarPairs(data, part="all")
+    wanted = np.linspace(0, len(pairs) - 1, poses).astype(int)
+    gain = float(pairs.store.about["gain"])
+    found: dict[str, list[NDArray[np.float64]]] = {"oracle, pixels (rays)": []}
+    for scene in scenes_of(pairs.recipe, pairs.recipe.sequences):
+        for number in wanted[pairs.scene[pairs.first[wanted]] == scene.number]:
+            simulator = jittered(SceneRenderer(pairs.recipe, scene).simulator)
+            frame = pairs.first[number]
+            (seen,) = next(differentiate(simulator, pairs.pose[frame], gain))
+            oracle = bound(seen, noise, law="rays")
+            assert oracle is not None
+            found["oracle, pixels (rays)"].append(oracle.std(2))
+            sonar, pose = pairs.recipe.instrument, Pose(*pairs.pose[frame])
+            axes = sonar.range_m, sonar.bearing_rad
+            height = float(pairs.store.read("height_m", int(frame)))
+            ground = GroundGeometry(*axes, sonar.bearing, height, pose.pitch, pose.roll)
+            moving = ground.derivative / np.array([sonar.bin_m, np.diff(axes[1]).mean()])[:, None]
+            for name, known in (("tiles, scene known", True), ("tiles, scene unknown", False)):
+                fisher = of_tiles(seen, noise, moving, known)
+                found.setdefault(name, []).append(np.sqrt(np.diag(np.linalg.inv(fisher))))
+    for name, stds in found.items():
+        print(f"{name}: " + " / ".join(f"{value:.3g}" for value in in_units(overall(stds)[None])[0]) + " mm, mm, deg")
+
+
+def of_tiles(seen: Derivative, noise: NoiseModel, moving: NDArray[np.float64], known: bool) -> NDArray[np.float64]:
+    """Fisher information of the motion ``(3, 3)`` in two frames, from the spectra of tiles.
+
+    Args:
+        seen: the frame, and what its pixels vary by.
+        noise: added to it.
+        moving: how cells move with the motion, in bins and beams ``(bins, beams, 2, 3)``.
+        known: whether the scene is.
+    """
+    w = 2 * np.pi * np.fft.fftfreq(TILE)
+    along, across = np.meshgrid(np.where(abs(w) < np.pi, w, 0), np.where(abs(w) < np.pi, w, 0), indexing="ij")
+    spread = seen.variance + ROUNDING + seen.filled * (2 - np.pi / 2) * noise.scale**2 + (1 - seen.filled) * noise.std**2
+    every = TILE // 2
+    rows, columns = (range(0, length - TILE + 1, every) for length in seen.level.shape)
+    spectra, levels = np.zeros((len(rows), len(columns), TILE, TILE)), np.zeros((len(rows), len(columns), 1, 1))
+    for i, j in np.ndindex(spectra.shape[:2]):
+        own = slice(i * every, i * every + TILE), slice(j * every, j * every + TILE)
+        spectra[i, j] = spectrum(seen.level[own])
+        levels[i, j] = float((spread[own] * WINDOW**2).mean())
+    signal = uniform_filter(spectra, (3, 3, 1, 1), mode="nearest")  # one tile's spectrum is random
+    told = signal / (2 * levels) if known else signal**2 / (levels**2 + 2 * signal * levels)
+    told *= every**2 / TILE**2  # tiles overlap
+    matrix = np.einsum("aij,bij,rcij->rcab", *2 * [np.stack([along, across])], told)
+    middle = np.nan_to_num(moving[every::every, every::every][: len(rows), : len(columns)])
+    return np.asarray(np.einsum("rcak,rcab,rcbl->kl", middle, matrix, middle))
+
+
 def tiles(image: NDArray[np.uint8]) -> list[NDArray[np.float64]]:
     """Tiles of a frame as fractions of the maximum."""
     rows, columns = (range(0, length - TILE + 1, TILE) for length in image.shape)
     return [image[r : r + TILE, c : c + TILE] / 255 for r in rows for c in columns]
 
 
+def spectrum(tile: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Power of a tile by frequency, of all parts of it about its mean."""
+    return np.asarray(np.abs(np.fft.fft2((tile - tile.mean()) * WINDOW)) ** 2 / tile.size)
+
+
 def variance(tile: NDArray[np.float64], noise: NoiseModel) -> float:
     """Mean variance of the noise of a tile's pixels."""
     lit = float((tile > 0).mean())
-    return lit * (2 - np.pi / 2) * noise.scale**2 + (1 - lit) * noise.std**2
+    return lit * (2 - np.pi / 2) * noise.scale**2 + (1 - lit) * noise.std**2 + ROUNDING
 
 
 if __name__ == "__main__":
