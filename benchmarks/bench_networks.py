@@ -49,12 +49,14 @@ def main() -> None:
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     elsewhere = ",".join(filter(None, ["zero", "ecc", "direct", asked.corrnet]))
-    methods = ",".join(filter(None, [elsewhere, asked.networks]))
+    networks = [name for name in asked.networks.split(",") if name]
     for name in [asked.only] if asked.only else [*HOME, *ELSEWHERE]:
         data = asked.out / f"{name}{'' if name in HOME else '-few'}.zarr"
         common = (data, "--part", "all", "--reference", "direct")
         if name in HOME:
             make(data, name, SETS[name], "flight.pings=2")
+            forced = "" if name == HOME[0] else ":force=1"  # the other model's bearing is a cone's
+            methods = ",".join([elsewhere, *(network + forced for network in networks)])
             levels = ("--noise", "none,low,high", "--limit", 10)
             compare(asked.out / f"networks-{name}", *common, *levels, "--pairs", asked.pairs, "--estimators", methods)
             if asked.perturbed:

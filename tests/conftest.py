@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import sys
+import warnings
+from pathlib import Path
 
 import pytest
+from helpers import Command, Done
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -34,3 +38,20 @@ def variant() -> str:
     from mitsonar.simulation.variant import ensure_variant
 
     return ensure_variant()
+
+
+@pytest.fixture
+def mitsonar(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    """The command line in this process, which saves its start: ``mitsonar("render", scene, cwd=folder)``."""
+    from mitsonar.cli import main
+
+    def run(*arguments: object, cwd: Path | None = None) -> Done:
+        capfd.readouterr()
+        with monkeypatch.context() as changed, warnings.catch_warnings():
+            changed.setattr(sys, "argv", ["mitsonar", *map(str, arguments)])
+            changed.chdir(cwd or Path.cwd())
+            with pytest.raises(SystemExit) as end:
+                main()
+        return Done(int(end.value.code or 0), *capfd.readouterr())
+
+    return run

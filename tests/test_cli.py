@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Command, by_itself, refused
 from PIL import Image
 
 from mitsonar.errors import MitsonarError
@@ -41,14 +41,7 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def mitsonar(*arguments: object, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line in a process of its own."""
-    command = [sys.executable, "-m", "mitsonar", *map(str, arguments)]
-    env = {**os.environ, **environment}
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, timeout=300)
-
-
-def test_render_writes_all_that_it_promises(scene: Path, tmp_path: Path) -> None:
+def test_render_writes_all_that_it_promises(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = [
         "--frames",
@@ -88,7 +81,7 @@ def test_render_writes_all_that_it_promises(scene: Path, tmp_path: Path) -> None
     assert {"mitsuba", "drjit", "numpy"} <= set(about["versions"])
 
 
-def test_without_options_one_frame_from_the_pose_in_the_scene(scene: Path, tmp_path: Path) -> None:
+def test_without_options_one_frame_from_the_pose_in_the_scene(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     done = mitsonar("render", scene, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     frames = SonarFrames.load(tmp_path / "out" / "floor")
@@ -101,7 +94,9 @@ def test_without_options_one_frame_from_the_pose_in_the_scene(scene: Path, tmp_p
     assert frames.level_scale == same.level_scale
 
 
-def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(scene: Path, tmp_path: Path) -> None:
+def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(
+    mitsonar: Command, scene: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out, "--frames", 2, "--exr").returncode == 0
     assert mitsonar("image", out).returncode == 0
@@ -117,17 +112,7 @@ def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(scene: Pa
     np.testing.assert_allclose(np.minimum(levels, fewer.level_scale), fewer.image * fewer.level_scale, rtol=1e-6)
 
 
-def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    """One sentence, exit code 2, no traceback, and these words in it."""
-    assert done.returncode == 2, (done.returncode, done.stderr)
-    assert "Traceback" not in done.stderr + done.stdout
-    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1, done.stderr
-    for word in words:
-        assert word in lines[0], lines[0]
-
-
-def test_bad_input_is_answered_by_one_sentence(scene: Path, tmp_path: Path) -> None:
+def test_bad_input_is_answered_by_one_sentence(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "o"
     good = scene.read_text()
 
@@ -165,7 +150,7 @@ def test_bad_input_is_answered_by_one_sentence(scene: Path, tmp_path: Path) -> N
     assert not out.exists()
 
 
-def test_an_out_that_exists_is_kept(scene: Path, tmp_path: Path) -> None:
+def test_an_out_that_exists_is_kept(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
@@ -183,11 +168,11 @@ def test_an_out_that_exists_is_kept(scene: Path, tmp_path: Path) -> None:
 
 
 def test_without_llvm_the_error_names_the_command(scene: Path, tmp_path: Path) -> None:
-    done = mitsonar("render", scene, "-o", tmp_path / "o", DRJIT_LIBLLVM_PATH="/nonexistent", CUDA_VISIBLE_DEVICES="")
+    done = by_itself("render", scene, "-o", tmp_path / "o", DRJIT_LIBLLVM_PATH="/nonexistent", CUDA_VISIBLE_DEVICES="")
     refused(done, "libLLVM", "apt-get install")
 
 
-def test_a_seed_changes_the_jitter_and_a_parameter_the_scene(scene: Path, tmp_path: Path) -> None:
+def test_a_seed_changes_the_jitter_and_a_parameter_the_scene(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     images = []
     for name, options in (("a", []), ("b", ["--seed", 1]), ("c", ["-D", "cells=50"]), ("d", [])):
         assert mitsonar("render", scene, "-o", tmp_path / name, *options).returncode == 0
@@ -197,7 +182,9 @@ def test_a_seed_changes_the_jitter_and_a_parameter_the_scene(scene: Path, tmp_pa
     assert not np.array_equal(images[0], images[2])
 
 
-def test_a_killed_run_leaves_whole_frames_and_resumes_to_the_same_bits(scene: Path, tmp_path: Path) -> None:
+def test_a_killed_run_leaves_whole_frames_and_resumes_to_the_same_bits(
+    mitsonar: Command, scene: Path, tmp_path: Path
+) -> None:
     options = ["--frames", 60, "--to", "1,1,2.5,35,0,20", "--noise", "high"]
     assert mitsonar("render", scene, "-o", tmp_path / "whole", *options).returncode == 0
     out = tmp_path / "killed"
@@ -246,7 +233,7 @@ def test_a_long_run_stays_zarr(scene: Path, tmp_path: Path, monkeypatch: pytest.
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "zarr").image, SonarFrames.load(tmp_path / "npz").image)
 
 
-def test_broken_echoes_are_named(scene: Path, tmp_path: Path) -> None:
+def test_broken_echoes_are_named(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out, "--exr").returncode == 0
     (out / "echoes" / "000000.exr").write_bytes(b"not an image")
@@ -254,7 +241,7 @@ def test_broken_echoes_are_named(scene: Path, tmp_path: Path) -> None:
         list(StoredEchoes(out).pings(np.zeros((1, 6))))
 
 
-def test_presets_scenes_and_doctor_print() -> None:
+def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     listed = mitsonar("presets")
     assert listed.returncode == 0
     assert "oculus-m1200d-2100khz" in listed.stdout
@@ -313,7 +300,7 @@ def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
     assert len(SonarFrames.load(tmp_path / "run")) == 3
 
 
-def test_echoes_are_not_replaced_by_what_is_made_of_them(scene: Path, tmp_path: Path) -> None:
+def test_echoes_are_not_replaced_by_what_is_made_of_them(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out, "--exr").returncode == 0
     refused(mitsonar("image", out, "-o", out, "--overwrite"), "echoes", "another folder")

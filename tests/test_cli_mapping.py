@@ -9,60 +9,20 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 import tifffile
-from helpers import diffuse, files_of, floor, scene
+from helpers import Command, diffuse, files_of, floor, refused, scene
 from numpy.typing import NDArray
 from PIL import Image
 from test_odometry import as_zarr, over_ground, sway
 
-from mitsonar.cli import main
 from mitsonar.frames import SonarFrames
 from mitsonar.mapping.paths import path_of
 from mitsonar.motion import Pose, Trajectory, motions
 from mitsonar.sonar import Sonar
-
-
-class Done(NamedTuple):
-    """What a command came to."""
-
-    code: int
-    out: str
-    err: str
-
-
-Command = Callable[..., Done]
-
-
-@pytest.fixture
-def mitsonar(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
-    """Run the command line in this process."""
-
-    def run(*arguments: object) -> Done:
-        monkeypatch.setattr(sys, "argv", ["mitsonar", *map(str, arguments)])
-        capfd.readouterr()
-        with warnings.catch_warnings(), pytest.raises(SystemExit) as end:
-            main()
-        return Done(int(end.value.code or 0), *capfd.readouterr())
-
-    return run
-
-
-def refused(done: Done, *words: str) -> None:
-    """One sentence, exit code 2, no traceback, and these words in it."""
-    assert done.code == 2, done
-    lines = [line for line in done.err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1, done
-    assert "Traceback" not in done.err + done.out
-    for word in words:
-        assert word in lines[0], lines[0]
-
 
 DRIVEN = np.tile([0.012, 0.009, np.radians(0.3)], (11, 1))
 
@@ -121,9 +81,9 @@ def in_common(a: Path, b: Path) -> tuple[NDArray[np.float32], NDArray[np.float32
 def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "odometry"
     done = mitsonar("odometry", rendered, "-o", out, "--estimator", "direct")
-    assert done.code == 0, done
-    assert "11 motions by direct (pitch; height where no first echoes show), 0 not believed and bridged" in done.out
-    assert "end-point error" in done.out
+    assert done.returncode == 0, done
+    assert "11 motions by direct (pitch; height where no first echoes show), 0 not believed and bridged" in done.stdout
+    assert "end-point error" in done.stdout
     found = table(out)
     assert found["path length"] == pytest.approx(np.linalg.norm(DRIVEN[:, :2], axis=1).sum(), rel=1e-6)
     assert found["end-point error"] < 4, "mm"
@@ -133,12 +93,12 @@ def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered
     assert np.abs(motions(estimated.poses) - DRIVEN).max() < 2e-3
     for name, trajectory in (("a", out), ("b", "true"), ("c", out / "estimated.tum")):
         done = mitsonar("mosaic", rendered, trajectory, "-o", tmp_path / f"{name}.tif", "--cell-mm", 20)
-        assert done.code == 0, done
+        assert done.returncode == 0, done
     assert (tmp_path / "a.tif").read_bytes() == (tmp_path / "c.tif").read_bytes()
     # the check can fail: a path that goes the other way makes another map
     back = path_of(-DRIVEN, Pose(*true.poses[0]), true.time_s)
     back.save_tum(tmp_path / "back.tum")
-    assert mitsonar("mosaic", rendered, tmp_path / "back.tum", "-o", tmp_path / "d.tif", "--cell-mm", 20).code == 0
+    assert mitsonar("mosaic", rendered, tmp_path / "back.tum", "-o", tmp_path / "d.tif", "--cell-mm", 20).returncode == 0
     alike = {}
     for name in ("a", "d"):
         one, other = in_common(tmp_path / f"{name}.tif", tmp_path / "b.tif")
@@ -150,14 +110,14 @@ def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered
 
 def test_the_pictures_are_pictures(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     out = tmp_path / "odometry"
-    assert mitsonar("odometry", drawn, "-o", out, "--estimator", "zero").code == 0
+    assert mitsonar("odometry", drawn, "-o", out, "--estimator", "zero").returncode == 0
     done = mitsonar("mosaic", drawn, out, "-o", tmp_path / "map.png", "--blend", "centre", "--centre-beams", 40)
-    assert done.code == 0, done
-    assert "20 frames along the estimated path" in done.out
+    assert done.returncode == 0, done
+    assert "20 frames along the estimated path" in done.stdout
     for path in (out / "path.png", tmp_path / "map.png", tmp_path / "map.quality.png"):
         assert len(np.unique(np.array(Image.open(path)))) > 50
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.png"), "exists and is kept", "--overwrite")
-    assert mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.png", "--no-flatten", "--overwrite").code == 0
+    assert mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.png", "--no-flatten", "--overwrite").returncode == 0
 
 
 def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) -> None:
@@ -168,9 +128,9 @@ def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) 
     frames.poses = frames.height_m = None
     frames.save(tmp_path / "bare.npz")
     told = ["--height", 2.5, "--pitch-deg", 35]
-    assert mitsonar("odometry", tmp_path / "known.npz", "-o", tmp_path / "known").code == 0
+    assert mitsonar("odometry", tmp_path / "known.npz", "-o", tmp_path / "known").returncode == 0
     done = mitsonar("odometry", tmp_path / "bare.npz", "-o", tmp_path / "bare", *told, "--from", "1,-2,2.5,35,0,40")
-    assert done.code == 0, done
+    assert done.returncode == 0, done
     assert not (tmp_path / "bare" / "true.tum").exists()
     same = [(tmp_path / name / "estimated.tum").read_bytes() for name in ("known", "bare")]
     assert same[0] == same[1]
@@ -178,7 +138,7 @@ def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) 
     for name, options in (("known", []), ("bare", []), ("bare", told)):
         out = tmp_path / f"{len(maps)}.tif"
         done = mitsonar("mosaic", tmp_path / f"{name}.npz", tmp_path / name, "-o", out, "--cell-mm", 20, *options)
-        assert done.code == 0, done
+        assert done.returncode == 0, done
         maps.append(bands(out)[0])
     np.testing.assert_allclose(maps[0], maps[1], atol=2e-5)  # files round the pitch
     np.testing.assert_allclose(maps[0], maps[2], atol=2e-5)
@@ -192,12 +152,12 @@ def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) 
 def test_a_long_run_and_some_of_its_frames(mitsonar: Command, tmp_path: Path) -> None:
     """Every second frame of frames.zarr; the mosaic takes the frames that have a pose, and says how many have none."""
     as_zarr(over_ground(sway(12)), tmp_path / "frames.zarr")
-    assert mitsonar("odometry", tmp_path, "-o", tmp_path / "out", "--every", 2, "--smooth", "spline").code == 0
+    assert mitsonar("odometry", tmp_path, "-o", tmp_path / "out", "--every", 2, "--smooth", "spline").returncode == 0
     assert table(tmp_path / "out")["motions"] == 5
     done = mitsonar("mosaic", tmp_path / "frames.zarr", tmp_path / "out", "-o", tmp_path / "map.tif")
-    assert done.code == 0, done
-    assert "6 frames along the estimated path" in done.out
-    assert "warning: 6 of 12 frames have no pose" in done.err
+    assert done.returncode == 0, done
+    assert "6 frames along the estimated path" in done.stdout
+    assert "warning: 6 of 12 frames have no pose" in done.stderr
 
 
 def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
@@ -205,9 +165,9 @@ def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_p
     frames.image[10:13] = 0
     frames.save(tmp_path / "gap.npz")
     done = mitsonar("odometry", tmp_path / "gap.npz", "-o", tmp_path / "out")
-    assert done.code == 0, done
-    assert "warning: 4 of 19 motions (21 %) are not believed and were bridged" in done.err
-    assert "4 not believed and bridged" in done.out
+    assert done.returncode == 0, done
+    assert "warning: 4 of 19 motions (21 %) are not believed and were bridged" in done.stderr
+    assert "4 not believed and bridged" in done.stdout
     frames.image[...] = 0
     frames.save(tmp_path / "dark.npz")
     refused(mitsonar("odometry", tmp_path / "dark.npz", "-o", tmp_path / "dark"), "none of 19 motions is believed")
@@ -220,7 +180,7 @@ SAME = ("estimated.tum", "true.tum", "motions.csv", "covariances.npz", "table.md
 
 def test_a_killed_odometry_resumes_to_the_same_files_with_any_workers(mitsonar: Command, tmp_path: Path) -> None:
     over_ground(sway(120)).save(tmp_path / "frames.npz")
-    assert mitsonar("odometry", tmp_path, "-o", tmp_path / "whole", "--workers", 1).code == 0
+    assert mitsonar("odometry", tmp_path, "-o", tmp_path / "whole", "--workers", 1).returncode == 0
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "mitsonar", "odometry", str(tmp_path), "-o", str(out), "--workers", "1"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
@@ -236,7 +196,7 @@ def test_a_killed_odometry_resumes_to_the_same_files_with_any_workers(mitsonar: 
     refused(mitsonar("odometry", tmp_path, "-o", out), "exists and is kept", "--resume")
     refused(mitsonar("mosaic", tmp_path, out, "-o", tmp_path / "map.png"), "not finished", "--resume")
     again = mitsonar("odometry", tmp_path, "-o", out, "--resume", "--workers", 2)
-    assert again.code == 0, again
+    assert again.returncode == 0, again
     one, two = files_of(tmp_path / "whole"), files_of(out)
     for name in SAME:
         assert one[name] == two[name], name

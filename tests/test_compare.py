@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import tiny_recipe
-from test_cli import mitsonar, refused
+from helpers import Command, refused, tiny_recipe
 
 from mitsonar.dataset.generate import make
 from mitsonar.metrics import cluster_resamples, in_units
@@ -148,7 +147,7 @@ def test_limits_are_below_what_is_reached(pairs: SonarPairs) -> None:
     assert (np.sqrt((errors**2).mean(axis=0)) > found["pixel"]).all()
 
 
-def test_command_prints_a_table_and_goes_on(made: Path, tmp_path: Path) -> None:
+def test_command_prints_a_table_and_goes_on(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     words = ("compare", made, "--part", "all", "--noise", "none,high", "--limit", 0, "--estimators", "zero,ecc,direct")
     done = mitsonar(*words, "-o", tmp_path / "out", "--prior")
     assert done.returncode == 0, done.stderr
@@ -174,7 +173,7 @@ def test_command_prints_a_table_and_goes_on(made: Path, tmp_path: Path) -> None:
     refused(mitsonar(*words, "--pairs", 5, "-o", tmp_path / "out"), "other pairs", "choose another -o")
 
 
-def test_mistakes_are_said(made: Path, tmp_path: Path) -> None:
+def test_mistakes_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     refused(mitsonar("compare", made, "--estimators", "dierct"), "unknown estimator", "did you mean direct")
     refused(mitsonar("compare", made, "--part", "all", "--reference", "ecc", "--estimators", "zero"), "--reference")
     refused(mitsonar("compare", made, "--part", "all", "--noise", "loud"), "noise must be")
@@ -184,7 +183,7 @@ def test_mistakes_are_said(made: Path, tmp_path: Path) -> None:
     refused(mitsonar("compare", made, "--part", "all", "-o", tmp_path / "full"), "holds other things")
 
 
-def test_damaged_answers_are_said(made: Path, tmp_path: Path) -> None:
+def test_damaged_answers_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     words = ("compare", made, "--part", "all", "--limit", 0, "--estimators", "zero", "--pairs", 4, "-o", tmp_path / "out")
     assert mitsonar(*words).returncode == 0
     (path,) = (tmp_path / "out").glob("answers-*.npz")
@@ -192,7 +191,7 @@ def test_damaged_answers_are_said(made: Path, tmp_path: Path) -> None:
     refused(mitsonar(*words), "is damaged", "remove it")
 
 
-def test_an_axis_that_never_moves_and_a_turned_mount(tmp_path: Path) -> None:
+def test_an_axis_that_never_moves_and_a_turned_mount(mitsonar: Command, tmp_path: Path) -> None:
     """The truth is the sonar's motion, not the vehicle's; tables have no number for an axis without motion."""
     words = {"sonar__beams": 48, "sonar__range_bins": 256, "sonar__rays_per_beam": 200, "world__a_side": [25, 25]}
     mount = {"mount__heading_deg": 90.0, "mount__forward_m": 0.3}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import TINY, files_of, tiny_recipe
+from helpers import TINY, Command, files_of, refused, tiny_recipe
 
 from mitsonar.dataset.check import check
 from mitsonar.dataset.generate import make
@@ -759,23 +759,7 @@ def test_a_store_that_is_not_there(bucket: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- command line
 
 
-def refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    """One sentence, exit code 2, no traceback, and these words in it."""
-    assert done.returncode == 2, (done.returncode, done.stderr)
-    assert "Traceback" not in done.stderr + done.stdout, done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1, done.stderr
-    for word in words:
-        assert word in lines[0], lines[0]
-
-
-def mitsonar(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mitsonar", *map(str, arguments)], capture_output=True, text=True, cwd=cwd, timeout=200
-    )
-
-
-def test_commands_look_at_a_data_set(made: Path, tmp_path: Path) -> None:
+def test_commands_look_at_a_data_set(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     shown = mitsonar("dataset", "info", made)
     assert shown.returncode == 0, shown.stderr
     for words in ("150", "thesis", "mean / noise", "bytes a frame"):
@@ -797,7 +781,7 @@ def test_commands_look_at_a_data_set(made: Path, tmp_path: Path) -> None:
     assert (tmp_path / "tiny.png").stat().st_size > 20_000
 
 
-def test_commands_answer_mistakes(made: Path, tmp_path: Path) -> None:
+def test_commands_answer_mistakes(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     refused(mitsonar("dataset", "make", "rocky", "-o", tmp_path / "x"), "no recipe 'rocky'", "rocky-field")
     refused(mitsonar("dataset", "make", "ship-hull", "-o", tmp_path / "x", "--scale", 2), "--scale")
     refused(mitsonar("dataset", "make", "ship-hull", "-o", tmp_path / "x", "--scale", 0.1, "--sequences", 3), "contradict")
@@ -818,7 +802,7 @@ def test_commands_answer_mistakes(made: Path, tmp_path: Path) -> None:
     assert yaml.safe_load(printed)["world"]["family"] == "ship-hull"
 
 
-def test_worlds_from_the_command_line(tmp_path: Path) -> None:
+def test_worlds_from_the_command_line(mitsonar: Command, tmp_path: Path) -> None:
     made = mitsonar(
         "world", "rocky-field", "--size-m", 4, "--a-side", "2,3", "--rotation-deg", "-10,10", "-o", tmp_path / "w"
     )

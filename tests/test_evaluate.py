@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import run_python, tiny_recipe
-from test_cli_mapping import Command, refused
-from test_cli_mapping import mitsonar as mitsonar
+from helpers import Command, refused, run_python, tiny_recipe
 from test_odometry import over_ground, sway
 
 from mitsonar.dataset.generate import make
@@ -270,8 +268,8 @@ def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: Son
     assert there.motion == estimator.estimate(frames).motion
     assert there.covariance is not None
     done = mitsonar("evaluate", "corrnet", made, "--part", "all", "--pairs", "4", "--noise", "none")
-    assert done.code == 0, done.err
-    assert "corrnet" in done.out
+    assert done.returncode == 0, done.stderr
+    assert "corrnet" in done.stdout
     refused(mitsonar("evaluate", "./corrnet", made), "no checkpoint", "or corrnet")
 
 
@@ -333,8 +331,8 @@ def test_odometry_and_compare_take_checkpoints(
     sonar = Sonar(bearing="azimuth", beams=48, range_bins=256, range_min=3.2, range_max=5.6)
     over_ground(sway(12), sonar).save(tmp_path / "frames.npz")
     done = mitsonar("odometry", tmp_path / "frames.npz", "--estimator", run, "-o", tmp_path / "out1")
-    assert done.code == 0, done.err
-    assert "fixed by training" in done.out
+    assert done.returncode == 0, done.stderr
+    assert "fixed by training" in done.stdout
     told = [json.loads(line) for line in (tmp_path / "out1" / "estimates.jsonl").read_text().splitlines()]
     assert len(told) == 11
     assert all(np.allclose(one["motion"], SAYS, atol=1e-7) and one["believe"] for one in told)
@@ -342,8 +340,8 @@ def test_odometry_and_compare_take_checkpoints(
     assert stated["recipe"]["options"]["digest"] == checkpoint.digest
     table = ("compare", made, "--part", "all", "--limit", 0, "--estimators", f"zero,{run}")
     done = mitsonar(*table, "-o", tmp_path / "table", "--json")
-    assert done.code == 0, done.err
-    _, row = json.loads(done.out)["tables"][0]["rows"]
+    assert done.returncode == 0, done.stderr
+    _, row = json.loads(done.stdout)["tables"][0]["rows"]
     truth = SonarPairs(made, part="all", one_a_sequence=True)
     believed = [Network(checkpoint).estimate(truth.sonar_frames(k)).believe for k in range(len(truth))]
     answers = np.where(np.array(believed)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
@@ -351,7 +349,7 @@ def test_odometry_and_compare_take_checkpoints(
     assert row["failures"] == believed.count(False) <= 2
     assert np.allclose(row["rmse"], np.sqrt((errors**2).mean(axis=0)), rtol=1e-5)
     again = mitsonar(*table, "-o", tmp_path / "table", "--json")
-    assert json.loads(again.out)["tables"][0]["rows"][1] == row
+    assert json.loads(again.stdout)["tables"][0]["rows"][1] == row
     constant(truth, SAYS / 2).save(run / "network.ckpt")
     try:
         refused(mitsonar(*table, "-o", tmp_path / "table"), "other networks", "choose another -o")
@@ -369,7 +367,7 @@ def test_workers_of_odometry_say_the_same(mitsonar: Command, run: Path, tmp_path
     over_ground(sway(20), sonar).save(tmp_path / "frames.npz")
     for workers in (1, 2):
         words = ("--estimator", run, "--workers", workers, "-o", tmp_path / f"out{workers}")
-        assert mitsonar("odometry", tmp_path / "frames.npz", *words).code == 0
+        assert mitsonar("odometry", tmp_path / "frames.npz", *words).returncode == 0
     first, second = ((tmp_path / f"out{workers}" / "estimates.jsonl").read_bytes() for workers in (1, 2))
     assert first == second
 
@@ -377,7 +375,7 @@ def test_workers_of_odometry_say_the_same(mitsonar: Command, run: Path, tmp_path
 def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, run: Path, tmp_path: Path) -> None:
     words = ("evaluate", run, made, "--part", "all", "--noise", "none,high")
     done = mitsonar(*words, "-o", tmp_path / "out")
-    assert done.code == 0, done.err
+    assert done.returncode == 0, done.stderr
     for said in (
         "18 samples of 3 scenes, thesis model",
         "noise high",
@@ -386,9 +384,9 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         "fixed by training",
         "trained on",
     ):
-        assert said in done.out
-    assert "holds pairs that training has seen" in done.err
-    assert "3 scenes only" in done.err
+        assert said in done.stdout
+    assert "holds pairs that training has seen" in done.stderr
+    assert "3 scenes only" in done.stderr
     report = json.loads((tmp_path / "out" / "table.json").read_text())
     truth = SonarPairs(made, part="all", one_a_sequence=True)
     motion = np.array([truth.target(k) for k in range(len(truth))])
@@ -406,8 +404,8 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         assert table["beyond"] == {"true": 0.0, "answers": 0.0}
         assert row["ms"] > 0
     refused(mitsonar(*words, "-o", tmp_path / "out"), "exists and is kept", "--overwrite")
-    assert mitsonar(*words, "-o", tmp_path / "out", "--overwrite").code == 0
-    parts = json.loads(mitsonar("evaluate", run, made, "--noise", "none", "--pairs", 1, "--json").out)
+    assert mitsonar(*words, "-o", tmp_path / "out", "--overwrite").returncode == 0
+    parts = json.loads(mitsonar("evaluate", run, made, "--noise", "none", "--pairs", 1, "--json").stdout)
     assert (parts["part"], parts["pairs"]) == ("validation", 1)
 
 
@@ -448,8 +446,8 @@ def test_heights_are_evaluated_in_mm(many: dict[str, Path], mitsonar: Command, t
     trained = constant(own, [2.5])
     trained.save(tmp_path / "network.ckpt")
     done = mitsonar("evaluate", tmp_path, many["high"], "--part", "all", "--noise", "none", "-o", tmp_path / "out")
-    assert done.code == 0, done.err
-    assert "height mm" in done.out
+    assert done.returncode == 0, done.stderr
+    assert "height mm" in done.stdout
     row, zero = json.loads((tmp_path / "out" / "table.json").read_text())["tables"][0]["rows"]
     truth = np.array([own.target(k)[0] for k in range(len(own))])
     assert row["rmse"] == pytest.approx([1e3 * np.sqrt(((2.5 - truth) ** 2).mean())], rel=1e-5)
@@ -566,9 +564,9 @@ def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatc
     path = tmp_path / "network.onnx"
     words = ("export", tmp_path, "--onnx")
     done = mitsonar(*words, path, "--batch", "dynamic")
-    assert done.code == 0, done.err
-    assert str(path) in done.out
-    assert not done.err
+    assert done.returncode == 0, done.stderr
+    assert str(path) in done.stdout
+    assert not done.stderr
     before = path.read_bytes()
     agrees(before, checkpoint, 5)
     refused(mitsonar(*words, path), "exists and is kept", "--overwrite")
@@ -580,5 +578,5 @@ def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatc
     refused(mitsonar(*words, path, "--overwrite"), "writing ONNX needs onnxscript", "mitsonar[learn]")
     assert path.read_bytes() == before
     monkeypatch.setattr("mitsonar.networks.onnx.onnx_of", lambda checkpoint, batch: b"new")
-    assert mitsonar(*words, path, "--overwrite").code == 0
+    assert mitsonar(*words, path, "--overwrite").returncode == 0
     assert path.read_bytes() == b"new"

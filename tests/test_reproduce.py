@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import Command, refused
 from matplotlib.figure import Figure
-from test_cli import mitsonar, refused
 
 from mitsonar.dataset.recipe import load_recipe
 from mitsonar.errors import MitsonarError
@@ -391,7 +391,7 @@ def test_a_folder_keeps_to_what_it_was_begun_with(whole: Path, tmp_path: Path) -
     assert os.listdir(tmp_path) == ["thesis.docx"]
 
 
-def test_the_command_lists_its_tables_and_answers_to_mistakes(whole: Path, tmp_path: Path) -> None:
+def test_the_command_lists_its_tables_and_answers_to_mistakes(mitsonar: Command, whole: Path, tmp_path: Path) -> None:
     listed = mitsonar("reproduce")
     assert listed.returncode == 0, listed.stderr
     for name in RECIPES:
