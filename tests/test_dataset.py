@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import TINY, Command, files_of, refused, tiny_recipe
+from helpers import TINY, Command, Done, files_of, refused, tiny_recipe
 
 from mitsonar.dataset.check import check
 from mitsonar.dataset.generate import make
@@ -234,8 +234,9 @@ def command(folder: Path, *options: object, recipe: dict[str, Any] | None = None
     ]
 
 
-def run(arguments: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(arguments, capture_output=True, text=True, env={**os.environ, **environment}, timeout=300)
+def run(arguments: list[str], **environment: str) -> Done:
+    done = subprocess.run(arguments, capture_output=True, text=True, env={**os.environ, **environment}, timeout=300)
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
 def test_a_worker_that_lives_on_makes_the_data_set_that_it_is_asked_for(tmp_path: Path) -> None:
@@ -298,14 +299,16 @@ def test_what_the_plan_says_is_checked_and_mended(made: Path, tmp_path: Path, na
         ("zarr.json", b'{"zarr_format": 3, "node_type": "group", "attributes": {"kind": "mitsonar data set", "format": 1}}'),
     ],
 )
-def test_damaged_metadata_is_one_sentence(made: Path, tmp_path: Path, name: str, content: bytes | None) -> None:
+def test_damaged_metadata_is_one_sentence(
+    mitsonar: Command, made: Path, tmp_path: Path, name: str, content: bytes | None
+) -> None:
     url = copy_of(made, tmp_path)
     (url / name).unlink()
     if content is not None:
         (url / name).write_bytes(content)
     for word in ("check", "info"):
-        refused(run([sys.executable, "-m", "mitsonar", "dataset", word, str(url)]), "damaged")
-    refused(run(command(tmp_path, "--workers", 1, "--verify")), "damaged")
+        refused(mitsonar("dataset", word, url), "damaged")
+    refused(mitsonar(*command(tmp_path, "--workers", 1, "--verify")[3:]), "damaged")
 
 
 def test_killed_before_the_group_is_whole(made: Path, tmp_path: Path) -> None:
@@ -618,6 +621,7 @@ def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> No
         subprocess.run(["umount", str(small)], check=True)
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = f"""
 import os, sys

@@ -376,7 +376,9 @@ def test_another_size_than_it_was_made_for_is_refused() -> None:
 # ---------------------------------------------------------------- learning
 
 
-@pytest.mark.parametrize("name", THESIS)
+@pytest.mark.parametrize(
+    "name", [name if name == "posenet" else pytest.param(name, marks=pytest.mark.slow) for name in THESIS]
+)
 def test_it_learns_eight_samples_by_heart(name: str) -> None:
     """Random images with labels in +-10: the loss falls from that of answering 0 to a tenth and less."""
     network = tiny(name, dropout=0)

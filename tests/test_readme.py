@@ -39,9 +39,10 @@ def test_commands_and_python_blocks_run_in_order(tmp_path: Path) -> None:
         learns = command[1] in ("compare", "train", "evaluate", "export", "reproduce")
         if learns and importlib.util.find_spec("torch") is None:
             continue
-        # few frames are enough to see that a command works; odometry needs those of its run
-        few = "--trajectory" in command and "out/run" not in command
-        run(["-m", *command, *(["--frames", "2"] if few else [])], tmp_path)
+        # few frames and pairs are enough to see that a command works; odometry needs the frames of its run
+        fewer = ["--frames", "2"] if "--trajectory" in command and "out/run" not in command else []
+        fewer += ["--pairs", "8"] if command[1] == "compare" else []
+        run(["-m", *command, *fewer], tmp_path)
     for code in PYTHON:
         assert run(["-c", code], tmp_path)
 
