@@ -436,8 +436,9 @@ def _wait(until: Any, seconds: float) -> None:
         time.sleep(0.05)
 
 
-def test_no_scheduler_there(tmp_path: Path) -> None:
-    done = run(command(tmp_path, "--scheduler", "tcp://127.0.0.1:9"))
+def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mitsonar.dataset.workers.ANSWERS_WITHIN", "1s")
+    done = mitsonar(*command(tmp_path, "--scheduler", "tcp://127.0.0.1:9")[3:])
     refused(done, "no dask scheduler", "tcp://127.0.0.1:9")
 
 

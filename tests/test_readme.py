@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -35,24 +34,16 @@ def test_commands_and_python_blocks_run_in_order(tmp_path: Path) -> None:
     """In a folder that holds the scenes, as a checkout does; blocks may use what commands have made."""
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     assert len(COMMANDS) >= 12
+    assert FOR_TORCH
+    has_torch = importlib.util.find_spec("torch") is not None or os.environ.get("MITSONAR_REQUIRE_LEARN") == "1"
     for command in COMMANDS:
-        learns = command[1] in ("compare", "train", "evaluate", "export", "reproduce")
-        if learns and importlib.util.find_spec("torch") is None:
+        if command[1] in ("compare", "train", "evaluate", "export", "reproduce") and not has_torch:
             continue
         # few frames and pairs are enough to see that a command works; odometry needs the frames of its run
         fewer = ["--frames", "2"] if "--trajectory" in command and "out/run" not in command else []
         fewer += ["--pairs", "8"] if command[1] == "compare" else []
         run(["-m", *command, *fewer], tmp_path)
-    for code in PYTHON:
-        assert run(["-c", code], tmp_path)
-
-
-@pytest.mark.learn
-def test_blocks_for_torch_run(tmp_path: Path) -> None:
-    """Those that read the data set of the commands."""
-    make = next(command for command in COMMANDS if command[1:3] == ["dataset", "make"])
-    run(["-m", *make], tmp_path)
-    for code in FOR_TORCH:
+    for code in [*PYTHON, *(FOR_TORCH if has_torch else [])]:
         assert run(["-c", code], tmp_path)
 
 

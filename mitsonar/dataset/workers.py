@@ -33,6 +33,9 @@ LOSSES = 3
 SILENCE_S = 90.0
 """How long there may be no worker at all."""
 
+ANSWERS_WITHIN = "10s"
+"""How long a scheduler may take to answer first, in dask's words."""
+
 
 def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
     """Make the shards; their numbers, as they get done.
@@ -67,7 +70,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout="10s", set_as_default=False)
+            client = Client(scheduler, timeout=ANSWERS_WITHIN, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())[:160]
             raise MitsonarError(
