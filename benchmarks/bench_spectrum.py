@@ -28,12 +28,12 @@ from mitsonar.estimation.limit import bound, overall
 from mitsonar.geometry import GroundGeometry
 from mitsonar.metrics import in_units
 from mitsonar.motion import Pose
-from mitsonar.noise import NoiseModel, load_noise
+from mitsonar.noise import NoiseModel, information, load_noise
 from mitsonar.simulation.derivatives import Derivative, differentiate, jittered
+from mitsonar.sonar import Sonar
 
 TILE = 32
 BANDS = 4
-ROUNDING = 1 / 12 / 255**2
 
 WINDOW = np.outer(np.hanning(TILE + 2)[1:-1], np.hanning(TILE + 2)[1:-1])
 WINDOW /= np.sqrt(np.mean(WINDOW**2))
@@ -84,54 +84,56 @@ def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
 def motions(data: str, noise: NoiseModel, poses: int) -> None:
     """The limit of the motion between two frames of a scene that is not known, over the first poses of some pairs."""
     pairs = SonarPairs(data, part="all")
-    wanted = np.linspace(0, len(pairs) - 1, poses).astype(int)
+    wanted = pairs.first[np.linspace(0, len(pairs) - 1, poses).astype(int)]
     gain = float(pairs.store.about["gain"])
-    found: dict[str, list[NDArray[np.float64]]] = {"oracle, pixels (rays)": []}
+    found: dict[str, list[NDArray[np.float64]]] = {"oracle, pixels (rays)": [], "scene known": [], "scene unknown": []}
     for scene in scenes_of(pairs.recipe, pairs.recipe.sequences):
-        for number in wanted[pairs.scene[pairs.first[wanted]] == scene.number]:
-            simulator = jittered(SceneRenderer(pairs.recipe, scene).simulator)
-            frame = pairs.first[number]
-            (seen,) = next(differentiate(simulator, pairs.pose[frame], gain))
+        frames = wanted[pairs.scene[wanted] == scene.number]
+        if not len(frames):
+            continue
+        simulator = jittered(SceneRenderer(pairs.recipe, scene).simulator)
+        for frame, (seen,) in zip(frames, differentiate(simulator, pairs.pose[frames], gain), strict=True):
             oracle = bound(seen, noise, law="rays")
             assert oracle is not None
-            found["oracle, pixels (rays)"].append(oracle.std(2))
-            sonar, pose = pairs.recipe.instrument, Pose(*pairs.pose[frame])
-            axes = sonar.range_m, sonar.bearing_rad
             height = float(pairs.store.read("height_m", int(frame)))
-            ground = GroundGeometry(*axes, sonar.bearing, height, pose.pitch, pose.roll)
-            moving = ground.derivative / np.array([sonar.bin_m, np.diff(axes[1]).mean()])[:, None]
-            for name, known in (("tiles, scene known", True), ("tiles, scene unknown", False)):
-                fisher = of_tiles(seen, noise, moving, known)
-                found.setdefault(name, []).append(np.sqrt(np.diag(np.linalg.inv(fisher))))
+            signal, level = spectra_of(seen, noise)
+            moving = derivative_of(pairs.recipe.instrument, Pose(*pairs.pose[frame]), height)
+            found["oracle, pixels (rays)"].append(oracle.std(2))
+            found["scene known"].append(least(signal / (2 * level), moving))
+            found["scene unknown"].append(least(signal**2 / (level**2 + 2 * signal * level), moving))
     for name, stds in found.items():
-        print(f"{name}: " + " / ".join(f"{value:.3g}" for value in in_units(overall(stds)[None])[0]) + " mm, mm, deg")
+        print(f"{name}: " + " / ".join(f"{value:.3g}" for value in in_units(overall(stds))) + " mm, mm, deg")
 
 
-def of_tiles(seen: Derivative, noise: NoiseModel, moving: NDArray[np.float64], known: bool) -> NDArray[np.float64]:
-    """Fisher information of the motion ``(3, 3)`` in two frames, from the spectra of tiles.
-
-    Args:
-        seen: the frame, and what its pixels vary by.
-        noise: added to it.
-        moving: how cells move with the motion, in bins and beams ``(bins, beams, 2, 3)``.
-        known: whether the scene is.
-    """
-    w = 2 * np.pi * np.fft.fftfreq(TILE)
-    along, across = np.meshgrid(np.where(abs(w) < np.pi, w, 0), np.where(abs(w) < np.pi, w, 0), indexing="ij")
-    spread = seen.variance + ROUNDING + seen.filled * (2 - np.pi / 2) * noise.scale**2 + (1 - seen.filled) * noise.std**2
-    every = TILE // 2
-    rows, columns = (range(0, length - TILE + 1, every) for length in seen.level.shape)
+def spectra_of(seen: Derivative, noise: NoiseModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of tiles that overlap by half: power by frequency ``(rows, columns, TILE, TILE)``, the mean of neighbours since one
+    tile is random, and the variance of noise and rays ``(rows, columns, 1, 1)``."""
+    pixels = information(noise, seen.level, seen.filled).variance + seen.variance
+    rows, columns = (range(0, length - TILE + 1, TILE // 2) for length in seen.level.shape)
     spectra, levels = np.zeros((len(rows), len(columns), TILE, TILE)), np.zeros((len(rows), len(columns), 1, 1))
-    for i, j in np.ndindex(spectra.shape[:2]):
-        own = slice(i * every, i * every + TILE), slice(j * every, j * every + TILE)
-        spectra[i, j] = spectrum(seen.level[own])
-        levels[i, j] = float((spread[own] * WINDOW**2).mean())
-    signal = uniform_filter(spectra, (3, 3, 1, 1), mode="nearest")  # one tile's spectrum is random
-    told = signal / (2 * levels) if known else signal**2 / (levels**2 + 2 * signal * levels)
-    told *= every**2 / TILE**2  # tiles overlap
-    matrix = np.einsum("aij,bij,rcij->rcab", *2 * [np.stack([along, across])], told)
-    middle = np.nan_to_num(moving[every::every, every::every][: len(rows), : len(columns)])
-    return np.asarray(np.einsum("rcak,rcab,rcbl->kl", middle, matrix, middle))
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            own = slice(row, row + TILE), slice(column, column + TILE)
+            spectra[i, j] = spectrum(seen.level[own])
+            levels[i, j] = (pixels[own] * WINDOW**2).mean()
+    return uniform_filter(spectra, (3, 3, 1, 1), mode="nearest"), levels
+
+
+def derivative_of(sonar: Sonar, pose: Pose, height: float) -> NDArray[np.float64]:
+    """How the middles of those tiles move with the motion, in bins and beams ``(rows, columns, 2, 3)``."""
+    ground = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, height, pose.pitch, pose.roll)
+    cell = np.array([sonar.bin_m, np.diff(sonar.bearing_rad).mean()])
+    every = slice(TILE // 2, 1 - TILE // 2, TILE // 2)
+    return np.nan_to_num(ground.derivative / cell[:, None])[every, every]
+
+
+def least(told: NDArray[np.float64], moving: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least standard deviations of the motion ``(3,)``, from what each frequency of each tile tells of its phase."""
+    w = 2 * np.pi * np.fft.fftfreq(TILE)
+    w[TILE // 2] = 0  # the finest has no phase
+    axes = np.stack(np.meshgrid(w, w, indexing="ij"))
+    shifts = np.einsum("aij,bij,rcij->rcab", axes, axes, told / 4)  # each cell is in four tiles
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.einsum("rcak,rcab,rcbl->kl", moving, shifts, moving)))))
 
 
 def tiles(image: NDArray[np.uint8]) -> list[NDArray[np.float64]]:
@@ -147,8 +149,7 @@ def spectrum(tile: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def variance(tile: NDArray[np.float64], noise: NoiseModel) -> float:
     """Mean variance of the noise of a tile's pixels."""
-    lit = float((tile > 0).mean())
-    return lit * (2 - np.pi / 2) * noise.scale**2 + (1 - lit) * noise.std**2 + ROUNDING
+    return float(information(noise, tile, tile > 0).variance.mean())
 
 
 if __name__ == "__main__":

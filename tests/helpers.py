@@ -257,6 +257,9 @@ class Done(NamedTuple):
 
 Command = Callable[..., Done]
 
+PROGRAM = (sys.executable, "-m", "mitsonar")
+"""What a command begins with in a process of its own."""
+
 
 def refused(done: Done, *words: str) -> None:
     """One sentence, exit code 2, no traceback, and these words in it."""
@@ -270,7 +273,6 @@ def refused(done: Done, *words: str) -> None:
 
 def by_itself(*arguments: object, cwd: Path | None = None, **environment: str) -> Done:
     """The command line in a process of its own."""
-    command = [sys.executable, "-m", "mitsonar", *map(str, arguments)]
-    env = {**os.environ, **environment}
+    command, env = [*PROGRAM, *map(str, arguments)], {**os.environ, **environment}
     done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=env, timeout=300)
     return Done(done.returncode, done.stdout, done.stderr)

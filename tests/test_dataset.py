@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers import TINY, Command, Done, files_of, refused, tiny_recipe
+from helpers import PROGRAM, TINY, Command, by_itself, files_of, refused, tiny_recipe
 
 from mitsonar.dataset.check import check
 from mitsonar.dataset.generate import make
@@ -221,22 +221,7 @@ def command(folder: Path, *options: object, recipe: dict[str, Any] | None = None
     """The command line that makes the tiny data set in a folder."""
     path = folder / "tiny.yaml"
     path.write_text(yaml.safe_dump(recipe or TINY, sort_keys=False))
-    return [
-        sys.executable,
-        "-m",
-        "mitsonar",
-        "dataset",
-        "make",
-        str(path),
-        "-o",
-        str(folder / "tiny.zarr"),
-        *map(str, options),
-    ]
-
-
-def run(arguments: list[str], **environment: str) -> Done:
-    done = subprocess.run(arguments, capture_output=True, text=True, env={**os.environ, **environment}, timeout=300)
-    return Done(done.returncode, done.stdout, done.stderr)
+    return ["dataset", "make", str(path), "-o", str(folder / "tiny.zarr"), *map(str, options)]
 
 
 def test_a_worker_that_lives_on_makes_the_data_set_that_it_is_asked_for(tmp_path: Path) -> None:
@@ -308,7 +293,7 @@ def test_damaged_metadata_is_one_sentence(
         (url / name).write_bytes(content)
     for word in ("check", "info"):
         refused(mitsonar("dataset", word, url), "damaged")
-    refused(mitsonar(*command(tmp_path, "--workers", 1, "--verify")[3:]), "damaged")
+    refused(mitsonar(*command(tmp_path, "--workers", 1, "--verify")), "damaged")
 
 
 def test_killed_before_the_group_is_whole(made: Path, tmp_path: Path) -> None:
@@ -386,7 +371,7 @@ def test_shards_of_a_lost_worker_are_handed_out_again() -> None:
 
 
 def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    done = run(command(tmp_path, "--workers", 2))
+    done = by_itself(*command(tmp_path, "--workers", 2))
     assert done.returncode == 0, done.stderr
     assert files_of(tmp_path / "tiny.zarr") == files_of(made)
 
@@ -416,7 +401,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
         ]
         workers = [subprocess.Popen(worker, **quiet) for _ in range(2)]
         making = subprocess.Popen(
-            command(tmp_path, "--scheduler", address), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [*PROGRAM, *command(tmp_path, "--scheduler", address)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         _wait(lambda: any((tmp_path / "tiny.zarr" / "seal" / "c").glob("*/*/*")), 90)
         workers[0].kill()
@@ -438,7 +423,7 @@ def _wait(until: Any, seconds: float) -> None:
 
 def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mitsonar.dataset.workers.ANSWERS_WITHIN", "1s")
-    done = mitsonar(*command(tmp_path, "--scheduler", "tcp://127.0.0.1:9")[3:])
+    done = mitsonar(*command(tmp_path, "--scheduler", "tcp://127.0.0.1:9"))
     refused(done, "no dask scheduler", "tcp://127.0.0.1:9")
 
 
@@ -448,12 +433,12 @@ def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: 
     arguments, url = command(tmp_path, "--workers", 1), tmp_path / "tiny.zarr"
     kept: list[dict[str, float]] = []
     for moment in rng.uniform(0.8, 3.2, 10):
-        process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(moment)
         process.send_signal(signal.SIGKILL)
         process.wait()
         kept.append({str(path): path.stat().st_mtime_ns for path in url.glob("seal/c/*/*/*")})
-    done = run(arguments)
+    done = by_itself(*arguments)
     assert done.returncode == 0, done.stderr
     assert files_of(url) == files_of(made)
     for before, after in zip(kept, [*kept[1:], kept[-1]], strict=True):
@@ -540,7 +525,7 @@ with Place({str(url)!r}).locked():
     try:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "locked\n"
-        refused(run(command(tmp_path, "--workers", 1)), "another process is writing", "nothing was changed")
+        refused(by_itself(*command(tmp_path, "--workers", 1)), "another process is writing", "nothing was changed")
         assert files_of(url) == {"writer.lock": b""}
     finally:
         holder.kill()
@@ -609,13 +594,13 @@ def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> No
         pytest.skip("mounting a small file system is not allowed here")
     try:
         for workers in (1, 2):
-            refused(run(command(small, "--workers", workers, recipe=TINY)), "No space left on device")
+            refused(by_itself(*command(small, "--workers", workers, recipe=TINY)), "No space left on device")
             url = small / "tiny.zarr"
             assert not list(url.rglob("*.partial"))
             store = DataStore.open(url, unfinished=True)
             assert 0 < int(store.seals().any(axis=(1, 2)).sum()) < store.shards
         subprocess.run(["mount", "-o", "remount,size=10m", str(small)], check=True)
-        done = run(command(small, "--workers", 1))
+        done = by_itself(*command(small, "--workers", 1))
         assert done.returncode == 0, done.stderr
         assert files_of(url) == files_of(made)
     finally:
@@ -699,15 +684,15 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
     url = f"{bucket}/data/tiny.zarr"
     arguments = command(tmp_path, "--workers", 1)
     arguments[arguments.index("-o") + 1] = url
-    process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _wait(lambda: any(name.startswith("seal/c/") for name in listed(url)), 60)
     process.kill()
     process.wait()
-    refused(run(arguments), "is being written by process", "nothing was changed")  # its last sign is seconds old
+    refused(by_itself(*arguments), "is being written by process", "nothing was changed")  # its last sign is seconds old
     place = Place(url)
     lock = json.loads(place.read("writer.json"))
     place.write("writer.json", json.dumps({**lock, "time": lock["time"] - 1000}).encode())
-    done = run(arguments)
+    done = by_itself(*arguments)
     assert done.returncode == 0, done.stderr
     assert objects_of(url) == files_of(made)
     store = DataStore.open(url)
@@ -717,7 +702,7 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
     place.write(damaged, place.read(damaged)[:100])
     place.fs.invalidate_cache()
     assert [fault for fault in check(store) if damaged in fault]
-    done = run(arguments)
+    done = by_itself(*arguments)
     assert done.returncode == 0, done.stderr
     assert objects_of(url) == files_of(made)
 
@@ -735,7 +720,7 @@ def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: 
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
     arguments = command(tmp_path, "--workers", 1)
     arguments[arguments.index("-o") + 1] = "s3://bucket/tiny.zarr"
-    refused(run(arguments), "cannot list s3://bucket/tiny.zarr", "endpoint")
+    refused(by_itself(*arguments), "cannot list s3://bucket/tiny.zarr", "endpoint")
 
 
 def test_a_writer_that_was_taken_over_stops(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
