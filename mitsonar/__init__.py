@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 from mitsonar import plugins
 
 if TYPE_CHECKING:
+    from mitsonar.channel_sonar import ChannelSonar
+    from mitsonar.dataset.impulse_samples import ImpulseSamples
+    from mitsonar.dataset.impulses import ImpulsePairs
     from mitsonar.dataset.pairs import SonarPairs
     from mitsonar.dataset.recipe import Split, load_recipe
     from mitsonar.dataset.rendered import RenderedPairs
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from mitsonar.motion import Motion, Pose, Trajectory
     from mitsonar.noise import NoiseModel, load_noise
     from mitsonar.presets import PRESETS, load_sonar
+    from mitsonar.responses import ImpulseResponses
+    from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scenes import load_scene
     from mitsonar.sonar import Sonar
@@ -29,7 +34,12 @@ __version__ = "0.1.0"
 
 __all__ = [
     "PRESETS",
+    "ChannelSimulator",
+    "ChannelSonar",
     "DataStore",
+    "ImpulsePairs",
+    "ImpulseResponses",
+    "ImpulseSamples",
     "MitsonarError",
     "MitsonarWarning",
     "Motion",
@@ -50,7 +60,12 @@ __all__ = [
 
 _HOME = {
     "PRESETS": "presets",
+    "ChannelSimulator": "simulation.channel",
+    "ChannelSonar": "channel_sonar",
+    "ImpulseResponses": "responses",
     "DataStore": "dataset.store",
+    "ImpulsePairs": "dataset.impulses",
+    "ImpulseSamples": "dataset.impulse_samples",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
     "Motion": "motion",

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.files import read_npz
 from mitsonar.sonar import Sonar
 
 __all__ = ["LABELS", "SonarFrames", "to_uint8"]
@@ -149,11 +148,7 @@ class SonarFrames:
                 done = int(table.pop("frames_done", len(table["image"])))
                 table |= {name: table[name][:done] for name in PER_FRAME if name in table}
             else:
-                with zipfile.ZipFile(path) as file:  # read to the end, or NumPy would not see each part's checksum
-                    if any(entry.comment for entry in file.infolist()):  # a damaged length there swallows other parts
-                        raise ValueError("its list of parts is damaged")
-                    parts = {name.removesuffix(".npy"): io.BytesIO(file.read(name)) for name in file.namelist()}
-                table = {name: np.lib.format.read_array(part, allow_pickle=False) for name, part in parts.items()}
+                table = read_npz(path)
         except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
             raise MitsonarError(f"cannot read frames {path}: {error}; give frames.npz or a run's folder") from None
         return cls.from_arrays(table, str(path))

@@ -27,7 +27,9 @@ __all__ = [
     "motions",
     "mounted",
     "pose_from_to_world",
+    "steady",
     "to_world_matrices",
+    "velocities",
 ]
 
 # Mitsuba's sensor frame in the vehicle's: local x = port, local y = up, local z = forward (columns)
@@ -93,6 +95,38 @@ def motions(poses: ArrayLike) -> NDArray[np.float64]:
     turn = np.diff(table[:, 5])
     yaw = turn - 2 * np.pi * np.rint(turn / (2 * np.pi))
     return np.column_stack([x * cos - y * sin, x * sin + y * cos, yaw])
+
+
+def velocities(flown: Trajectory) -> NDArray[np.float64]:
+    """Velocity along a trajectory in the vehicle's own axes: starboard, forward, up [m/s], turn to starboard [rad/s]
+    ``(frames, 4)``; of each step, the last again (one pose: zero)."""
+    if len(flown) == 1:
+        return np.zeros((1, 4))
+    step = np.diff(flown.time_s)[:, None]
+    moved = vehicle_rotation(flown.poses[:-1]).inv().apply(np.diff(flown.poses[:, :3], axis=0)) / step
+    turn = np.diff(flown.poses[:, 5])
+    turned = (turn - 2 * np.pi * np.rint(turn / (2 * np.pi)))[:, None] / step
+    table = np.concatenate([moved, turned], axis=1)
+    return np.concatenate([table, table[-1:]])
+
+
+def steady(
+    start: Pose, velocity: tuple[float, float, float], frames: int, rate_hz: float
+) -> tuple[Trajectory, NDArray[np.float64]]:
+    """``frames`` poses of a level vehicle that keeps its velocity, starboard and forward [m/s] and turn [rad/s] in its own
+    axes, along an arc; and that velocity as :func:`velocities` has it ``(frames, 4)``."""
+    sideways, forward, turn = velocity
+    time = np.arange(frames) / rate_hz
+    angle = turn * time
+    # integral of the velocity turned by the heading: sin(a)/a and (1 - cos a)/a along the arc
+    along, beside = time * np.sinc(angle / np.pi), time * np.sin(angle / 2) * np.sinc(angle / (2 * np.pi))
+    sin, cos = np.sin(start.heading), np.cos(start.heading)
+    right, ahead = sideways * along + forward * beside, forward * along - sideways * beside
+    poses = np.tile(np.array(start, dtype=float), (frames, 1))
+    poses[:, 0] += right * cos + ahead * sin
+    poses[:, 1] += ahead * cos - right * sin
+    poses[:, 5] += angle
+    return Trajectory(poses, time), np.tile([sideways, forward, 0.0, turn], (frames, 1))
 
 
 def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``echo``, ``cell_noise``, ``perlin``.
+"""Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``channel_sonar``, ``echo``, ``cell_noise`` ...
 
 Mitsuba keeps one registry of plugins a variant, and a class can derive from ``mi.Sensor`` only once a variant is set.
 So :func:`install` registers them for the variant that is set, if any, and again after each change of variant, whether
@@ -16,7 +16,7 @@ from types import ModuleType
 
 __all__ = ["PLUGINS", "install"]
 
-PLUGINS = ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")
+PLUGINS = ("surfaces", "place", "imaging_sonar", "channel_sonar", "echo", "cell_noise", "perlin")
 """The modules that speak Mitsuba, in the order in which they import each other."""
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces"]
+__all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces", "facet_points", "reflectances_of", "reflectivity_at"]
 
 DEFAULT_REFLECTIVITY = 0.5
 
@@ -171,11 +171,10 @@ def _registry_index(shape: mi.Shape) -> int:
 
 def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> mi.Float:
     """Normal and reflectivity of each triangle, as Mitsuba itself computes them."""
-    si = _points_on_facets(mesh, 1 / 3, 1 / 3)
-    if not flat:
-        own = mi.Float(-1)
-    else:
-        own = _unit(_one_number(mesh.bsdf().eval_diffuse_reflectance(si)) if constant < 0 else mi.Float(constant))
+    si = facet_points(mesh, dr.arange(mi.UInt32, mesh.face_count()), mi.Point2f(1 / 3))
+    own = mi.Float(-1)
+    if flat:
+        own = reflectivity_at(mesh.bsdf(), si) if constant < 0 else mi.Float(constant)
     return dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, own))
 
 
@@ -193,7 +192,8 @@ def _object_ids(meshes: list[mi.Mesh]) -> mi.Float:
 
 def _corner_rows(mesh: mi.Mesh) -> mi.Float:
     """uv of each triangle's first corner, and its change to the second and to the third."""
-    first, second, third = (_points_on_facets(mesh, *place).uv for place in ((0, 0), (1, 0), (0, 1)))
+    facets = dr.arange(mi.UInt32, mesh.face_count())
+    first, second, third = (facet_points(mesh, facets, mi.Point2f(*place)).uv for place in ((0, 0), (1, 0), (0, 1)))
     second, third = second - first, third - first
     rows = mi.Float(dr.zeros(mi.Float, 8 * mesh.face_count()))
     start = dr.arange(mi.UInt32, mesh.face_count()) * 8
@@ -202,18 +202,30 @@ def _corner_rows(mesh: mi.Mesh) -> mi.Float:
     return rows
 
 
-def _points_on_facets(mesh: mi.Mesh, second: float, third: float) -> mi.SurfaceInteraction3f:
-    """The point with these barycentric coordinates on each triangle."""
-    count = mesh.face_count()
+def facet_points(mesh: mi.Mesh, facet: mi.UInt32, place: mi.Point2f) -> mi.SurfaceInteraction3f:
+    """Points on triangles: ``facet`` is the triangle's number, ``place`` its second and third barycentric coordinate."""
+    count = dr.width(facet)
     found = dr.zeros(mi.PreliminaryIntersection3f, count)
     found.valid = dr.full(mi.Bool, True, count)
     found.t = mi.Float(1)
-    found.prim_index = dr.arange(mi.UInt32, count)
-    found.prim_uv = mi.Point2f(second, third)
+    found.prim_index = facet
+    found.prim_uv = place
     found.shape = mi.ShapePtr(mesh)
     ray = dr.zeros(mi.Ray3f, count)
     ray.d = mi.Vector3f(0, 0, 1)
     return found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
+
+
+def reflectances_of(bsdf: mi.BSDF) -> list[mi.Object]:
+    """The textures that a BSDF's reflectivity may come from."""
+    return _walk(bsdf)[1]
+
+
+def reflectivity_at(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> mi.Float:
+    """Reflectivity 0..1 of a BSDF at points; :data:`DEFAULT_REFLECTIVITY` where it has no diffuse reflectance."""
+    if not _walk(bsdf)[0] <= DIFFUSE | APPROXIMATED | WRAPPERS:
+        return mi.Float(DEFAULT_REFLECTIVITY)
+    return _unit(_one_number(bsdf.eval_diffuse_reflectance(si)))
 
 
 def _one_number(spectrum: Any) -> mi.Float:

@@ -53,12 +53,18 @@ def observatory() -> Trajectory:
     return arc((0.0, 0.0), pose(0, -13.5, 7, 32), 60, 45, 2)
 
 
+def hydrophones() -> Trajectory:
+    """1 m ahead and 0.5 m to starboard, for the imaging sonar; hydrophones fly courses (`mitsonar impulse`)."""
+    return Trajectory.between(pose(0, 0, 2.5, 35), pose(0.5, 1.0, 2.5, 35), 45, 10)
+
+
 TRAJECTORIES: dict[str, Callable[[], Trajectory]] = {
     "flat_floor": flat_floor,
     "pattern": pattern,
     "objects": objects,
     "sunken_ship": sunken_ship,
     "observatory": observatory,
+    "hydrophones": hydrophones,
 }
 
 

@@ -239,6 +239,29 @@ def tiny_recipe(**changes: Any) -> Any:
     return recipe_from(fields)
 
 
+HEARD: dict[str, Any] = {
+    "name": "heard",
+    "world": {"family": "flat-objects", "size_m": 16.0, "seabed_cells": 96, "rectangles": 20, "ellipses": 20},
+    "scenes": [{"count": 4, "sequences": 10}],
+    "channel": {"range_max": 8.0, "frequency_step_hz": 40.0, "frame_rate_hz": 40.0},
+    "flight": {"height_m": 4.0, "pings": 3, "sideways_mm": 50.0, "forward_mm": 50.0, "yaw_deg": 0.4, "jump_m": None},
+    "frames": 3,
+    "split": {"by": "scene", "train": 0.5, "validation": 0.5},
+}
+"""Four small scenes of ten sequences of three pings: a second each."""
+
+
+def heard_recipe(**changes: Any) -> Any:
+    """The small recipe of responses with some groups of keys changed."""
+    from mitsonar.dataset.recipe import recipe_from
+
+    groups = {
+        name: {**HEARD[name], **value} if isinstance(value, dict) and name in HEARD else value
+        for name, value in changes.items()
+    }
+    return recipe_from({**HEARD, **groups})
+
+
 def files_of(folder: Path) -> dict[str, bytes]:
     """All files below a folder."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}

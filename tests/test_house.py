@@ -19,40 +19,68 @@ STAGES = (
         "errors",
         "files",
         "sonar",
+        "channel_sonar",
         "presets",
         "motion",
+        "courses",
         "frames",
+        "responses",
         "framestore",
         "noise",
         "geometry",
         "height",
         "metrics",
         "plots",
+        "response_plots",
     ),
     "simulation.echoes",
-    *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "echo", "cell_noise", "perlin")),
+    *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "channel_sonar", "echo", "cell_noise", "perlin")),
     *(f"simulation.worlds.{name}" for name in ("shapes", "perlin", "world")),
     *(f"simulation.worlds.{name}" for name in ("rocky_field", "ship_hull", "pattern", "flat_objects")),
     *(f"simulation.worlds.{name}" for name in ("user_mesh", "scene_file")),
     "simulation.worlds.families",
     *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "tracing", "views", "segments", "bistatic")),
     *(f"simulation.{name}" for name in ("binning", "imaging", "runs", "derivatives")),
+    *(f"simulation.{name}" for name in ("paths", "scatterers", "hearing", "channel", "impulse_runs")),
     *(
         f"dataset.{name}"
-        for name in ("recipe", "plan", "split", "place", "store", "rendering", "shards", "workers", "generate")
+        for name in ("recipe", "recording", "image_recording", "response_recording", "recordings", "plan", "split", "place")
     ),
-    *(f"dataset.{name}" for name in ("check", "sheet", "arrangement", "ground", "pairs", "rendered", "again")),
+    *(f"dataset.{name}" for name in ("store", "rendering", "hearing", "renderers", "shards", "workers", "generate")),
+    *(
+        f"dataset.{name}"
+        for name in ("check", "response_sheet", "sheet", "arrangement", "ground", "parts", "batches", "pairs", "rendered")
+    ),
+    *(f"dataset.{name}" for name in ("again", "packing", "impulse_samples", "impulses")),
     *(
         f"networks.{name}"
         for name in ("law", "blocks", "posenet", "sfmnet", "cnn1b", "cnn4b", "cnn4posenet", "posenet_dual")
     ),
-    *(f"networks.{name}" for name in ("look", "matching", "slopes", "corrnet", "create", "shipped", "checkpoint", "onnx")),
+    *(
+        f"networks.{name}"
+        for name in ("look", "matching", "slopes", "corrnet", "impulse_posenet", "create", "shipped", "checkpoint", "onnx")
+    ),
     *(
         f"estimation.{name}"
         for name in ("estimator", "zero", "ground", "ecc", "phase", "flow", "direct", "network", "estimators")
     ),
-    *(f"estimation.{name}" for name in ("limit", "comparison")),
-    *(f"mapping.{name}" for name in ("paths", "assessment", "source", "odometry", "mosaic", "charts", "results")),
+    *(f"estimation.{name}" for name in ("limit", "comparison", "regressors")),
+    *(f"estimation.{name}" for name in ("impulse", "ground_law", "impulse_search", "impulse_limit")),
+    *(f"estimation.{name}" for name in ("impulse_correlation", "impulse_likelihood", "impulse_estimators")),
+    *(
+        f"mapping.{name}"
+        for name in (
+            "paths",
+            "assessment",
+            "source",
+            "response_source",
+            "continuity",
+            "odometry",
+            "mosaic",
+            "charts",
+            "results",
+        )
+    ),
     *(f"training.{name}" for name in ("recipe", "loss", "data", "augment", "module", "journal", "run")),
     *(f"training.{name}" for name in ("evaluation", "tables", "reproduce")),
     "cli",
@@ -264,7 +292,7 @@ def test_package_data_names_every_shipped_file() -> None:
     shipped = {path for path in scenes.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
     assert shipped == named
     recipes = set((ROOT / "mitsonar" / "dataset").glob(SETUPTOOLS["package-data"]["mitsonar.dataset"][0]))
-    assert len(recipes) == 11
+    assert len(recipes) == 27
     training = ROOT / "benchmarks" / "recipes"
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.recipes"] for path in training.glob(pattern)}
     assert {path for path in training.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")} == named

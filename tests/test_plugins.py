@@ -13,7 +13,7 @@ from helpers import run_python
 
 from mitsonar.plugins import PLUGINS
 
-SHIPPED = ("imaging_sonar", "echo", "cell_noise", "perlin")
+SHIPPED = ("imaging_sonar", "channel_sonar", "echo", "cell_noise", "perlin")
 
 SCENE = """
     XML = '''<scene version="3.0.0">

@@ -16,6 +16,7 @@ def main() -> None:
         evaluate,
         export,
         image,
+        impulse,
         limit,
         mosaic,
         odometry,
@@ -35,6 +36,7 @@ def main() -> None:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.command()(render.render)
+    app.command()(impulse.impulse)
     app.command()(image.image)
     app.command()(presets.presets)
     app.command()(presets.scenes)

@@ -13,7 +13,7 @@ import typer
 from numpy.typing import NDArray
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render import SIX, _instrument, _parameters, _path
+from mitsonar.cli.render import SIX, _instrument, _path, scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def limit(
             raise MitsonarError(f"{source} is a data set, which says sonar, poses and segments itself: give none of them")
         subject = _of_data(source, pairs, part, gain, seed)
     else:
-        subject = _of_scene(source, sonar, model, seed, segments, gain, _parameters(parameter or []), flown)
+        subject = _of_scene(source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), flown)
     if name is not None and gain is None:
         subject = Subject(subject.sonar, subject.views, subject.places, subject.poses, None)
     rows: list[tuple[Value | None, Table]] = []

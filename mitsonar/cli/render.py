@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mitsonar.motion import Pose, Trajectory
     from mitsonar.sonar import Sonar
 
-__all__ = ["render"]
+__all__ = ["SIX", "render", "scene_parameters"]
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 
@@ -48,7 +48,7 @@ def render(
     if overwrite and resume:
         raise MitsonarError("--overwrite and --resume contradict each other: give one")
     outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr)
-    parameters = _parameters(parameter or [])
+    parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     instrument, standing = _instrument(loaded, sonar, model, seed)
     path = _path(instrument, standing, scene, frames, start, end, trajectory)
@@ -65,7 +65,8 @@ def render(
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
 
 
-def _parameters(pairs: list[str]) -> dict[str, str]:
+def scene_parameters(pairs: list[str]) -> dict[str, str]:
+    """What -D says."""
     wrong = [pair for pair in pairs if "=" not in pair]
     if wrong:
         raise MitsonarError(f"-D takes NAME=VALUE: got {wrong[0]!r}")

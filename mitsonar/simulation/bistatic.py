@@ -26,9 +26,6 @@ __all__ = ["Receiver"]
 FEWEST_ACROSS = 8
 """Jittered rays of the transmitter across a receiver's beam, below which images have stripes."""
 
-OFF_SURFACE = 1e-5
-"""How far off a surface a ray to the receiver begins, as a part of the size of coordinates: ten times their rounding."""
-
 
 class Receiver:
     """One receiver of a bistatic sonar.
@@ -89,6 +86,8 @@ class Receiver:
         import drjit as dr
         import mitsuba as mi
 
+        from mitsonar.simulation.tracing import hidden
+
         lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
         u: Any
         point, normal = mi.Point3f(echoes.x, echoes.y, echoes.z), mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
@@ -99,7 +98,7 @@ class Receiver:
         beam, inside, elevation = self._beam(-port, forward, up)
         toward = dr.dot(normal, u)
         lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
-        active = lit & ~self._hidden(scene, point, u, distance, normal, toward, lit)
+        active = lit & ~hidden(scene, point, normal, u, distance, lit)
         return Seen(self._heard(echoes, fan, u, distance, normal), dr.select(active, beam, 0), active, elevation)
 
     def _beam(self, starboard: Any, forward: Any, up: Any) -> tuple[Any, Any, Any]:
@@ -124,18 +123,6 @@ class Receiver:
             axes = mi.Float(sonar.bearing_rad.tolist())
             inside &= dr.abs(bearing - dr.gather(mi.Float, axes, beam)) <= sonar.beam_width_rad / 2
         return beam, inside, elevation
-
-    def _hidden(self, scene: Any, point: Any, u: Any, distance: Any, normal: Any, toward: Any, active: Any) -> Any:
-        """Whether something stands between the point and the receiver."""
-        import drjit as dr
-        import mitsuba as mi
-
-        size = dr.select(dr.abs(point.x) > dr.abs(point.y), dr.abs(point.x), dr.abs(point.y)) + dr.abs(point.z)
-        off = (1 + size) * OFF_SURFACE
-        begin = point + normal * dr.select(toward > 0, -off, off)
-        ray = mi.Ray3f(begin, -u)
-        ray.maxt = distance * (1 - mi.math.ShadowEpsilon)
-        return scene.ray_test(ray, active)
 
     def _heard(self, echoes: Echoes, fan: Fan, u: Any, distance: Any, normal: Any) -> Echoes:
         """Range, footprint, cosine and weight of the echoes between transmitter and receiver."""

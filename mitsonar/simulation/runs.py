@@ -27,7 +27,7 @@ from mitsonar.simulation.imaging import Pings, Tally, constant_gain, to_image
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.sonar import Sonar
 
-__all__ = ["Outputs", "Report", "Source", "StoredEchoes", "run", "scene_digest"]
+__all__ = ["Outputs", "Report", "Source", "StoredEchoes", "begin", "path_digest", "run", "scene_digest"]
 
 
 class Source(Protocol):
@@ -96,7 +96,7 @@ def run(
     """
     folder = Path(folder)
     recipe = _recipe(source, trajectory, outputs, origin)
-    state = _begin(folder, recipe, overwrite=overwrite, resume=resume)
+    state = begin(folder, recipe, "frames", overwrite=overwrite, resume=resume)
     trajectory.save_tum(folder / "poses.tum")
     if not state["finished"]:
         progress(int(state["frames_done"]))
@@ -206,6 +206,11 @@ def scene_digest(path: str | Path) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
+def path_digest(trajectory: Trajectory) -> str:
+    """SHA-256 of poses and times."""
+    return hashlib.sha256(np.column_stack([trajectory.poses, trajectory.time_s]).tobytes()).hexdigest()
+
+
 def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dict[str, Any]) -> dict[str, Any]:
     """All that decides the bits of a run."""
     return {
@@ -213,7 +218,7 @@ def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: di
         "variant": source.variant,
         "sonar": source.sonar.model_dump(),
         "frames": len(trajectory),
-        "poses_sha256": hashlib.sha256(np.column_stack([trajectory.poses, trajectory.time_s]).tobytes()).hexdigest(),
+        "poses_sha256": path_digest(trajectory),
         "noise": outputs.noise.model_dump(),
         "labels": outputs.labels,
         "cartesian": outputs.cartesian,
@@ -221,8 +226,19 @@ def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: di
     }
 
 
-def _begin(folder: Path, recipe: dict[str, Any], *, overwrite: bool, resume: bool) -> dict[str, Any]:
-    """The state of the run: a new one, in a new folder, or the one that is there and was broken off."""
+def begin(folder: Path, recipe: dict[str, Any], what: str, *, overwrite: bool, resume: bool) -> dict[str, Any]:
+    """The state of the run: a new one, in a new folder, or the one that is there and was broken off.
+
+    Args:
+        folder: of the run.
+        recipe: all that decides its bits.
+        what: it makes, ``frames`` or ``responses``: a Zarr group of that name while it goes on, packed as npz in the end.
+        overwrite: replace a run that is there.
+        resume: go on with a run that was broken off.
+
+    Raises:
+        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+    """
     exists = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     if exists and resume:
         state = read_json(folder / "run.json")
@@ -233,8 +249,9 @@ def _begin(folder: Path, recipe: dict[str, Any], *, overwrite: bool, resume: boo
                 f"{folder} holds another run, it differs in {', '.join(other)}: resume with the options it was begun "
                 f"with (run.json has them), or choose another folder"
             )
-        if (folder / "frames.npz").exists():  # killed while the store was packed, or finished
-            shutil.rmtree(folder / "frames.zarr", ignore_errors=True)
+        if (folder / f"{what}.npz").exists():  # killed while the store was packed, or finished
+            if what == "frames":
+                shutil.rmtree(folder / "frames.zarr", ignore_errors=True)
             state["finished"] = True
             write_json(folder / "run.json", state)
         return {"finished": False, "frames_done": 0, "warnings": []} | state

@@ -7,6 +7,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mitsonar.channel_sonar import ChannelSonar
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.motion import Pose
 from mitsonar.simulation.variant import ensure_variant
@@ -15,7 +16,7 @@ from mitsonar.sonar import Sonar
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["find_scene", "load_scene", "shipped_scenes", "shipped_trajectory", "sonar_in"]
+__all__ = ["channel_sonar_in", "find_scene", "load_scene", "shipped_scenes", "shipped_trajectory", "sonar_in"]
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -73,6 +74,14 @@ def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
     from mitsonar.plugins.imaging_sonar import is_imaging_sonar
 
     found = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
+    return (found[index].sonar, found[index].pose) if index < len(found) else None
+
+
+def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pose] | None:
+    """Instrument and pose of the scene's ``channel_sonar`` number ``index``; None where there is none."""
+    from mitsonar.plugins.channel_sonar import is_channel_sonar
+
+    found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
     return (found[index].sonar, found[index].pose) if index < len(found) else None
 
 

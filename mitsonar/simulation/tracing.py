@@ -16,7 +16,10 @@ from mitsonar.plugins import echo, imaging_sonar, surfaces
 from mitsonar.simulation.echoes import Echoes
 from mitsonar.sonar import Sonar
 
-__all__ = ["Rays", "Tracer"]
+__all__ = ["Rays", "Tracer", "height_below", "hidden"]
+
+OFF_SURFACE = 1e-5
+"""How far off a surface a ray to a receiver begins, as a part of the size of coordinates: ten times their rounding."""
 
 
 class Rays:
@@ -110,6 +113,29 @@ class Tracer:
     def height_m(self, scene: mi.Scene, rows: mi.Float) -> Any:
         """Height of each pose over what is straight below it [m]; nan where there is nothing."""
         line = dr.arange(mi.UInt32, dr.width(rows) // 12) * 3
-        place = mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3)))
-        found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
-        return dr.select(found.is_valid(), found.t, dr.nan)
+        return height_below(scene, mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3))))
+
+
+def height_below(scene: mi.Scene, place: mi.Point3f) -> Any:
+    """Height of places over what is straight below them [m]; nan where there is nothing."""
+    found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
+    return dr.select(found.is_valid(), found.t, dr.nan)
+
+
+def hidden(scene: Any, point: Any, normal: Any, u: Any, distance: Any, active: Any) -> Any:
+    """Whether something stands between points of a surface and an eye.
+
+    Args:
+        scene: traced.
+        point: on the surface.
+        normal: of the surface there, either way.
+        u: unit direction from the eye to the point.
+        distance: from the eye [m].
+        active: which points are asked for.
+    """
+    size = dr.select(dr.abs(point.x) > dr.abs(point.y), dr.abs(point.x), dr.abs(point.y)) + dr.abs(point.z)
+    off = (1 + size) * OFF_SURFACE
+    begin = point + normal * dr.select(dr.dot(normal, u) > 0, -off, off)
+    ray = mi.Ray3f(begin, -u)
+    ray.maxt = distance * (1 - mi.math.ShadowEpsilon)
+    return scene.ray_test(ray, True, active)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError, nearest_names
 
-__all__ = ["VARIANTS", "Backend", "backend", "ensure_variant", "release_memory", "use_threads"]
+__all__ = ["VARIANTS", "Backend", "backend", "ensure_variant", "release_memory", "thread_count", "use_threads"]
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
 """The variants that mitsonar works with; monochrome ones need less memory."""
@@ -62,6 +62,13 @@ def use_threads(count: int) -> None:
 
     if dr.thread_count() != count:
         dr.set_thread_count(count)
+
+
+def thread_count() -> int:
+    """How many threads the renderer has, one at least."""
+    import drjit as dr
+
+    return max(1, int(dr.thread_count()))
 
 
 def release_memory() -> None:

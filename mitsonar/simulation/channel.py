@@ -1,0 +1,259 @@
+"""Echoes to complex channel impulse responses, for any transmitter and receivers (Almanza-Medina, 5.2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import finufft
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.channel_sonar import PADDING, ChannelSonar
+from mitsonar.errors import MitsonarError
+from mitsonar.motion import Trajectory
+from mitsonar.responses import ImpulseResponses
+from mitsonar.simulation.variant import thread_count
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impulse_response"]
+
+FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "doppler")
+FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
+"""What is fetched of :class:`~mitsonar.simulation.hearing.Heard`."""
+
+TOLERANCE = 1e-9
+"""Of the non-uniform FFT, relative."""
+
+PINGS_AT_A_TIME = 16
+"""Whose launches wait for their transforms: 50 bytes an echo and receiver."""
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Responses of consecutive pings, and what became of the echoes.
+
+    Attributes:
+        first: number of the first ping.
+        response: ``(pings, receivers, taps)`` complex64.
+        height_m: of the transmitter over what is straight below it ``(pings,)``; nan where nothing is.
+        echoes: that count ``(pings, receivers)``.
+        dropped: echoes from beyond ``range_max`` ``(pings, receivers)``.
+    """
+
+    first: int
+    response: NDArray[np.complex64]
+    height_m: NDArray[np.float64]
+    echoes: NDArray[np.int64]
+    dropped: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.response)
+
+
+@dataclass(frozen=True)
+class Paths:
+    """The echoes of one ping at one receiver.
+
+    Attributes:
+        delay_s: ``(n,)`` float64.
+        amplitude: ``(n,)`` float64.
+        doppler_hz: shift of the carrier ``(n,)``, positive where the way gets shorter.
+        dropped: how many more came from beyond ``range_max``.
+    """
+
+    delay_s: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    doppler_hz: NDArray[np.float64]
+    dropped: int
+
+
+class ChannelSimulator:
+    """A scene heard by a channel sonar.
+
+    ``scatterers``: points of the world (:mod:`mitsonar.simulation.scatterers`) that the transmitter sees, one shadow ray
+    each; amplitude sqrt(C dA cos_A cos_B) / (r_A r_B), so that its square is the level of an imaging sonar's echo. ``rays``:
+    the thesis's model, rays that are fixed to the vehicle, evenly over each receiver's field of view; amplitude C cos_A.
+
+    Args:
+        scene: any Mitsuba scene.
+        sonar: the instrument.
+        like: of the same scene, whose scatterers are used again where the instruments would have the same.
+
+    Attributes:
+        notes: what a user should know about the scene's BSDFs.
+
+    Raises:
+        MitsonarError: no surface to carry scatterers.
+    """
+
+    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None) -> None:
+        self.sonar = sonar
+        from mitsonar.simulation.hearing import Hearing
+
+        self.hearing: Hearing = Hearing(scene, sonar, None if like is None else like.hearing)
+        self.notes = self.hearing.notes
+
+    def responses(
+        self, flown: Trajectory, velocity: ArrayLike | None = None, progress: Callable[[int], None] = lambda pings: None
+    ) -> ImpulseResponses:
+        """Responses of a whole trajectory.
+
+        Args:
+            flown: poses of the transmitter and times.
+            velocity: in the vehicle's axes, see :class:`~mitsonar.responses.ImpulseResponses`; default: standing still.
+            progress: called with the number of pings that were added.
+
+        Raises:
+            MitsonarError: velocities that do not fit.
+        """
+        parts = []
+        for part in self.pings(flown.poses, velocity):
+            parts.append(part)
+            progress(len(part))
+        return ImpulseResponses(
+            response=np.concatenate([part.response for part in parts]),
+            time_s=flown.time_s,
+            sonar=self.sonar,
+            poses=flown.poses,
+            velocity=_checked(velocity, len(flown), self.sonar.sound_speed),
+            height_m=np.concatenate([part.height_m for part in parts]),
+            echoes=np.concatenate([part.echoes for part in parts]),
+            dropped=np.concatenate([part.dropped for part in parts]),
+        )
+
+    def pings(self, poses: ArrayLike, velocity: ArrayLike | None = None, *, first: int = 0) -> Iterator[Channels]:
+        """Responses of consecutive pings, some at a time: memory does not grow with their number.
+
+        Args:
+            poses: of the transmitter when a ping is sent ``(pings, 6)``.
+            velocity: in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s].
+            first: number of the first ping.
+
+        Raises:
+            MitsonarError: velocities that do not fit.
+        """
+        table = np.atleast_2d(np.asarray(poses, dtype=float))
+        speeds = _checked(velocity, len(table), self.sonar.sound_speed)
+        with ThreadPoolExecutor(thread_count()) as threads:
+            for begin in range(0, len(table), PINGS_AT_A_TIME):
+                here = slice(begin, begin + PINGS_AT_A_TIME)
+                yield self._channels(table[here], speeds[here], first + begin, threads)
+
+    def paths(self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int = 0) -> Paths:
+        """The echoes that one receiver's response is made of."""
+        table = np.reshape(np.asarray(pose, dtype=float), (1, 6))
+        speeds = _checked(velocity, 1, self.sonar.sound_speed)
+        heard = self.hearing.hear(table[0], speeds[0], receiver, FOR_PATHS)
+        keep = heard["counts"].astype(bool)
+        delay, amplitude, doppler = (heard[name][keep].astype(float) for name in ("delay", "amplitude", "doppler"))
+        return Paths(delay, amplitude, doppler, int(np.count_nonzero(heard["beyond"])))
+
+    def _channels(
+        self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
+    ) -> Channels:
+        """Responses of some pings: a launch for each; which points it asks for and its transform are found beside others."""
+        shape = (len(poses), len(self.sonar.receivers))
+        asked = [threads.submit(self.hearing.source.asked, poses[k], receiver) for k, receiver in np.ndindex(shape)]
+        made = []
+        for (k, receiver), ready in zip(np.ndindex(shape), asked, strict=True):
+            heard = self.hearing.hear(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result())
+            made.append(threads.submit(_one_response, self.sonar, heard))
+        response, echoes, dropped = zip(*(future.result() for future in made), strict=True)
+        return Channels(
+            first=first,
+            response=np.reshape(np.asarray(response, np.complex64), (*shape, self.sonar.taps)),
+            height_m=self.hearing.height_m(poses),
+            echoes=np.reshape(echoes, shape).astype(np.int64),
+            dropped=np.reshape(dropped, shape).astype(np.int64),
+        )
+
+
+def _one_response(sonar: ChannelSonar, heard: dict[str, NDArray[Any]]) -> tuple[NDArray[np.complex128], int, int]:
+    """One response, its echoes, and those from too far."""
+    keep = np.flatnonzero(heard["counts"])
+    strength = np.empty(len(keep), np.complex128)
+    strength.real, strength.imag = heard["real"][keep], heard["imag"][keep]
+    spectrum = _spectrum(sonar, heard["turn"][keep], strength, PADDING)
+    return _taps(sonar, spectrum, PADDING), len(keep), int(np.count_nonzero(heard["beyond"]))
+
+
+def frequency_response(
+    delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSonar
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """Frequencies of the band ``(k,)`` [Hz] and H_f there (Almanza-Medina, eq. 5.15), by a type 1 non-uniform FFT.
+
+    Args:
+        delay_s: of each echo.
+        amplitude: of each echo.
+        sonar: carrier, band and frequency step.
+    """
+    delay = np.asarray(delay_s, dtype=float)
+    turn, strength = _phasors(delay, np.asarray(amplitude), sonar, 1)
+    half = _half(sonar, 1)
+    frequency = np.arange(-half, half + 1, dtype=np.float64) * sonar.frequency_step_hz
+    return frequency, _spectrum(sonar, turn, strength, 1)
+
+
+def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSonar) -> NDArray[np.complex128]:
+    """The response ``(taps,)`` of echoes: frequency response, raised cosine, inverse FFT (eq. 5.15-5.17), padded."""
+    delay = np.asarray(delay_s, dtype=float)
+    turn, strength = _phasors(delay, np.asarray(amplitude), sonar, PADDING)
+    return _taps(sonar, _spectrum(sonar, turn, strength, PADDING), PADDING)
+
+
+def _phasors(
+    delay: NDArray[np.float64], amplitude: NDArray[Any], sonar: ChannelSonar, padding: int
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """What :class:`Heard` holds for the transform, of echoes on this side."""
+    turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
+    strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
+    return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)
+
+
+def _half(sonar: ChannelSonar, padding: int) -> int:
+    """Number of the last frequency within the band, counted from its middle."""
+    return math.floor((1 + sonar.rolloff) * sonar.bandwidth_hz / 2 / sonar.frequency_step_hz * padding + 1e-9)
+
+
+def _spectrum(
+    sonar: ChannelSonar, turn: NDArray[np.float64], strength: NDArray[np.complex128], padding: int
+) -> NDArray[np.complex128]:
+    """Sum of strength exp(-i k turn) for k of the band ``(2 half + 1,)``."""
+    modes = 2 * _half(sonar, padding) + 1
+    if not len(turn):
+        return np.zeros(modes, np.complex128)
+    return np.asarray(finufft.nufft1d1(turn, strength, modes, eps=TOLERANCE, isign=-1, nthreads=1))
+
+
+def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -> NDArray[np.complex128]:
+    """Raised cosine and inverse FFT (eq. 5.17); of the padded length the asked taps."""
+    half = _half(sonar, padding)
+    number = np.arange(-half, half + 1)
+    length_ = sonar.taps * padding
+    band = np.zeros(length_, np.complex128)
+    np.add.at(band, number % length_, spectrum * sonar.raised_cosine(number * sonar.frequency_step_hz / padding))
+    return np.asarray(np.fft.ifft(band)[: sonar.taps])
+
+
+def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDArray[np.float64]:
+    """Velocities ``(pings, 4)``.
+
+    Raises:
+        MitsonarError: another shape, not finite, as fast as sound.
+    """
+    table = np.zeros((pings, 4)) if velocity is None else np.atleast_2d(np.asarray(velocity, dtype=float))
+    if table.shape != (pings, 4) or not np.isfinite(table).all():
+        raise MitsonarError(
+            f"velocity must be finite numbers (pings, 4) = ({pings}, 4), starboard, forward, up in m/s and turn in rad/s: "
+            f"got {table.shape}"
+        )
+    fastest, most = float(np.linalg.norm(table[:, :3], axis=1).max(initial=0)), 0.1 * sound_speed
+    if fastest > most:
+        raise MitsonarError(f"velocity must stay below a tenth of the sound speed, {most:g} m/s: got {fastest:g}")
+    return table

@@ -1,0 +1,296 @@
+"""Points that belong to the world and scatter sound, and which of them a field of view may hold.
+
+A surface whose reflectivity comes in cells (``cell_noise`` over uv, or a picture) has one point in each cell, at a place
+that is a hash of the cell; any other surface gets points at random, so many a square metre, from the seed. Neither depends
+on who looks, when, or with how many rays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mitsonar.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.errors import MitsonarError
+from mitsonar.plugins.cell_noise import CellNoise
+from mitsonar.plugins.place import ROUNDS
+from mitsonar.plugins.surfaces import facet_points, reflectances_of, reflectivity_at
+
+__all__ = ["Scatterers"]
+
+MOST = 2**26
+"""Points of a scene: 28 bytes each."""
+
+A_BUCKET = 256
+"""Points that lie together, about: few enough to fit a field of view closely, enough for buckets to be few."""
+
+A_BLOCK = 64
+"""Buckets that are looked at together first."""
+
+BITS = 20
+"""Of a bucket's place along each axis."""
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """Balls that hold groups of points, and where their surfaces face.
+
+    Attributes:
+        middle: ``(groups, 3)`` [m].
+        radius: ``(groups,)`` [m].
+        facing: mean normal of a group whose points are seen from one side only, else zero ``(groups, 3)``.
+        spread: largest angle of a normal to it ``(groups,)`` [rad].
+    """
+
+    middle: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    facing: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+    def may_be_seen(
+        self, groups: NDArray[np.int64], eye: NDArray[np.float64], axes: NDArray[np.float64], field: FieldOfView
+    ) -> NDArray[np.int64]:
+        """Of some groups those that a field of view at ``eye`` may hold any point of, seen from its front."""
+        way = self.middle[groups] - eye
+        distance = np.sqrt(np.einsum("gi,gi->g", way, way))
+        unit, radius = way / np.maximum(distance, 1e-12)[:, None], self.radius[groups]
+        margin = np.where(distance > radius, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1)), np.pi)
+        away = np.einsum("gi,gi->g", self.facing[groups], unit) > np.sin(np.minimum(margin + self.spread[groups], np.pi / 2))
+        ahead, aside, above = axes @ unit.T
+        return groups[field.may_see(ahead, aside, above, margin) & ~away]
+
+
+@dataclass(frozen=True)
+class Scatterers:
+    """Points of a scene, neighbours side by side.
+
+    Attributes:
+        place: where they lie ``(points, 3)`` float32 [m]; as they are, exactly, whoever looks.
+        normal: of the surface there ``(points, 3)`` float32.
+        strength: reflectivity times the area that a point stands for ``(points,)`` float32 [m2].
+        first: number of the first point of each bucket, and of the end ``(buckets + 1,)``.
+        one_sided: whether a bucket's points are those of closed bodies, seen from outside only ``(buckets,)``.
+    """
+
+    place: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    strength: NDArray[np.float32]
+    first: NDArray[np.int64]
+    one_sided: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, scene: mi.Scene, sonar: ChannelSonar) -> Scatterers:
+        """The scatterers of a scene's shapes.
+
+        Raises:
+            MitsonarError: no surface to carry any, or more than memory should hold.
+        """
+        parts, closed = [], []
+        for number, shape in enumerate(scene.shapes()):
+            if shape.bsdf() is not None:
+                grid = _grid_of(shape)
+                parts.append(_in_cells(shape, grid, number) if grid else _at_random(shape, sonar, number))
+                closed.append(np.full(len(parts[-1][2]), shape.is_mesh() and _is_closed(shape)))
+        if not sum(map(len, closed)):
+            raise MitsonarError(
+                "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
+                "bitmap as reflectance, or raise points_per_m2"
+            )
+        place, normal, strength = (np.concatenate(values) for values in zip(*parts, strict=True))
+        one_sided = np.concatenate(closed)
+        order, first = _buckets(place, np.where(one_sided, _side(normal), 0))
+        return cls(place[order], normal[order], strength[order], first, one_sided[order[first[:-1]]])
+
+    def __len__(self) -> int:
+        return len(self.strength)
+
+    @cached_property
+    def spheres(self) -> tuple[Spheres, Spheres]:
+        """Around blocks of buckets, and around buckets."""
+        buckets = np.arange(len(self.one_sided))
+        blocks = self.first[:-1][::A_BLOCK]
+        mixed = np.logical_and.reduceat(self.one_sided, buckets[::A_BLOCK])
+        return self._spheres(blocks, mixed), self._spheres(self.first[:-1], self.one_sided)
+
+    def _spheres(self, first: NDArray[np.int64], one_sided: NDArray[np.bool_]) -> Spheres:
+        low, high = (reach.reduceat(self.place, first).astype(float) for reach in (np.minimum, np.maximum))
+        count = np.diff(np.append(first, len(self)))
+        mean = np.add.reduceat(self.normal, first, dtype=np.float64)
+        mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-12)[:, None]
+        along = np.einsum("pi,pi->p", self.normal, np.repeat(mean.astype(np.float32), count, axis=0))
+        spread = np.arccos(np.clip(np.minimum.reduceat(along, first), -1, 1)) + 1e-3
+        return Spheres((low + high) / 2, np.linalg.norm(high - low, axis=1) / 2, mean * one_sided[:, None], spread)
+
+    def within(self, eye: NDArray[np.float64], axes: NDArray[np.float64], field: FieldOfView) -> NDArray[np.uint32]:
+        """Numbers of the points that a field of view may hold: all that it does hold, and some beside it.
+
+        Args:
+            eye: where it is ``(3,)`` [m].
+            axes: its :attr:`FieldOfView.axes` turned to the world ``(3, 3)``.
+            field: its shape.
+        """
+        blocks, buckets = self.spheres
+        near = blocks.may_be_seen(np.arange(len(blocks.radius)), eye, axes, field)
+        inner = (near[:, None] * A_BLOCK + np.arange(A_BLOCK)).ravel()
+        return _ranges(self.first, buckets.may_be_seen(inner[inner < len(self.one_sided)], eye, axes, field))
+
+
+def _side(normal: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Which of six ways a normal points, 1 to 6."""
+    axis = np.abs(normal).argmax(axis=1)
+    return np.asarray(1 + 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0))
+
+
+def _is_closed(mesh: Any) -> bool:
+    """Whether a mesh bounds bodies, its normals outside: each edge is met once in each direction, each body's volume > 0."""
+    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
+    vertex = np.array(mesh.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    forth, back = (np.sort(a * len(vertex) + b) for a, b in (edges.T, edges.T[::-1]))
+    if (np.diff(forth) == 0).any() or not np.array_equal(forth, back):
+        return False
+    links = coo_array((np.ones(len(edges), np.int8), tuple(edges.T)), shape=2 * (len(vertex),))
+    _, body = connected_components(links, directed=False)
+    corner = vertex[faces] - vertex[faces[0, 0]]
+    volume = np.bincount(body[faces[:, 0]], np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])))
+    return bool((volume[np.unique(body[faces[:, 0]])] > 0).all())
+
+
+def _grid_of(shape: mi.Shape) -> tuple[Any, int, int] | None:
+    """The grid over uv that gives a shape its reflectivity: texture, cells along u and v; None where there is none."""
+    textures = reflectances_of(shape.bsdf())
+    if len(textures) != 1:
+        return None
+    # by its name: the class is made anew with each variant
+    if type(textures[0]).__name__ == CellNoise.__name__ and textures[0].coordinates == "uv":
+        fine = round(textures[0].cells * 2 ** (textures[0].octaves - 1))
+        return (textures[0], fine, fine) if fine >= 1 else None
+    if textures[0].class_name() == "BitmapTexture":
+        size = textures[0].resolution()
+        return None, int(size[0]), int(size[1])
+    return None
+
+
+Points = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+
+
+def _in_cells(shape: mi.Shape, grid: tuple[Any, int, int], number: int) -> Points:
+    """One point a cell, at a place that is a hash of cell and texture's seed (of a picture: the shape's number)."""
+    texture, columns, rows = grid
+    turn = np.eye(3)
+    if texture is not None:
+        turn[:2] = texture.to_uv
+    back = np.linalg.inv(turn)
+    corners = turn @ np.array([[0, 1, 0, 1], [0, 0, 1, 1], [1, 1, 1, 1.0]])
+    low = np.floor(corners[:2].min(axis=1) * (columns, rows)).astype(int)
+    wide, tall = np.ceil(corners[:2].max(axis=1) * (columns, rows)).astype(int) - low
+    _check_count(shape, float(wide) * float(tall))
+    cell = dr.arange(mi.UInt32, int(wide * tall))
+    column, row = mi.Int32(cell % int(wide)) + int(low[0]), mi.Int32(cell // int(wide)) + int(low[1])
+    key = mi.UInt32(_key(texture.seed if texture is not None else number, texture is not None))
+    bits: list[Any] = [dr.reinterpret_array(mi.UInt32, value) for value in (column, row)]
+    first, second = mi.sample_tea_32(bits[0], bits[1] ^ key, ROUNDS)
+    u, v = (mi.Float(column) + _fraction(first)) / columns, (mi.Float(row) + _fraction(second)) / rows
+    uv = mi.Point2f(*(float(a) * u + float(b) * v + float(c) for a, b, c in back[:2]))
+    inside = (uv.x >= 0) & (uv.x < 1) & (uv.y >= 0) & (uv.y < 1)
+    si = shape.eval_parameterization(uv, mi.RayFlags.All, inside)
+    area = dr.norm(dr.cross(si.dp_du, si.dp_dv)) * abs(float(np.linalg.det(back[:2, :2]))) / (columns * rows)
+    return _kept(shape, si, area, inside & si.is_valid())
+
+
+def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> Points:
+    """Points all over a surface, each standing for the same area (of shapes that are no meshes: for its part of it)."""
+    area = float(shape.surface_area()[0])
+    _check_count(shape, area * sonar.points_per_m2)
+    count = round(area * sonar.points_per_m2)
+    if count == 0:
+        return np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    rng = np.random.default_rng([sonar.seed, number, 81])
+    u, v = (mi.Float(draw.astype(np.float32)) for draw in rng.random((2, count)))
+    if shape.is_mesh():
+        share = np.cumsum(_facet_areas(shape))
+        facet = np.searchsorted(share, np.sort(rng.random(count)) * share[-1], side="right")
+        facet, root = np.minimum(facet, len(share) - 1).astype(np.uint32), dr.sqrt(u)
+        si = facet_points(shape, mi.UInt32(facet), mi.Point2f(root * v, 1 - root))
+        return _kept(shape, si, mi.Float(area / count), mi.Bool(True))
+    si = shape.eval_parameterization(mi.Point2f(u, v), mi.RayFlags.All)
+    return _kept(shape, si, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / count, si.is_valid())
+
+
+def _facet_areas(mesh: Any) -> NDArray[np.float64]:
+    """Area of each triangle [m2]."""
+    facets = dr.arange(mi.UInt32, mesh.face_count())
+    corners = [np.array(facet_points(mesh, facets, mi.Point2f(*at)).p, dtype=float) for at in ((0, 0), (1, 0), (0, 1))]
+    return np.asarray(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0), axis=0) / 2)
+
+
+def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: Any, valid: Any) -> Points:
+    """Place, normal and strength of the points that scatter anything."""
+    strength = dr.select(valid, reflectivity_at(shape.bsdf(), si) * area, 0)
+    dr.eval(si.p, si.n, strength)
+    found = np.broadcast_to(np.array(strength), np.array(si.p).shape[1:])
+    keep = np.flatnonzero((found > 0) & np.isfinite(found))
+    place, normal = (np.broadcast_to(np.array(values).T, (len(found), 3))[keep] for values in (si.p, si.n))
+    return np.ascontiguousarray(place, np.float32), np.ascontiguousarray(normal, np.float32), found[keep].astype(np.float32)
+
+
+def _check_count(shape: mi.Shape, count: float) -> None:
+    if count > MOST:
+        raise MitsonarError(
+            f"shape {shape.id()} would carry {count:,.0f} scatterers, more than {MOST:,}: give its texture fewer cells, or "
+            "lower points_per_m2"
+        )
+
+
+def _key(number: int, texture: bool) -> int:
+    """32 bits that draw places within cells; others than those that draw the cell's reflectivity."""
+    return int(np.random.SeedSequence([abs(number), int(texture), 82]).generate_state(1)[0])
+
+
+def _fraction(bits: mi.UInt32) -> mi.Float:
+    return (mi.Float(bits >> 8) + 0.5) * 2.0**-24
+
+
+def _buckets(place: NDArray[np.float32], side: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """An order in which points of one cube that face one way follow each other, near cubes near; where each group begins,
+    and the end."""
+    low, high = place.min(axis=0).astype(float), place.max(axis=0).astype(float)
+    reach = np.sort(high - low)[::-1]
+    # an edge that holds A_BUCKET points of a surface as large as the two longest sides
+    edge = math.sqrt(reach[0] * reach[1] * A_BUCKET / len(place))
+    edge = max(edge, reach[0] / (2**BITS - 1), 1e-9)
+    key = side.astype(np.uint64) << np.uint64(3 * BITS)
+    for axis, values in enumerate(((place - low) / edge).T):
+        key |= _spaced(values.astype(np.uint64)) << np.uint64(axis)
+    order = np.argsort(key, kind="stable")
+    new = np.flatnonzero(np.diff(key[order])) + 1
+    return order, np.concatenate([[0], new, [len(place)]])
+
+
+def _spaced(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Bits of numbers below 2^21 with two zeros before each: three such make a place on Morton's curve."""
+    masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
+    for shift, mask in zip((32, 16, 8, 4, 2), masks, strict=True):
+        number = (number | (number << np.uint64(shift))) & np.uint64(mask)
+    return number
+
+
+def _ranges(first: NDArray[np.int64], buckets: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """All numbers of some buckets' points."""
+    begin, count = first[buckets], first[buckets + 1] - first[buckets]
+    if not len(begin):
+        return np.empty(0, np.uint32)
+    jump = np.ones(count.sum(), np.int64)
+    ends = np.cumsum(count)
+    jump[0] = begin[0]
+    jump[ends[:-1]] = begin[1:] - (begin[:-1] + count[:-1] - 1)
+    return np.cumsum(jump).astype(np.uint32)
