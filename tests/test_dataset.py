@@ -20,12 +20,13 @@ from helpers import PROGRAM, TINY, Command, by_itself, files_of, refused, tiny_r
 
 from mitsonar.dataset.check import check
 from mitsonar.dataset.generate import make
+from mitsonar.dataset.image_recording import array_names
 from mitsonar.dataset.place import Place
 from mitsonar.dataset.plan import Plan, sequences_of
 from mitsonar.dataset.rendering import FRAMES_A_SCENE, SceneRenderer, calibrate
 from mitsonar.dataset.shards import forget, make_shard
 from mitsonar.dataset.sheet import info, sheet_figure
-from mitsonar.dataset.store import DataStore, array_names, versions
+from mitsonar.dataset.store import DataStore, versions
 from mitsonar.dataset.workers import Queue
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import to_uint8
@@ -613,6 +614,7 @@ def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypa
 import os, sys
 import mitsonar.dataset.workers as workers
 from mitsonar.dataset.generate import make
+from mitsonar.dataset.image_recording import array_names
 from helpers import tiny_recipe
 from mitsonar.errors import MitsonarError
 

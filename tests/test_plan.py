@@ -9,7 +9,8 @@ import pytest
 from helpers import tiny_recipe, world_directions
 from scipy import stats
 
-from mitsonar.dataset.plan import Plan, footprint, run_poses, scenes_of, sequences_of
+from mitsonar.dataset.image_recording import footprint
+from mitsonar.dataset.plan import Plan, run_poses, scenes_of, sequences_of
 from mitsonar.dataset.recipe import Recipe, load_recipe
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import Motion, Pose, compose, mounted

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.dataset.plan import Plan, footprint, footprints_at
-from mitsonar.dataset.store import DataStore, array_names
+from mitsonar.dataset.plan import Plan, footprints_at
+from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import motions
 
@@ -49,7 +48,7 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
                     + (f"{sizes[key]} bytes, sealed with {size}" if sizes[key] != size else "other bytes than were sealed")
                 )
             if not damaged:
-                wrong += _values(store, here)
+                wrong += store.recording.faults(store.read, here)
         progress(here.stop - here.start)
     if unwritten:
         which = ", ".join(map(str, unwritten[:10])) + (" ..." if len(unwritten) > 10 else "")
@@ -59,42 +58,6 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
             "`mitsonar dataset make` makes them"
         )
     return wrong
-
-
-def _values(store: DataStore, here: slice) -> list[str]:
-    """Ranges of the values of a shard."""
-    wrong = []
-    beams = {view.name: len(view.bearing_rad) for view in store.recipe.views}
-    for name, (kind, view) in array_names(store.recipe).items():
-        values = store.read(name, here)
-        low, high = _limits(kind, values, beams[view])
-        known = values[~np.isnan(values)] if kind == "elevation_rad" else values
-        if known.size and not (known.min() >= low and known.max() <= high):
-            wrong.append(
-                f"{name}, frames {here.start}..{here.stop - 1}: values {known.min():g}..{known.max():g}, allowed "
-                f"{low:g}..{high:g}"
-            )
-        if kind == "nonzero":
-            vector = store.read(name.replace("nonzero", "vector", 1), here)
-            if ((vector > 0) != (values > 0)).any() or (vector > values * (1 + 1e-6)).any():
-                wrong.append(
-                    f"{name}, frames {here.start}..{here.stop - 1}: sums and numbers of echoes contradict each other"
-                )
-    return wrong
-
-
-def _limits(kind: str, values: NDArray[Any], beams: int) -> tuple[float, float]:
-    match kind:
-        case "image":
-            return 0, 255 if values.dtype == np.uint8 else 1
-        case "vector" | "nonzero":
-            return 0, beams
-        case "elevation_rad":
-            return -np.pi / 2, np.pi / 2
-        case "shadow":
-            return 0, 2
-        case _:
-            return -1, np.inf
 
 
 def _plan(store: DataStore) -> list[str]:
@@ -119,12 +82,9 @@ def _counts(store: DataStore) -> list[str]:
         found = int((scene[first] == number).sum())
         if found != wanted.sequences:
             wrong.append(f"scene {number} has {found} sequences, {wanted.sequences} promised")
-    for view in store.recipe.views:
-        suffix = store.recipe.suffix(view.name)
-        if not np.array_equal(store.read(f"bearing_rad{suffix}"), view.bearing_rad):
-            wrong.append(f"bearing_rad{suffix} is not what the recipe's sonar has")
-    if not np.array_equal(store.read("range_m"), store.recipe.views[0].sonar.range_m):
-        wrong.append("range_m is not what the recipe's sonar has")
+    for name, axis in store.recording.axes.items():
+        if not np.array_equal(store.read(name), axis.values):
+            wrong.append(f"{name} is not what the recipe's sonar has")
     return wrong
 
 
@@ -174,11 +134,9 @@ def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.i
     recipe = store.recipe
     half = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
     limit = np.array([half[int(number)] for number in scene])
-    fov = recipe.flight.footprint_fov_deg
     farthest = -np.inf
     for height in np.unique(vehicle[:, 2]):
         mine = vehicle[:, 2] == height
-        reach = footprint(recipe.instrument, recipe.mount.pose, float(height), fov)
-        corners = np.abs(footprints_at(vehicle[mine], reach))
+        corners = np.abs(footprints_at(vehicle[mine], store.recording.reach(float(height))))
         farthest = max(farthest, float((corners.max(axis=(1, 2)) - limit[mine]).max()))
     return farthest

@@ -11,7 +11,7 @@ import numpy as np
 from mitsonar.dataset.place import Place
 from mitsonar.dataset.plan import Plan, scenes_of
 from mitsonar.dataset.recipe import Recipe
-from mitsonar.dataset.rendering import calibrate
+from mitsonar.dataset.renderers import settled_of
 from mitsonar.dataset.split import PARTS, deal, world_of
 from mitsonar.dataset.store import DataStore, versions
 from mitsonar.dataset.workers import made_by
@@ -115,8 +115,7 @@ def _begun_or_new(place: Place, recipe: Recipe, sequences: int | None, variant: 
             if verify:
                 store.mend_known(Plan.of(recipe, count))
             return store
-    gain = calibrate(recipe)
-    about = {"gain": gain, "level_scale": 1 / gain, "variant": variant, "versions": versions()}
+    about = {**settled_of(recipe), "variant": variant, "versions": versions()}
     return DataStore.create(place, recipe, Plan.of(recipe, count), about)
 
 
@@ -183,31 +182,10 @@ def _frames(store: DataStore, shards: list[int]) -> int:
 def _warnings(store: DataStore) -> list[str]:
     """What the user should know of a finished data set."""
     sentences = [*_too_few(store)]
-    flight, bin_mm = store.recipe.flight, 1e3 * store.recipe.instrument.bin_m
-    largest_mm = max(flight.sideways_mm, flight.forward_mm)
-    if flight.kind == "random" and flight.pings > 1 and 0 < largest_mm < bin_mm / 100:
-        sentences.append(
-            f"motions of at most {largest_mm:g} mm are less than a hundredth of a range bin ({bin_mm:.2g} mm): "
-            "flight.sideways_mm and forward_mm are in millimetres"
-        )
     over_nothing = int(np.isnan(store.read("height_m")).sum())
     if over_nothing:
         sentences.append(
             f"nothing is below the sonar in {over_nothing:,} of {len(store):,} frames: world.size_m is larger than what the "
             "scene holds"
         )
-    dropped, saturated = (store.read(name).astype(np.int64) for name in ("dropped", "saturated"))
-    recipe = store.recipe
-    if dropped.any():
-        rays = recipe.instrument.rays
-        sentences.append(
-            f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside the "
-            f"window {recipe.instrument.range_min:g}..{recipe.instrument.range_max:g} m and were dropped, as the window says"
-        )
-    pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in recipe.views)
-    if saturated.mean() > 0.01 * pixels:
-        sentences.append(
-            f"{100 * saturated.mean() / pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set on the "
-            "first 20 frames, is too high for the rest"
-        )
-    return sentences
+    return sentences + store.recording.warnings(store.read)

@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
-from mitsonar.dataset.arrangement import Labels, arrangement_of
+from mitsonar.dataset.arrangement import Arrangement, Labels, arrangement_of
+from mitsonar.dataset.batches import Batches, StoredBatches
 from mitsonar.dataset.ground import ground_of
-from mitsonar.dataset.recipe import Recipe, Split, split_from
-from mitsonar.dataset.split import deal, world_of
-from mitsonar.dataset.store import DataStore, array_names
+from mitsonar.dataset.image_recording import array_names
+from mitsonar.dataset.parts import Part
+from mitsonar.dataset.recipe import Recipe, Split
+from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import SonarFrames
 from mitsonar.height import standing_of
 from mitsonar.motion import motions
-from mitsonar.noise import NoiseModel
+from mitsonar.noise import NOISE_MODELS, NoiseModel, load_noise
 
-__all__ = ["Samples", "SonarPairs", "split_for"]
+__all__ = ["Samples", "SonarPairs"]
 
 GROUND = "ground/"
 """Before the names of the ground's geometry in a raw sample."""
 
-SEED_STEP = 1_000_003
-"""Between the noise seeds of two epochs: more than any number of views."""
 
-
-class Samples:
+class Samples(Batches):
     """What stored and rendered samples share: how raw frames become inputs and labels.
 
     Attributes:
@@ -81,15 +80,11 @@ class Samples:
                 f"{', '.join(self.arrange.views)}, kind='image'"
             )
 
-    def set_epoch(self, epoch: int) -> None:
-        """Another epoch draws other noise, and another order in :meth:`SonarPairs.loader`."""
-        self.epoch = epoch
-
     def finished(self, batch: dict[str, torch.Tensor], device: torch.device | str | None = None) -> tuple[Any, torch.Tensor]:
         """Inputs and labels of a batch of raw samples; noise and layout are made on ``device``."""
         moved = {name: values.to(device, non_blocking=True) for name, values in batch.items()}
         ground = {name.removeprefix(GROUND): moved.pop(name) for name in list(moved) if name.startswith(GROUND)}
-        inputs = self.arrange(moved, moved["frames"], self.seed + SEED_STEP * self.epoch)
+        inputs = self.arrange(moved, moved["frames"], self.epoch_seed)
         return (inputs, ground) if self.ground else inputs, moved["label"]
 
     def ground_below(self, image: NDArray[Any], poses: NDArray[np.float64], height_m: NDArray[np.float64]) -> dict[str, Any]:
@@ -119,31 +114,41 @@ class Samples:
             **more,
         )
 
-    def batches(
-        self, raw: Dataset[Any], batch_size: int, device: torch.device | str | None, workers: int, **words: Any
-    ) -> Iterator[tuple[Any, torch.Tensor]]:
-        """Inputs and labels of batches of raw samples, which workers read or render, on a device."""
-        pinned = device is not None and torch.device(device).type == "cuda"
-        start = "spawn" if workers else None  # a fork after the ray tracer has started is unsafe
-        loader = DataLoader(
-            raw, batch_size=batch_size, num_workers=workers, pin_memory=pinned, multiprocessing_context=start, **words
-        )
-        for batch in loader:
-            yield self.finished(batch, device)
-
     @property
     def stored_kind(self) -> str:
         """What samples are made of: images also where vectors are wanted and only images are there."""
         return self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
 
-    def one(self, sample: dict[str, Any]) -> tuple[Any, torch.Tensor]:
-        """Input and label of one raw sample."""
-        batch = {name: torch.as_tensor(values)[None] for name, values in sample.items()}
-        inputs, label = self.finished(batch)
-        return _first(inputs), label[0]
+    def at_noise(self, level: str) -> Arrangement:
+        """The arrangement with one level of noise."""
+        return replace(self.arrange, noise=load_noise(level), levels=())
+
+    def described(self) -> dict[str, Any]:
+        """What a checkpoint keeps of the samples that a network was trained on."""
+        recipe, mount, arrange = self.recipe, self.recipe.mount, self.arrange
+        rows = {conversion.index.shape[1] for conversion in arrange.maps.values()}
+        return {
+            "arrangement": {
+                "frames": self.frames,
+                "views": list(arrange.views),
+                "kind": arrange.kind,
+                "layout": arrange.layout,
+                "coordinates": arrange.coordinates,
+                "cartesian_rows": rows.pop() if rows else 512,
+                "ground": self.ground,
+            },
+            "sonar": {view.name: view.sonar.model_dump(mode="json") for view in recipe.views if view.name in arrange.views},
+            "stands": {
+                "height_m": [height + mount.up_m for height in recipe.flight.heights],
+                "pitch_deg": mount.pitch_deg,
+                "roll_deg": mount.roll_deg,
+            },
+            "model": recipe.instrument.model,
+            "noise": "; ".join(map(_said, arrange.levels or [arrange.noise])),
+        }
 
 
-class SonarPairs(Dataset[Any], Samples):
+class SonarPairs(StoredBatches, Samples, Dataset[Any]):
     """Samples of a data set's store, each ``frames`` consecutive frames with the motion between them.
 
     ``pairs[i]`` is ``(input, label)``, float32 tensors, ready for ``torch.utils.data.DataLoader``; :meth:`loader` does the
@@ -183,39 +188,18 @@ class SonarPairs(Dataset[Any], Samples):
     ) -> None:
         self.store = DataStore.open(url)
         Samples.__init__(self, self.store.recipe, **arrangement)
-        self.split = split_for(split, self.recipe)
-        self.scene, self.sequence = self.store.read("scene"), self.store.read("sequence")
-        self.pose, self.motion = self.store.read("pose"), self.store.read("motion")
-        worlds = world_of(self.recipe, self.store.scenes)[self.scene]
+        self.chosen = Part.of(self.store, part, split, self.frames, seed=self.seed, one_a_sequence=one_a_sequence)
+        self.split, self.first = self.chosen.split, self.chosen.first
+        self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
+        self.pose, self.motion = self.chosen.pose, self.chosen.motion
         self._grounds: dict[int, dict[str, Any]] = {}
-        self.first = self._samples(deal(worlds, self.sequence, self.split, part), one_a_sequence)
-        if not len(self.first):
-            raise MitsonarError(
-                f"{self.store.place.url} has no sample of {self.frames} frames in part {part!r}: its sequences have "
-                f"{np.bincount(self.sequence).max()} frames; ask for fewer frames, or another part"
-            )
-
-    def _samples(self, mine: NDArray[np.bool_], one_a_sequence: bool) -> NDArray[np.int64]:
-        """The first frame of each sample: its sequence goes on for as many frames as it needs."""
-        first = np.arange(max(0, len(self.sequence) - self.frames + 1))
-        whole = mine[first] & (self.sequence[first] == self.sequence[first + self.frames - 1])
-        first = first[whole]
-        if one_a_sequence:
-            rank = np.random.default_rng([self.seed, 5]).permutation(len(first))
-            order = np.lexsort((rank, self.sequence[first]))
-            first = np.sort(first[order][np.unique(self.sequence[first][order], return_index=True)[1]])
-        return first
 
     def __len__(self) -> int:
         return len(self.first)
 
-    def __getitem__(self, index: int) -> tuple[Any, torch.Tensor]:
-        return self.one(self.raw(index))
-
     def frame_numbers(self, index: int) -> slice:
         """The frames of a sample, as numbered in the store."""
-        first = int(self.first[index])
-        return slice(first, first + self.frames)
+        return self.chosen.frame_numbers(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
         """The mean motion from frame to frame (sideways m, forward m, yaw rad); of one frame its height over z = 0 [m]."""
@@ -258,7 +242,7 @@ class SonarPairs(Dataset[Any], Samples):
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
         if image is not None:
             sample[name] = image[None]
-        image = self.arrange.noisy(sample, name, sample["frames"], self.seed + SEED_STEP * self.epoch)[0]
+        image = self.arrange.noisy(sample, name, sample["frames"], self.epoch_seed)[0]
         return self.frames_of(
             np.asarray(image),
             self.pose[here],
@@ -267,57 +251,7 @@ class SonarPairs(Dataset[Any], Samples):
             level_scale=float(self.store.about["level_scale"]),
         )
 
-    def loader(
-        self,
-        batch_size: int,
-        *,
-        device: torch.device | str | None = None,
-        shuffle: bool = True,
-        workers: int = 0,
-        drop_last: bool = False,
-    ) -> Iterator[tuple[Any, torch.Tensor]]:
-        """Batches of one epoch on a device; their order is a function of seed and epoch."""
-        order = torch.Generator().manual_seed(self.seed + SEED_STEP * self.epoch)
-        words = {"shuffle": shuffle, "generator": order, "drop_last": drop_last}
-        yield from self.batches(_Raw(self), batch_size, device, workers, **words)
 
-
-def _first(inputs: Any) -> Any:
-    """The first sample of a batch."""
-    if isinstance(inputs, tuple):
-        return tuple(map(_first, inputs))
-    return {name: values[0] for name, values in inputs.items()} if isinstance(inputs, dict) else inputs[0]
-
-
-@dataclass(frozen=True)
-class _Raw(Dataset[Any]):
-    """The raw samples, for workers that only read."""
-
-    pairs: SonarPairs
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        return self.pairs.raw(index)
-
-
-def split_for(split: str | Split | dict[str, Any] | None, recipe: Recipe) -> Split:
-    """The split that is asked for, of a data set of this recipe; see :class:`SonarPairs`.
-
-    Raises:
-        MitsonarError: a word or keys that are not known.
-    """
-    if isinstance(split, Split):
-        return split
-    if isinstance(split, dict):
-        return split_from(split)
-    match split:
-        case None:
-            return recipe.split
-        case "sequence":
-            return recipe.split if recipe.split.by == "sequence" else Split()
-        case "scene":
-            return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
-        case _:
-            raise MitsonarError(f"split must be sequence, scene, or keys as in a recipe: got {split!r}")
+def _said(noise: NoiseModel) -> str:
+    names = [name for name, model in NOISE_MODELS.items() if model == noise]
+    return names[0] if names else f"{noise.mean:g},{noise.std:g},{noise.scale:g}"

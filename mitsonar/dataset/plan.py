@@ -9,26 +9,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from mitsonar.dataset.recipe import Flight, Recipe
+from mitsonar.dataset.recordings import recording_of
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry import directions
-from mitsonar.motion import Motion, Pose, compose, motions, mounted, vehicle_rotation
+from mitsonar.motion import Motion, Pose, compose, motions, mounted
 from mitsonar.simulation.worlds.world import Family, stream
-from mitsonar.sonar import Sonar
 
-__all__ = ["Plan", "Scene", "Sequence", "footprint", "footprints_at", "scenes_of", "sequences_of"]
+__all__ = ["Plan", "Scene", "Sequence", "footprints_at", "scenes_of", "sequences_of", "steady_velocities"]
 
 FEWEST_SEQUENCES = 10
 """Sequences of a scene before a small data set opens another: worlds cost more than frames."""
-
-RAYS = 61
-"""Over azimuth and over elevation, whose ends on the ground make a footprint: arcs bulge less than 0.2 mm between them."""
 
 CANDIDATES = 64
 TRIES = 200
@@ -66,6 +60,7 @@ class Plan:
         vehicle: poses of the vehicle ``(frames, 6)``.
         poses: of the sonar ``(frames, 6)``.
         motion: sideways, forward [m], yaw [rad] to the next frame of the sequence ``(frames, 3)``; nan for its last.
+        velocity: of the vehicle in its own axes; see :func:`steady_velocities` ``(frames, 4)``.
     """
 
     scenes: list[Scene]
@@ -75,6 +70,7 @@ class Plan:
     vehicle: NDArray[np.float64]
     poses: NDArray[np.float64]
     motion: NDArray[np.float64]
+    velocity: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.scene)
@@ -94,15 +90,17 @@ class Plan:
         last = np.cumsum(lengths) - 1
         inner = np.setdiff1d(np.arange(len(vehicle)), last)
         motion[inner] = motions(vehicle)[inner]
+        rate = recording_of(recipe).frame_rate_hz
         step = np.concatenate([np.arange(length) for length in lengths])
         return cls(
             scenes=scenes,
             scene=np.repeat([scene.number for scene, _ in flown], lengths).astype(np.int32),
             sequence=np.repeat(np.arange(len(flown)), lengths).astype(np.int32),
-            time_s=step / recipe.instrument.frame_rate_hz,
+            time_s=step / rate,
             vehicle=vehicle,
             poses=mounted(vehicle, recipe.mount.pose),
             motion=motion,
+            velocity=np.concatenate([steady_velocities(one.vehicle, rate) for _, one in flown]),
         )
 
 
@@ -190,7 +188,7 @@ def _sequence(
 
 def _corners(recipe: Recipe, height: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
     """The vehicle and the corners of its footprint ``(n, 2)`` [m] in all pings, about the first and in its axes."""
-    reach = footprint(recipe.instrument, recipe.mount.pose, height, recipe.flight.footprint_fov_deg)
+    reach = recording_of(recipe).reach(height)
     return np.concatenate([footprints_at(driven, reach).reshape(-1, 2), driven[:, :2]])
 
 
@@ -221,32 +219,19 @@ def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
     return np.array(poses)
 
 
-@lru_cache(maxsize=8)
-def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None) -> NDArray[np.float64]:
-    """Corners of what a sonar can see of the ground z = 0, from a vehicle at ``height`` ``(n, 2)`` starboard, forward [m].
+def steady_velocities(vehicle: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
+    """Velocities of a level vehicle that keeps one from each pose ``(pings, 6)`` to the next, along an arc: starboard,
+    forward, up [m/s] in its own axes, turn to starboard [rad/s] ``(pings, 4)``; the last again, of one ping nothing.
 
-    Rays that meet the ground beyond the window's end, or never, count as far as that end allows.
+    Eq. 3.4 moves along the new heading; the arc's chord lies half a turn before it, shorter by the sinc of half a turn.
     """
-    azimuth, elevation = fov_deg or (sonar.azimuth_fov_deg, sonar.elevation_fov_deg)
-    outer = max(math.radians(azimuth) / 2, sonar.bearing_rad[-1] + sonar.beam_width_rad / 2 if fov_deg is None else 0)
-    b, e = np.meshgrid(np.linspace(-outer, outer, RAYS), np.radians(np.linspace(-elevation, elevation, RAYS)) / 2)
-    local = directions(sonar.bearing, b.ravel(), e.ravel())
-    eye = mounted(Pose(0, 0, height), mount)[0]
-    world = vehicle_rotation(eye).apply(local)
-    above = eye[2]
-    if above <= 0 or above >= sonar.range_max:
-        raise MitsonarError(
-            f"the sonar sees no ground: it is {above:g} m over it, range_max is {sonar.range_max:g} m; lower height_m or "
-            "raise range_max"
-        )
-    across = math.sqrt(sonar.range_max**2 - above**2)
-    level = np.hypot(world[:, 0], world[:, 1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ground = np.where(world[:, 2] < 0, above * level / -world[:, 2], np.inf)
-    distance = np.minimum(ground, across)
-    unit = world[:, :2] / np.maximum(level, 1e-12)[:, None]
-    points = eye[:2] + unit * distance[:, None]
-    return np.asarray(points[ConvexHull(points).vertices])
+    sideways, forward, yaw = motions(vehicle).T
+    half = yaw / 2
+    shorter = np.sinc(half / np.pi)
+    sin, cos = np.sin(half) / shorter, np.cos(half) / shorter
+    up = np.diff(vehicle[:, 2])
+    steps = np.column_stack([sideways * cos + forward * sin, forward * cos - sideways * sin, up, yaw]) * rate_hz
+    return np.concatenate([steps, steps[-1:]]) if len(steps) else np.zeros((1, 4))
 
 
 def run_poses(name: str, height_m: float) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from mitsonar.channel_sonar import ChannelSonar
 from mitsonar.errors import MitsonarError, complaint, nearest_names
 from mitsonar.motion import Pose
 from mitsonar.presets import sonar_from
@@ -158,8 +159,11 @@ class Recipe(_Part):
     seed: int = Field(0, ge=0, lt=2**31, description="of worlds, flights and jitter")
     world: dict[str, Any] = Field(description="family of the world, and numbers of it")
     scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
-    sonar: dict[str, Any] = Field(description="preset and keys of docs/sonar.md")
-    mount: Mount = Field(default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle")
+    sonar: dict[str, Any] | None = Field(None, description="preset and keys of docs/sonar.md")
+    channel: dict[str, Any] | None = Field(None, description="in place of sonar: keys of docs/impulse.md, for responses")
+    mount: Mount = Field(
+        default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; of a channel none"
+    )
     flight: Flight = Field(default_factory=Flight, description="how the vehicle moves")
     frames: int = Field(2, ge=1, le=16, description="Q: frames that make one sample, unless a reader asks for others")
     receivers: list[ReceiverSpec] = Field(default_factory=list, description="of a bistatic sonar; the sonar transmits")
@@ -171,36 +175,88 @@ class Recipe(_Part):
     )
     split: Split = Field(default_factory=Split, description="which frames are for what")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _level(cls, fields: Any) -> Any:
+        """A channel sonar stands as its vehicle does."""
+        hears = isinstance(fields, dict) and fields.get("channel") is not None
+        return {"mount": Mount(), **fields} if hears else fields
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if (self.sonar is None) == (self.channel is None):
+            got = "neither" if self.sonar is None else "both"
+            raise ValueError(f"a data set is of a sonar (images) or a channel (impulse responses), one of them: got {got}")
         try:
-            self.views  # noqa: B018
+            self._check_images() if self.channel is None else self._check_responses()
             families = [self.family(group) for group in range(len(self.scenes))]
         except MitsonarError as error:
             raise ValueError(str(error)) from None
-        if len({view.name for view in self.views}) < len(self.views):
-            raise ValueError(f"receivers and segments must have names of their own: got {[v.name for v in self.views]}")
         low, high = self.flight.heights
         if not (low > 0 and math.isfinite(high)):
             raise ValueError(f"flight height_m must be finite and above 0: got {low:g} m")
         if low != high and self.flight.kind == "runs":
             raise ValueError(f"with flight.kind runs height_m is one number: got {low:g},{high:g}")
-        if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
-            raise ValueError("all receivers must have the same window: range_min, range_max and range_bins")
         if self.frames > self.flight.pings and self.flight.kind == "random":
             raise ValueError(f"frames must be at most flight.pings, {self.flight.pings}: got {self.frames}")
         if self.flight.kind == "runs" and any(group.sequences != len(self.flight.runs) for group in self.scenes):
             raise ValueError(f"with flight.kind runs each scene has {len(self.flight.runs)} sequences, one a run")
         if not all(family.half_m > 0 for family in families):
             raise ValueError("a scene must have a size")
-        if self.labels and self.store == "vectors":
-            raise ValueError("labels are pixels: store images or both with them")
         return self
+
+    def _check_images(self) -> None:
+        """What belongs to images.
+
+        Raises:
+            MitsonarError: keys that contradict each other.
+        """
+        if len({view.name for view in self.views}) < len(self.views):
+            raise MitsonarError(f"receivers and segments must have names of their own: got {[v.name for v in self.views]}")
+        if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
+            raise MitsonarError("all receivers must have the same window: range_min, range_max and range_bins")
+        if self.labels and self.store == "vectors":
+            raise MitsonarError("labels are pixels: store images or both with them")
+
+    def _check_responses(self) -> None:
+        """What belongs to responses.
+
+        Raises:
+            MitsonarError: a key of the instrument that cannot be, or keys that only images have.
+        """
+        self.channel_sonar  # noqa: B018
+        plain = {"mount": Mount(), "receivers": [], "segments": [], "labels": [], "store": "images", "pixel": "uint8"}
+        other = [name for name, value in plain.items() if getattr(self, name) != value]
+        other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []
+        if other:
+            raise MitsonarError(
+                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers say where they are "
+                "and look themselves"
+            )
 
     @cached_property
     def instrument(self) -> Sonar:
-        """The sonar (of a bistatic set: the transmitter)."""
+        """The sonar (of a bistatic set: the transmitter).
+
+        Raises:
+            MitsonarError: a data set of impulse responses.
+        """
+        if self.sonar is None:
+            raise MitsonarError(
+                f"the data set {self.name} is of impulse responses: read it with ImpulsePairs, this needs one of images"
+            )
         return sonar_from(dict(self.sonar)).replace(seed=self.seed)
+
+    @cached_property
+    def channel_sonar(self) -> ChannelSonar:
+        """The transmitter and receivers of a data set of impulse responses.
+
+        Raises:
+            MitsonarError: a data set of images.
+        """
+        if self.channel is None:
+            raise MitsonarError(f"the data set {self.name} is of images: read it with SonarPairs, this needs responses")
+        return ChannelSonar.create(**{"name": self.name, "seed": self.seed, **self.channel})
 
     @cached_property
     def views(self) -> list[View]:
@@ -212,7 +268,7 @@ class Recipe(_Part):
             return [Segment(sonar, name) for name in self.segments]
         made: list[View] = []
         for spec in self.receivers:
-            own = {**self.sonar, "beams": sonar.beams, "jitter": None, **spec.sonar}
+            own = {**(self.sonar or {}), "beams": sonar.beams, "jitter": None, **spec.sonar}
             made.append(Receiver(sonar, sonar_from({k: v for k, v in own.items() if v is not None}), spec.pose, spec.name))
         return made or [Whole(sonar)]
 

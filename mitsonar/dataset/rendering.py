@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.dataset.image_recording import ImageRecording
 from mitsonar.dataset.plan import Scene, scenes_of, sequences_of
 from mitsonar.dataset.recipe import Recipe
-from mitsonar.dataset.store import PER_FRAME, array_names, pixel_type
 from mitsonar.errors import MitsonarError
 from mitsonar.frames import to_uint8
 from mitsonar.motion import mounted
@@ -20,7 +20,7 @@ from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, co
 from mitsonar.simulation.scenes import load_scene
 from mitsonar.simulation.variant import release_memory
 
-__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate"]
+__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world"]
 
 FRAMES_A_SCENE = 10_000_000
 """Pings are numbered by scene times this, plus their place in it: jitter does not depend on the size of the data set."""
@@ -36,17 +36,14 @@ class SceneRenderer:
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self.recipe, self.scene = recipe, scene
-        with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
-            path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
-            loaded = load_scene(path, **parameters)
-        self.simulator = Simulator(loaded, recipe.instrument, views=recipe.views)
+        self.simulator = Simulator(loaded_world(recipe, scene), recipe.instrument, views=recipe.views)
 
     def looks(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[Pings]]:
         """Levels of frames ``first``, ``first + 1`` ... of the scene, in batches, a part for each view."""
         return self.simulator.looks(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)
 
     def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, NDArray[Any]]:
-        """What is stored of frames of the scene: kind and view -> values ``(frames, ...)``; see ``store.array_names``.
+        """What is stored of frames of the scene: kind and view -> values ``(frames, ...)``; see ``array_names``.
 
         Args:
             poses: of the sonar ``(frames, 6)``.
@@ -59,15 +56,14 @@ class SceneRenderer:
             self._fill({name: array[start : start + len(looks[0])] for name, array in values.items()}, looks, gain)
         return values
 
+    def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
+        """Frames where the plan has them; see :class:`~mitsonar.dataset.renderers.Renderer`."""
+        return self.frames(planned["pose"], first, float(about["gain"]))
+
     def _empty(self, frames: int) -> dict[str, NDArray[Any]]:
-        """Arrays to fill."""
-        views = {view.name: view for view in self.recipe.views}
-        values = {name: np.zeros(frames, dtype=kind) for name, kind in PER_FRAME.items()}
-        for name, (kind, view_name) in array_names(self.recipe).items():
-            view = views[view_name]
-            beams = () if kind in ("vector", "nonzero") else (len(view.bearing_rad),)
-            values[name] = np.empty((frames, view.sonar.range_bins, *beams), dtype=pixel_type(kind, self.recipe))
-        return values
+        """Arrays to fill; counts begin at 0."""
+        stored = ImageRecording(self.recipe).stored
+        return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
 
     def _fill(self, values: dict[str, NDArray[Any]], looks: list[Pings], gain: float) -> None:
         """What is stored of one batch."""
@@ -86,6 +82,13 @@ class SceneRenderer:
                     values[f"nonzero{suffix}"][number] = np.count_nonzero(image, axis=1)
             for label in self.recipe.labels:
                 values[f"{label}{suffix}"][:] = pings.labels[label]
+
+
+def loaded_world(recipe: Recipe, scene: Scene) -> Any:
+    """A scene's world, built in a folder that is gone again once it is loaded."""
+    with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
+        path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
+        return load_scene(path, **parameters)
 
 
 def calibrate(recipe: Recipe) -> float:

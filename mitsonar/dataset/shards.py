@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.dataset.plan import Scene
-from mitsonar.dataset.rendering import SceneRenderer
+from mitsonar.dataset.renderers import Renderer, renderer_of
 from mitsonar.dataset.store import DataStore
 from mitsonar.simulation.variant import ensure_variant, release_memory
 
 __all__ = ["forget", "make_shard"]
 
-_RENDERER: dict[tuple[str, Scene], SceneRenderer] = {}
+_RENDERER: dict[tuple[str, Scene], Renderer] = {}
 """The last scene, by all that it depends on: the recipe, and which of its scenes."""
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -39,14 +39,15 @@ def forget() -> None:
 def _shard_values(store: DataStore, shard: int) -> dict[str, NDArray[Any]]:
     """All rendered arrays of a shard; frames of several scenes one after the other."""
     here = store.frames_of(shard)
-    scene_of, poses = store.read("scene")[here], store.read("pose", here)
+    scene_of = store.read("scene")[here]
+    planned = {name: store.read(name, here) for name in ("pose", *store.recording.planned)}
     firsts = _first_frames(store)
     parts: dict[str, list[NDArray[Any]]] = {}
-    gain = float(store.about["gain"])
     for number in np.unique(scene_of):
         mine = np.flatnonzero(scene_of == number)
         first = here.start + int(mine[0]) - firsts[int(number)]
-        for name, values in _renderer(store, int(number)).frames(poses[mine], first, gain).items():
+        known = {name: values[mine] for name, values in planned.items()}
+        for name, values in _renderer(store, int(number)).recorded(known, first, store.about).items():
             parts.setdefault(name, []).append(values)
     return {name: values[0] if len(values) == 1 else np.concatenate(values) for name, values in parts.items()}
 
@@ -57,10 +58,10 @@ def _first_frames(store: DataStore) -> dict[int, int]:
     return dict(zip(numbers.tolist(), first.tolist(), strict=True))
 
 
-def _renderer(store: DataStore, number: int) -> SceneRenderer:
+def _renderer(store: DataStore, number: int) -> Renderer:
     scene = store.scenes[number]
     key = (store.recipe.model_dump_json(), scene)
     if key not in _RENDERER:
         forget()  # before the next is loaded: two scenes would need twice the memory
-        _RENDERER[key] = SceneRenderer(store.recipe, scene)
+        _RENDERER[key] = renderer_of(store.recipe, scene)
     return _RENDERER[key]

@@ -1,4 +1,4 @@
-"""A look at a data set: a sheet of samples, labels and the mean image; a table of what it holds."""
+"""A look at a data set: a sheet of samples, labels and their mean; a table of what it holds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
-from mitsonar.dataset.store import DataStore, array_names
+from mitsonar.dataset.image_recording import array_names
+from mitsonar.dataset.response_sheet import response_sheet
+from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.noise import NOISE_MODELS
 
@@ -18,11 +20,14 @@ SAMPLED_FRAMES = 200
 
 
 def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None, seed: int = 0) -> Figure:
-    """Sample pairs with their labels, the distribution of the labels, and the mean image.
+    """Samples with their labels, the distribution of the labels, and the mean image; of responses see
+    :func:`~mitsonar.dataset.response_sheet.response_sheet`.
 
     Raises:
         MitsonarError: no such view; a data set without sequences of the recipe's number of frames.
     """
+    if store.recipe.channel is not None:
+        return response_sheet(store, samples=samples, receiver=view, seed=seed)
     names = {v: name for name, (kind, v) in array_names(store.recipe).items() if kind == store.recipe.kinds[0]}
     view = view or next(iter(names))
     if view not in names:
@@ -142,16 +147,21 @@ def _level(store: DataStore, name: str, view: str) -> dict[str, Any]:
     return {"filled": echoes / pixels, "signal_mean": mean, "signal_over_noise": noise}
 
 
+def _levels_of(store: DataStore) -> dict[str, Any]:
+    """The level of each view, once it is finished."""
+    names = array_names(store.recipe).items() if store.finished else ()
+    return {view: _level(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
+
+
 def info(store: DataStore) -> dict[str, Any]:
     """What a data set holds, by name; values are numbers, words, or tables of them."""
     about, sizes = store.about, store.place.sizes()
-    arrays, levels = {}, {}
-    for name, (kind, view) in array_names(store.recipe).items():
-        array = store.array(name)
-        size = sum(size for key, size in sizes.items() if key.startswith(f"{name}/"))
-        arrays[name] = f"{'x'.join(map(str, array.shape))} {array.dtype}, {size / max(len(store), 1):,.0f} bytes a frame"
-        if kind == store.recipe.kinds[0] and store.finished:
-            levels[view] = _level(store, name, view)
+    arrays = {}
+    for name, stored in store.recording.stored.items():
+        if stored.shape:
+            size = sum(size for key, size in sizes.items() if key.startswith(f"{name}/"))
+            shape = "x".join(map(str, (len(store), *stored.shape)))
+            arrays[name] = f"{shape} {stored.kind}, {size / max(len(store), 1):,.0f} bytes a {store.recording.what}"
     done = int((store.seals().any(axis=(1, 2))).sum())
     return {
         "name": store.recipe.name,
@@ -161,14 +171,14 @@ def info(store: DataStore) -> dict[str, Any]:
         "frames": len(store),
         "sequences": about["sequences"],
         "scenes": len(about["scenes"]),
-        "model": store.recipe.instrument.model,
-        "sonar": store.recipe.instrument.name,
-        "views": list(about["views"]),
+        "model": store.recording.model,
+        "sonar": store.recording.name,
+        **({"views": list(about["views"])} if "views" in about else {"receivers": about["receivers"]}),
         "seed": store.recipe.seed,
-        "gain": about["gain"],
+        **{name: about[name] for name in ("gain",) if name in store.recording.settled},
         "bytes": sum(sizes.values()),
         "arrays": arrays,
-        "levels": levels,
+        **({"levels": _levels_of(store)} if store.recipe.channel is None else {}),
         "variant": about["variant"],
         "versions": about["versions"],
     }

@@ -18,21 +18,22 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from mitsonar.dataset.place import Place
 from mitsonar.dataset.plan import Plan, Scene
 from mitsonar.dataset.recipe import Recipe, recipe_from
+from mitsonar.dataset.recording import Axis, Recording, Stored
+from mitsonar.dataset.recordings import recording_of
 from mitsonar.errors import MitsonarError
-from mitsonar.frames import LABELS
 
-__all__ = ["DECIDING", "FORMAT", "PER_FRAME", "DataStore", "array_names", "pixel_type", "versions"]
+__all__ = ["DECIDING", "FORMAT", "DataStore", "versions"]
 
 FORMAT = 1
 """Version of what docs/dataset.md describes."""
 
 SHARD_BYTES = 32 * 2**20
-"""Pixels of a shard, about: what a worker holds, and what a kill may cost."""
+"""Of what is recorded in a shard, about: what a worker holds, and what a kill may cost."""
 
 SEAL = "seal"
 
 DECIDING = ("mitsonar", "mitsuba", "drjit")
-"""Packages whose versions decide pixels."""
+"""Packages whose versions decide what is recorded."""
 
 
 @dataclass(frozen=True)
@@ -52,29 +53,13 @@ class Layout:
         """Chunks that hold whole short sequences; shards of some 32 MiB, of one scene if possible."""
         pings = recipe.flight.pings if recipe.flight.kind == "random" else 10
         chunk = pings if pings <= 10 else 10
-        size = 1 if recipe.pixel == "uint8" else 4
-        each = sum(len(view.bearing_rad) * view.sonar.range_bins * size for view in recipe.views)
-        each += len(recipe.labels) * 4 * each // size
+        each = recording_of(recipe).ping_bytes
         scenes = np.bincount(plan.scene)
         wanted = max(1, min(SHARD_BYTES // each, int(scenes.max())) // chunk)
         # where scenes allow it, shards end with them: a shard of two scenes loads both
         whole = int(np.gcd.reduce(scenes[scenes > 0])) // chunk
         aligned = max((n for n in range(1, wanted + 1) if whole % n == 0), default=1) if whole else 1
         return cls(chunk, chunk * (aligned if 3 * aligned >= wanted else wanted))
-
-
-def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
-    """What is stored of each view: the array's name -> (kind, view); names end with the view's where there are several."""
-    names = {}
-    for view in recipe.views:
-        kinds = [*recipe.kinds, *(["nonzero"] if "vector" in recipe.kinds else []), *recipe.labels]
-        for kind in kinds:
-            names[f"{kind}{recipe.suffix(view.name)}"] = (kind, view.name)
-    return names
-
-
-PER_FRAME = {"height_m": np.float64, "dropped": np.uint32, "saturated": np.uint32}
-"""What rendering tells of each frame."""
 
 
 class DataStore:
@@ -84,18 +69,20 @@ class DataStore:
         place: where it lies.
         group: the Zarr group.
         recipe: what it is.
+        recording: what its instrument records.
     """
 
     def __init__(self, place: Place, group: zarr.Group) -> None:
         self.place, self.group = place, group
         self._arrays: dict[str, zarr.Array] = {}
         self.recipe = recipe_from(dict(group.attrs["recipe"]))  # type: ignore[arg-type, call-overload]
+        self.recording: Recording = recording_of(self.recipe)
 
     @classmethod
     def create(cls, place: Place, recipe: Recipe, plan: Plan, about: dict[str, Any]) -> DataStore:
         """An empty store with all that is known before rendering; what an earlier try left is written anew.
 
-        ``about`` is kept in the attributes; it holds at least ``gain``.
+        ``about`` is kept in the attributes; it holds at least what the recording says is settled.
         """
         layout = Layout.of(recipe, plan)
         attributes = {
@@ -106,9 +93,7 @@ class DataStore:
             "sequences": int(plan.sequence[-1]) + 1,
             "chunk_frames": layout.chunk,
             "shard_frames": layout.shard,
-            "sonar": recipe.instrument.model_dump(),
-            "views": {view.name: view.sonar.model_dump() for view in recipe.views},
-            "level": "linear",
+            **recording_of(recipe).attributes,
             "scenes": [vars(scene) for scene in plan.scenes],
             "ready": False,
             "finished": False,
@@ -155,7 +140,8 @@ class DataStore:
             store = cls(place, group)
             if min(len(store), store.shard_frames, int(attributes["chunk_frames"]), len(store.scenes)) < 1:
                 raise ValueError("numbers below 1")
-            float(attributes["gain"]), dict(attributes["versions"]), str(attributes["variant"])
+            [float(attributes[name]) for name in store.recording.settled]
+            dict(attributes["versions"]), str(attributes["variant"])
         except (KeyError, TypeError, ValueError, MitsonarError) as error:
             raise MitsonarError(
                 f"the attributes of {place.url} are damaged ({type(error).__name__}: {error}): remove it and make it again"
@@ -242,7 +228,7 @@ class DataStore:
     @cached_property
     def rendered(self) -> list[str]:
         """Arrays that are written shard by shard."""
-        return [*array_names(self.recipe), *PER_FRAME]
+        return list(self.recording.stored)
 
     def key(self, name: str, shard: int) -> str:
         """The file of one array and shard."""
@@ -321,22 +307,12 @@ class DataStore:
     # ---------------------------------------------------------------- making the arrays
 
     def _create_arrays(self, plan: Plan, layout: Layout) -> None:
-        views = {view.name: view for view in self.recipe.views}
-        for name, (kind, view_name) in array_names(self.recipe).items():
-            view = views[view_name]
-            beam = f"beam{self.recipe.suffix(view_name)}"
-            shape: tuple[int, ...] = (len(plan), view.sonar.range_bins)
-            dims: tuple[str, ...] = ("frame", "range")
-            if kind not in ("vector", "nonzero"):
-                shape, dims = (*shape, len(view.bearing_rad)), (*dims, beam)
-            self._array(name, shape, dims, pixel_type(kind, self.recipe), layout, TEXTS[kind].format(view_name))
-        for view_name, view in views.items():
-            suffix = self.recipe.suffix(view_name)
-            self._known(f"bearing_rad{suffix}", view.bearing_rad, (f"beam{suffix}",), TEXTS["bearing_rad"])
-        self._known("range_m", self.recipe.views[0].sonar.range_m, ("range",), TEXTS["range_m"])
-        for name, kind_of in PER_FRAME.items():
-            self._array(name, (len(plan),), ("frame",), np.dtype(kind_of), Layout(layout.shard, 0), TEXTS[name])
-        for name, values in planned(plan).items():
+        for name, stored in self.recording.stored.items():
+            # numbers of a shard's pings are small: one chunk
+            self._array(name, len(plan), stored, layout if len(stored.shape) > 0 else Layout(layout.shard, 0))
+        for name, axis in self.recording.axes.items():
+            self._axis(name, axis)
+        for name, values in planned(plan, self.recording).items():
             self._planned(name, values)
         shape = (self.shards, len(self.rendered), 2)
         seal = self.group.create_array(
@@ -351,34 +327,37 @@ class DataStore:
         )
         seal.attrs.put({"about": TEXTS[SEAL], "arrays": self.rendered})
 
-    def _array(
-        self, name: str, shape: tuple[int, ...], dims: tuple[str, ...], kind: np.dtype[Any], layout: Layout, text: str
-    ) -> None:
+    def _axis(self, name: str, axis: Axis) -> None:
+        """An array along a dimension."""
+        self._known(name, axis.values, (axis.dim,), axis.about)
+
+    def _array(self, name: str, frames: int, stored: Stored, layout: Layout) -> None:
         """An array that is rendered: shards of compressed chunks with checksums (or plain chunks where a shard is 0)."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # checksums of v3 are not in every reader
             self.group.create_array(
                 name,
-                shape=shape,
-                chunks=(layout.chunk, *shape[1:]),
-                shards=(layout.shard, *shape[1:]) if layout.shard else None,
-                dtype=kind,
+                shape=(frames, *stored.shape),
+                chunks=(layout.chunk, *stored.shape),
+                shards=(layout.shard, *stored.shape) if layout.shard else None,
+                dtype=stored.kind,
                 fill_value=0,
                 compressors=[ZstdCodec(level=1), Crc32cCodec()],
-                dimension_names=dims,
-                attributes={"about": text},
+                dimension_names=("frame", *stored.dims),
+                attributes={"about": stored.about},
                 overwrite=True,
             )
 
     def other_versions(self) -> list[str]:
-        """Packages that decide pixels and are not here what the store was begun with."""
+        """Packages that decide what is recorded and are not here what the store was begun with."""
         there, here = self.about["versions"], versions()
-        return [f"{name} {there.get(name)} (now {here[name]})" for name in DECIDING if there.get(name) != here[name]]
+        deciding = (*DECIDING, *self.recording.decided_by)
+        return [f"{name} {there.get(name)} (now {here[name]})" for name in deciding if there.get(name) != here[name]]
 
     def unplanned(self, plan: Plan) -> list[str]:
         """Arrays that the plan decides and that do not hold it (to 1e-9: processors differ in last bits)."""
         wrong = []
-        for name, values in planned(plan).items():
+        for name, values in planned(plan, self.recording).items():
             try:
                 there = self.read(name)
                 same = there.shape == values.shape and np.allclose(there, values, rtol=0, atol=1e-9, equal_nan=True)
@@ -392,10 +371,10 @@ class DataStore:
         """Write again what the plan decides and what is damaged of it."""
         for name in self.unplanned(plan):
             self._arrays.pop(name, None)
-            self._planned(name, planned(plan)[name])
+            self._planned(name, planned(plan, self.recording)[name])
 
     def _planned(self, name: str, values: NDArray[Any]) -> None:
-        inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",)}
+        inner = {"pose": ("six",), "vehicle_pose": ("six",), "motion": ("three",), "velocity": ("four",)}
         self._known(name, values, ("frame", *inner.get(name, ())), TEXTS[name])
 
     def _known(self, name: str, values: NDArray[Any], dims: tuple[str, ...], text: str) -> None:
@@ -414,13 +393,13 @@ class DataStore:
             array[...] = values
 
 
-def planned(plan: Plan) -> dict[str, NDArray[Any]]:
+def planned(plan: Plan, recording: Recording) -> dict[str, NDArray[Any]]:
     """What the plan says of each frame."""
     known: dict[str, NDArray[Any]] = {"pose": plan.poses, "motion": plan.motion, "time_s": plan.time_s}
     known |= {"scene": plan.scene, "sequence": plan.sequence}
     if not np.array_equal(plan.poses[:, [0, 1, 2, 5]], plan.vehicle[:, [0, 1, 2, 5]]):
         known["vehicle_pose"] = plan.vehicle
-    return known
+    return known | {name: getattr(plan, name) for name in recording.planned}
 
 
 def digest(content: bytes) -> int:
@@ -431,7 +410,7 @@ def digest(content: bytes) -> int:
 def versions() -> dict[str, str]:
     """Versions of what decides the values."""
     found = {}
-    for package in ("mitsonar", "mitsuba", "drjit", "numpy", "zarr"):
+    for package in ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr"):
         try:
             found[package] = version(package)
         except PackageNotFoundError:
@@ -439,35 +418,11 @@ def versions() -> dict[str, str]:
     return found
 
 
-def pixel_type(kind: str, recipe: Recipe) -> np.dtype[Any]:
-    """The type of an array of this kind."""
-    match kind:
-        case "image":
-            return np.dtype(recipe.pixel)
-        case "vector":
-            return np.dtype(np.float32)
-        case "nonzero":
-            return np.dtype(np.uint32)
-        case _:
-            return np.dtype(LABELS[kind])
-
-
 TEXTS = {
-    "image": "{}: level times gain, 0..255 (or 0..1), row 0 nearest, column 0 most to port; zero means no echo",
-    "vector": "{}: sum over the beams of the image in 0..1",
-    "nonzero": "{}: number of beams with an echo, from which a vector's noise is drawn",
-    "elevation_rad": "{}: elevation of the strongest echo; nan without echo",
-    "shape_id": "{}: place in the scene of the shape of the strongest echo; -1 without echo",
-    "object_id": "{}: object of the strongest echo, as its mesh numbers them; 0 for none, -1 without echo",
-    "shadow": "{}: 0 not in shadow, 1 dark with sound or echoes beyond, 2 dark with all sound intercepted before",
-    "bearing_rad": "bearing of each beam's axis [rad], starboard positive",
-    "range_m": "centre of each range bin [m]",
-    "height_m": "height of the sonar over what is straight below it [m]; nan where nothing is",
-    "dropped": "returns of the frame that lie outside the window and were dropped",
-    "saturated": "pixels of the frame at the maximum",
     "pose": "sonar: x, y, z [m], pitch, roll, heading [rad]",
     "vehicle_pose": "vehicle: x, y, z [m], pitch, roll, heading [rad]; motion is the vehicle's",
     "motion": "to the next frame of the sequence: sideways, forward [m], yaw [rad]; nan for its last",
+    "velocity": "of the vehicle in its own axes: starboard, forward, up [m/s], turn to starboard [rad/s]",
     "time_s": "since the sequence began [s]",
     "scene": "number of the scene",
     "sequence": "number of the sequence",

@@ -16,15 +16,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mitsonar.channel_sonar import ChannelSonar
 from mitsonar.dataset.arrangement import LABELS, Labels
-from mitsonar.dataset.pairs import Samples
+from mitsonar.dataset.batches import Batches
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.files import write_whole
 from mitsonar.metrics import AXES
 from mitsonar.networks.create import NETWORKS, create_network
 from mitsonar.networks.law import MotionLaw
 from mitsonar.networks.shipped import SHIPPED, shipped_path
-from mitsonar.noise import NOISE_MODELS, NoiseModel
 from mitsonar.sonar import Sonar
 
 __all__ = ["FILE", "FORMAT", "WORDS", "Checkpoint"]
@@ -94,7 +94,7 @@ class Checkpoint:
     format: int = FORMAT
 
     @classmethod
-    def of(cls, network: nn.Module, samples: Samples, **about: Any) -> Self:
+    def of(cls, network: nn.Module, samples: Batches, **about: Any) -> Self:
         """The checkpoint of a network of :data:`~mitsonar.networks.create.NETWORKS` as it is now.
 
         Args:
@@ -111,24 +111,14 @@ class Checkpoint:
                 f"a checkpoint holds one of our networks: got {type(network).__name__}; make it with create_network, or "
                 "keep its state_dict yourself"
             )
-        recipe, mount, coder = samples.recipe, samples.recipe.mount, samples.labels
-        sonars = {view.name: view.sonar for view in recipe.views if view.name in samples.arrange.views}
+        recipe, coder, described = samples.recipe, samples.labels, samples.described()
         told: dict[str, Any] = {
+            **described,
             "network": names[0],
             "options": network.options,
             "weights": {name: values.detach().cpu().clone() for name, values in network.state_dict().items()},
-            "arrangement": _words_of(samples),
             "labels": {"kind": coder.kind, "low": coder.low, "high": coder.high, "names": coder.names},
-            "sonar": {}
-            if NETWORKS[names[0]].any_sonar
-            else {key: one.model_dump(mode="json") for key, one in sonars.items()},
-            "stands": {
-                "height_m": [height + mount.up_m for height in recipe.flight.heights],
-                "pitch_deg": mount.pitch_deg,
-                "roll_deg": mount.roll_deg,
-            },
-            "model": recipe.instrument.model,
-            "noise": "; ".join(map(_said, samples.arrange.levels or [samples.arrange.noise])),
+            "sonar": {} if NETWORKS[names[0]].any_sonar else described["sonar"],
             "data": recipe.name,
             "data_recipe": recipe.model_dump(mode="json"),
             **about,
@@ -167,8 +157,13 @@ class Checkpoint:
 
     @property
     def sonars(self) -> dict[str, Sonar]:
-        """The sonar of each view; empty where the network works with any."""
-        return {name: Sonar.create(**fields) for name, fields in self.sonar.items()}
+        """The sonar of each view; empty where the network works with any, or on impulse responses."""
+        return {} if self.channel else {name: Sonar.create(**fields) for name, fields in self.sonar.items()}
+
+    @property
+    def channel(self) -> ChannelSonar | None:
+        """The instrument of a network on impulse responses."""
+        return ChannelSonar.create(**self.sonar["channel"]) if self.arrangement["kind"] == "response" else None
 
     @property
     def fixed(self) -> str:
@@ -215,6 +210,9 @@ class Checkpoint:
             f"{one.name}, {one.beams} beams, {one.range_bins} bins, {one.range_min:g}..{one.range_max:g} m"
             for one in self.sonars.values()
         ]
+        if self.channel is not None:
+            heard = self.channel
+            sonars = [f"{heard.name}, {heard.carrier_hz:g} Hz, {heard.bandwidth_hz:g} Hz wide, {heard.taps} taps"]
         spans = zip(self.labels["names"], self.labels["low"], self.labels["high"], strict=True)
         rows = [
             ("network", f"{self.network}{options}"),
@@ -228,7 +226,7 @@ class Checkpoint:
         for level, found in self.metrics.items():
             rmse = found.get("rmse") if isinstance(found, dict) else None
             if isinstance(rmse, list):
-                units = [axis.unit for axis in AXES] if len(rmse) == len(AXES) else ["mm"] * len(rmse)
+                units = [axis.unit for axis in AXES[: len(rmse)]]
                 values = " / ".join(f"{value:.3g} {unit}" for value, unit in zip(rmse, units, strict=True))
                 rows.append((f"RMSE, noise {level}", f"{values} in validation"))
         return [*rows, ("written by", f"mitsonar {self.version}")]
@@ -344,7 +342,8 @@ def _faults(table: dict[Any, Any]) -> list[str]:
     found += [f"arrangement {word} is unknown ({nearest_names(word, WORDS)})" for word in words if word not in WORDS]
     if not found and not (words["views"] and all(isinstance(view, str) for view in words["views"])):
         found.append("arrangement views are not names")
-    return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["stands"])
+    hears = words["kind"] == "response" if not found else False
+    return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["stands"], hears)
 
 
 def _faults_of_labels(labels: dict[str, Any]) -> list[str]:
@@ -358,12 +357,14 @@ def _faults_of_labels(labels: dict[str, Any]) -> list[str]:
     return []
 
 
-def _faults_of_sonar(sonar: dict[str, Any], stands: dict[str, Any]) -> list[str]:
+def _faults_of_sonar(sonar: dict[str, Any], stands: dict[str, Any], hears: bool) -> list[str]:
+    if hears and list(sonar) != ["channel"]:
+        return ["sonar has no channel"]
     for view, own in sonar.items():
         if not isinstance(own, dict):
             return [f"sonar {view} is not a table"]
         try:
-            Sonar.create(**own)
+            (ChannelSonar if hears else Sonar).create(**own)
         except (MitsonarError, TypeError) as error:
             return [f"sonar {view}: {error}"]
     angles = [stands.get("pitch_deg"), stands.get("roll_deg")]
@@ -376,26 +377,6 @@ def _are_numbers(values: Any, count: int) -> bool:
     """Whether this is a list of so many finite numbers."""
     numbers = isinstance(values, list) and len(values) == count
     return numbers and all(type(value) in (int, float) and math.isfinite(value) for value in values)
-
-
-def _words_of(samples: Samples) -> dict[str, Any]:
-    """The words of :data:`WORDS` that samples were made with."""
-    arrange = samples.arrange
-    rows = {conversion.index.shape[1] for conversion in arrange.maps.values()}
-    return {
-        "frames": samples.frames,
-        "views": list(arrange.views),
-        "kind": arrange.kind,
-        "layout": arrange.layout,
-        "coordinates": arrange.coordinates,
-        "cartesian_rows": rows.pop() if rows else 512,
-        "ground": samples.ground,
-    }
-
-
-def _said(noise: NoiseModel) -> str:
-    names = [name for name, model in NOISE_MODELS.items() if model == noise]
-    return names[0] if names else f"{noise.mean:g},{noise.std:g},{noise.scale:g}"
 
 
 def _plain(value: Any, name: str) -> Any:

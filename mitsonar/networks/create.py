@@ -12,6 +12,7 @@ from mitsonar.networks.cnn1b import Cnn1b
 from mitsonar.networks.cnn4b import Cnn4b
 from mitsonar.networks.cnn4posenet import Cnn4PoseNet
 from mitsonar.networks.corrnet import CorrNet
+from mitsonar.networks.impulse_posenet import ImpulsePoseNet
 from mitsonar.networks.posenet import PoseNet
 from mitsonar.networks.posenet_dual import PoseNetDual
 from mitsonar.networks.sfmnet import SfMNet
@@ -26,6 +27,7 @@ NETWORKS: dict[str, Any] = {
     "cnn4posenet": Cnn4PoseNet,
     "posenet_dual": PoseNetDual,
     "corrnet": CorrNet,
+    "impulse_posenet": ImpulsePoseNet,
 }
 """Classes of networks; of each: ``needs``, ``any_sonar``, ``says_law``, as in :class:`~mitsonar.networks.blocks.Network`."""
 
@@ -65,19 +67,21 @@ def options_of(name: str) -> list[str]:
     return list(inspect.signature(NETWORKS[name]).parameters)
 
 
-def options_for(name: str, inputs: Any, labels: Tensor) -> dict[str, Any]:
+def options_for(name: str, inputs: Any, labels: Tensor, receivers: int = 1) -> dict[str, Any]:
     """The options of a network that samples settle: number of labels, sizes and channels of the input.
 
     Args:
         name: of :data:`NETWORKS`.
         inputs: of a batch, as :class:`~mitsonar.dataset.pairs.SonarPairs` gives them: one tensor or a tuple.
         labels: ``(batch, outputs)``.
+        receivers: whose impulse responses the input holds.
 
     Raises:
         MitsonarError: unknown name.
     """
     first, *others = inputs if isinstance(inputs, tuple) else (inputs,)
     settled: dict[str, Any] = {"outputs": labels.shape[-1], "size": list(first.shape[-2:]), "channels": first.shape[-3]}
+    settled["receivers"] = receivers
     if others and isinstance(others[0], Tensor):
         settled["cartesian_size"] = list(others[0].shape[-2:])
     known = options_of(name)

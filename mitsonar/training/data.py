@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
-from mitsonar.dataset.arrangement import Arrangement
+from mitsonar.dataset.impulses import ImpulsePairs
 from mitsonar.dataset.pairs import SonarPairs
 from mitsonar.dataset.recipe import Recipe, load_recipe
 from mitsonar.dataset.rendered import RawStream, RenderedPairs
 from mitsonar.dataset.rendering import calibrate
 from mitsonar.errors import MitsonarError
-from mitsonar.noise import load_noise
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.training.recipe import TrainingRecipe
 
@@ -39,6 +38,10 @@ def seed_of(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
 
 
+Kind = SonarPairs | RenderedPairs | ImpulsePairs
+"""Of samples."""
+
+
 @dataclass(frozen=True)
 class Material:
     """What a network learns from.
@@ -51,7 +54,7 @@ class Material:
         about: what a resumed run must find again: name and digest of the data.
     """
 
-    samples: SonarPairs | RenderedPairs
+    samples: Kind
     numbers: NDArray[np.int64] | None
     epoch: int
     validation: Validation
@@ -67,13 +70,9 @@ class Validation:
         levels: names of noise levels.
     """
 
-    def __init__(
-        self, samples: SonarPairs | RenderedPairs, rows: list[dict[str, Any]] | list[int], levels: list[str]
-    ) -> None:
+    def __init__(self, samples: Kind, rows: list[dict[str, Any]] | list[int], levels: list[str]) -> None:
         self.samples, self.rows = samples, rows
-        self.arrangements: dict[str, Arrangement] = {
-            level: replace(samples.arrange, noise=load_noise(level), levels=()) for level in dict.fromkeys(levels)
-        }
+        self.arrangements: dict[str, Any] = {level: samples.at_noise(level) for level in dict.fromkeys(levels)}
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -109,7 +108,10 @@ def material_of(recipe: TrainingRecipe, data: str | Path | None, *, render: bool
     if not render:
         assert data is not None
         return _stored(recipe, data)
+    if recipe.input.kind == "response":
+        raise MitsonarError("impulse responses are not rendered in training: make a data set, and leave out --render")
     stored = None if data is None else _part(recipe, data, "validation", labels="raw")
+    assert not isinstance(stored, ImpulsePairs)
     world = load_recipe(recipe.data, recipe.data_changes) if stored is None else stored.recipe
     if gain is None:
         ensure_variant()
@@ -131,20 +133,22 @@ def _stored(recipe: TrainingRecipe, data: str | Path) -> Material:
             "lower batch"
         )
     validation = _validation(recipe, _part(recipe, data, "validation", labels="raw"))
-    about = {"name": pairs.recipe.name, "digest": _digest(pairs.recipe, len(pairs.store)), "gain": pairs.store.about["gain"]}
+    digest, gain = _digest(pairs.recipe, len(pairs.store)), pairs.store.about.get("gain")
+    about = {"name": pairs.recipe.name, "digest": digest, "gain": gain}
     return Material(pairs, numbers, len(numbers), validation, about)
 
 
-def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: Any) -> SonarPairs:
-    return SonarPairs(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **words})
+def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: Any) -> SonarPairs | ImpulsePairs:
+    kind = ImpulsePairs if recipe.input.kind == "response" else SonarPairs
+    return kind(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **words})
 
 
-def _within(recipe: TrainingRecipe, pairs: SonarPairs) -> NDArray[np.bool_]:
+def _within(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> NDArray[np.bool_]:
     """Which samples lie in the part of the data that is used."""
     return np.asarray(pairs.first + pairs.frames <= recipe.part_of_data * len(pairs.store))
 
 
-def _validation(recipe: TrainingRecipe, pairs: SonarPairs) -> Validation:
+def _validation(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> Validation:
     """Stored samples, those of other sequences first."""
     wanted = recipe.validation
     numbers = np.flatnonzero(_within(recipe, pairs))
@@ -245,7 +249,7 @@ class Order(Sampler[list[tuple[int, int]]]):
 class _Stored(Dataset[Any]):
     """Raw samples with their epoch, for workers that only read."""
 
-    pairs: SonarPairs
+    pairs: SonarPairs | ImpulsePairs
 
     def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
         epoch, number = key
@@ -256,7 +260,7 @@ class _Stored(Dataset[Any]):
 class _Together:
     """Raw samples become a batch: ``epoch``, ``frames``, and ``raw``, or finished ``inputs`` and ``label``."""
 
-    samples: SonarPairs | RenderedPairs
+    samples: Kind
     finish: bool
 
     def __call__(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -270,7 +274,7 @@ class _Together:
         return {**batch, "inputs": inputs, "label": label}
 
 
-def finished(batch: dict[str, Any], samples: SonarPairs | RenderedPairs, device: torch.device) -> tuple[Any, Tensor]:
+def finished(batch: dict[str, Any], samples: Kind, device: torch.device) -> tuple[Any, Tensor]:
     """Inputs and labels of a batch on a device."""
     if "inputs" in batch:
         return batch["inputs"], batch["label"]

@@ -12,8 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
-from mitsonar.dataset.pairs import SonarPairs, split_for
+from mitsonar.channel_sonar import ChannelSonar
+from mitsonar.dataset.impulses import ImpulsePairs
+from mitsonar.dataset.pairs import SonarPairs
+from mitsonar.dataset.parts import split_for
 from mitsonar.dataset.recipe import Recipe, Split
+from mitsonar.dataset.recordings import recording_of
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.comparison import Answers, chosen, rows_of
@@ -27,13 +31,16 @@ Array = NDArray[np.float64]
 
 NOISES = ("none", "low", "high")
 
+SAME_INSTRUMENT = ("name", "model", "seed", "rays", "points_per_m2")
+"""Keys of a channel sonar in which two may differ and yet be one instrument."""
+
 TIMED = 20
 """Pairs over which the time of one is taken."""
 
 
 def predictions(
     checkpoint: Checkpoint,
-    pairs: SonarPairs,
+    pairs: SonarPairs | ImpulsePairs,
     batch: int = 16,
     *,
     numbers: Sequence[int] | None = None,
@@ -51,7 +58,8 @@ def predictions(
         progress: called with how many were done.
 
     Returns:
-        Targets ``(n, 3)`` [m, m, rad], or ``(n, 1)`` [m] of heights; covariances ``(n, 3, 3)``, if the network says them.
+        Targets ``(n, 3)`` [m, m, rad], ``(n, 2)`` [m] without yaw, or ``(n, 1)`` [m] of heights; covariances
+        ``(n, 3, 3)``, if the network says them.
     """
     place = _device(device)
     network = checkpoint.build().to(place)
@@ -71,7 +79,7 @@ def evaluate(
     checkpoint: Checkpoint,
     data: str | Path,
     *,
-    noise: Sequence[str] = NOISES,
+    noise: Sequence[str] | None = None,
     part: str | None = None,
     split: str | Split | dict[str, Any] | None = None,
     pairs: int | None = None,
@@ -86,7 +94,7 @@ def evaluate(
     Args:
         checkpoint: of the network.
         data: path or URL of the data set.
-        noise: levels, each a table.
+        noise: levels, each a table; default: :data:`NOISES`, or none for impulse responses.
         part: ``train``, ``validation``, ``test`` or ``all``; default: ``test`` where the split has one, else ``validation``.
         split: default: that of the training, else of the data set.
         pairs: at most so many, drawn at random.
@@ -110,7 +118,8 @@ def evaluate(
     if others and not force:
         raise MitsonarError(f"{'; '.join(others)}: evaluate on that sonar, or force it with --force")
     split = checkpoint.recipe.get("split") if split is None else split
-    levels = list(dict.fromkeys(noise))
+    usual = NOISES[:1] if checkpoint.channel is not None else NOISES
+    levels = list(dict.fromkeys(usual if noise is None else noise))
     samples = {level: samples_for(checkpoint, data, part=part, split=split, noise=level, seed=seed) for level in levels}
     first = samples[levels[0]]
     numbers = chosen(len(first), pairs, seed)
@@ -129,7 +138,7 @@ def evaluate(
         "trained": {"data": checkpoint.data, "model": checkpoint.model, "noise": checkpoint.noise, **checkpoint.trained},
         "data": str(data),
         "recipe": recipe.name,
-        "model": recipe.instrument.model,
+        "model": recording_of(recipe).model,
         "part": part or first.split.unseen,
         "split": first.split.by,
         "pairs": len(numbers),
@@ -149,7 +158,7 @@ def samples_for(
     split: str | Split | dict[str, Any] | None = None,
     noise: str = "none",
     seed: int = 0,
-) -> SonarPairs:
+) -> SonarPairs | ImpulsePairs:
     """One sample of each sequence of a data set, arranged for a network.
 
     Raises:
@@ -158,6 +167,8 @@ def samples_for(
     words = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": True}
     if part is None:
         part = split_for(split, DataStore.open(data).recipe).unseen
+    if checkpoint.channel is not None:
+        return ImpulsePairs(data, part=part, split=split, frames=checkpoint.arrangement["frames"], **words)
     return SonarPairs(data, part=part, split=split, **checkpoint.arrangement, **words)
 
 
@@ -165,7 +176,7 @@ def _device(device: torch.device | str | None) -> torch.device:
     return torch.device(device if device is not None else "cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs, numbers: Sequence[int]) -> float:
+def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numbers: Sequence[int]) -> float:
     """Median processor time of one sample on one core, from frames (and their geometry) to the answer."""
     network = checkpoint.build()
     spent = []
@@ -185,15 +196,16 @@ def _table(
     checkpoint: Checkpoint, truth: Array, resamples: NDArray[np.int64], ms: float, said: Array, law: Array | None
 ) -> dict[str, Any]:
     """Rows of the network and of always answering nothing."""
-    inputs = {checkpoint.network: inputs_of(checkpoint), "zero": "nothing"}
-    if truth.shape[1] == len(AXES):
+    inputs, beyond = {checkpoint.network: inputs_of(checkpoint), "zero": "nothing"}, _beyond(checkpoint, truth, said)
+    if truth.shape[1] >= 2:
+        truth, said, axes = _with_yaw(truth), _with_yaw(said), truth.shape[1]
         nan, sure = np.full((len(truth), 3, 3), np.nan), np.ones(len(truth), dtype=bool)
         answers = {
             checkpoint.network: Answers(said, sure, nan if law is None else law, np.full(len(truth), ms)),
             "zero": Answers(np.zeros_like(truth), sure, nan, np.zeros(len(truth))),
         }
-        rows = [row.plain() for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
-        scale = np.array([1, 1, 100])
+        rows = [_of_axes(row.plain(), axes) for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
+        scale = np.array([1, 1, 100])[:axes]
     else:
         middle = np.full_like(truth, checkpoint.coder.low.mean() / 2 + checkpoint.coder.high.mean() / 2)
         found = {checkpoint.network: said, "zero": middle}
@@ -205,7 +217,17 @@ def _table(
         scale = np.ones(1)
     for row in rows:
         row["thesis"] = [value * factor for value, factor in zip(row["rmse"], scale.tolist(), strict=True)]
-    return {"limits": {}, "reference": "zero", "rows": rows, "beyond": _beyond(checkpoint, truth, said)}
+    return {"limits": {}, "reference": "zero", "rows": rows, "beyond": beyond}
+
+
+def _with_yaw(motion: Array) -> Array:
+    """Motions ``(n, 3)`` of those with or without yaw, which is then 0."""
+    return np.hstack([motion, np.zeros((len(motion), len(AXES) - motion.shape[1]))])
+
+
+def _of_axes(row: dict[str, Any], axes: int) -> dict[str, Any]:
+    """A row with the numbers of its first axes."""
+    return {name: value[:axes] if isinstance(value, list) else value for name, value in row.items()}
 
 
 def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArray[np.int64]) -> dict[str, Any]:
@@ -248,6 +270,8 @@ def _beyond(checkpoint: Checkpoint, truth: Array, said: Array) -> dict[str, floa
 
 def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
     """Sentences on the sonars of a data set that are not those of training."""
+    if checkpoint.channel is not None:
+        return _other_channel(checkpoint.channel, recipe.channel_sonar, recipe.name)
     found = []
     for view in recipe.views:
         trained = checkpoint.sonars.get(view.name)
@@ -262,14 +286,22 @@ def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
     return list(dict.fromkeys(found))
 
 
+def _other_channel(trained: ChannelSonar, other: ChannelSonar, name: str) -> list[str]:
+    """A sentence on keys that differ and change responses."""
+    mine, its = trained.model_dump(mode="json"), other.model_dump(mode="json")
+    changed = [key for key in mine if mine[key] != its[key] and key not in SAME_INSTRUMENT]
+    return [f"trained with another channel sonar than that of {name}: {', '.join(changed)} differ"] if changed else []
+
+
 def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str]:
     """Sentences on what else differs, and on pairs that training has seen."""
     found = []
     same = checkpoint.data_recipe == recipe.model_dump(mode="json")
     if same and part in ("train", "all"):
         found.append(f"part {part} of this data set holds pairs that training has seen")
-    if recipe.instrument.model != checkpoint.model:
-        found.append(f"trained on the {checkpoint.model} model, evaluated on the {recipe.instrument.model} model")
+    model = recording_of(recipe).model
+    if model != checkpoint.model:
+        found.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")
     if not checkpoint.arrangement["ground"]:
         low, high = (height + recipe.mount.up_m for height in recipe.flight.heights)
         trained = checkpoint.stands

@@ -30,7 +30,8 @@ Array = NDArray[np.float64]
 
 def axes_of(labels: Labels) -> tuple[Axis, ...]:
     """Names and units of what is estimated: a motion's, or a height's."""
-    return AXES if len(labels.names) == len(AXES) else (Axis("height", "mm", 1e3),)
+    known = {axis.name: axis for axis in (*AXES, Axis("height", "mm", 1e3))}
+    return tuple(known[name.split()[0]] for name in labels.names)
 
 
 def said(output: Tensor | MotionLaw, labels: Labels) -> Array:
@@ -63,7 +64,8 @@ def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
     labels = torch.from_numpy(material.samples.labels.encode(truth))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
-        network = create_network(name, **{**options_for(name, inputs, labels), **options})
+        receivers = len(material.samples.described()["arrangement"]["views"])
+        network = create_network(name, **{**options_for(name, inputs, labels, receivers), **options})
     if recipe.start is not None:
         _begin_with(network, name, Checkpoint.load(recipe.start))
     try:

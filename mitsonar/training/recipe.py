@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from mitsonar.dataset.packing import snr_of
 from mitsonar.dataset.recipe import Split, recipe_fields, set_key, split_from
 from mitsonar.errors import MitsonarError, complaint
 from mitsonar.noise import load_noise
@@ -25,7 +26,7 @@ class _Part(BaseModel):
 
 
 def _known_noise(text: str) -> str:
-    load_noise(text)
+    (snr_of if text.endswith("dB") else load_noise)(text)
     return text
 
 
@@ -33,22 +34,44 @@ Noise = Annotated[str, AfterValidator(_known_noise)]
 
 
 class Input(_Part):
-    """How frames reach the network: words of :class:`~mitsonar.dataset.pairs.SonarPairs`."""
+    """How frames reach the network: words of :class:`~mitsonar.dataset.pairs.SonarPairs`; of impulse responses only frames
+    and leak, those of :class:`~mitsonar.dataset.impulses.ImpulsePairs`."""
 
     frames: int = Field(2, ge=1, le=16, description="of a sample; 1: heights are learnt")
     views: list[str] | None = Field(None, description="which views; null: all")
-    kind: Literal["image", "vector"] = Field("image", description="images, or sums over their beams")
+    kind: Literal["image", "vector", "response"] = Field(
+        "image", description="images, sums over their beams, or impulse responses"
+    )
     layout: Literal["side", "stack", "channels"] = Field("side", description="frames side by side, stacked, or channels")
     coordinates: Literal["polar", "cartesian", "both"] = Field("polar", description="as stored, fans in metres, or both")
     cartesian_rows: int = Field(512, ge=2, le=8192, description="pixels of a fan in the forward direction")
     ground: bool = Field(False, description="with the geometry of the ground, for networks that know it")
+    leak: Literal["none", "one_ping", "strangers"] = Field(
+        "none", description="of impulse responses: no motion is shown, what is still learnt is a leak"
+    )
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        plain = Input.model_construct(kind=self.kind, frames=self.frames)
+        images = ("views", "layout", "coordinates", "cartesian_rows", "ground")
+        other = [name for name in (images if self.kind == "response" else ("leak",)) if _differ(self, plain, name)]
+        if other:
+            raise ValueError(f"input.{other[0]} is not for kind {self.kind}: leave it out")
+        return self
 
     def words(self) -> dict[str, Any]:
-        """For SonarPairs and RenderedPairs."""
+        """For SonarPairs and RenderedPairs, or ImpulsePairs."""
         words = self.model_dump()
+        if self.kind == "response":
+            return {"frames": self.frames, "leak": self.leak}
+        del words["leak"]
         if not words["ground"]:
             del words["ground"]
         return words
+
+
+def _differ(one: BaseModel, other: BaseModel, name: str) -> bool:
+    return bool(getattr(one, name) != getattr(other, name))
 
 
 class Loss(_Part):
@@ -75,7 +98,8 @@ class Optimiser(_Part):
     kind: Literal["adam", "adamw"] = "adam"
     rate: float = Field(1e-4, gt=0, le=10, description="learning rate at the start")
     schedule: Literal["halve", "cosine", "constant"] = Field("halve", description="of the rate")
-    halve_every: float = Field(12.0, gt=0, description="epochs after which the rate is halved, again and again")
+    halve_every: float = Field(12.0, gt=0, description="epochs after which the rate falls, again and again")
+    fall_to: float = Field(0.5, gt=0, le=1, description="part of the rate that is left then, with schedule halve")
     warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the beginning")
     weight_decay: float = Field(0.0, ge=0, le=1)
     clip: float | None = Field(None, gt=0, description="largest norm of the gradient; null: any")
@@ -91,7 +115,7 @@ class Optimiser(_Part):
         rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
         match self.schedule:
             case "halve":
-                return self.rate * rise * 0.5 ** math.floor(step / (self.halve_every * epoch_steps))
+                return self.rate * rise * self.fall_to ** math.floor(step / (self.halve_every * epoch_steps))
             case "cosine":
                 done = max(0, step - self.warmup) / max(1, steps - self.warmup)
                 return self.rate * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
@@ -143,6 +167,9 @@ class TrainingRecipe(_Part):
         if not isinstance(fields, dict):
             return fields
         named = {"network": {"name": fields["network"]}} if isinstance(fields.get("network"), str) else {}
+        kind = fields["input"].get("kind") if isinstance(fields.get("input"), dict) else None
+        if kind == "response" and isinstance(fields.get("validate", {}), dict):
+            named["validate"] = {"noise": ["none"], **fields.get("validate", {})}
         either = {"epochs": None} if fields.get("steps") is not None and "epochs" not in fields else {}
         return {**fields, **named, **either}
 
@@ -159,6 +186,11 @@ class TrainingRecipe(_Part):
             raise ValueError(f"the length is epochs or steps, one of them: got epochs {self.epochs}, steps {self.steps}")
         if isinstance(self.noise, list) and not self.noise:
             raise ValueError("noise is a level or a list of levels: got an empty list; give none for no noise")
+        decibels = self.input.kind == "response"
+        for level in {*self.noises, *self.validate_.noise} - {"none"}:
+            if level.endswith("dB") != decibels:
+                allowed = "a signal to noise ratio such as '20 dB'" if decibels else "low, high, chapter2 or mean,std,scale"
+                raise ValueError(f"noise of input.kind {self.input.kind} is {allowed}, or none: got {level!r}")
         if self.augment and not self.input.ground:
             raise ValueError("augment is for inputs with ground: set input.ground: true, or leave augment out")
         if isinstance(self.split, dict):
