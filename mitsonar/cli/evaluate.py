@@ -32,8 +32,12 @@ def evaluate(
     run: Run,
     data: Annotated[str, typer.Argument(metavar="DATA.zarr", help="Path or URL of a data set.")],
     noise: Annotated[
-        str, typer.Option(help="Levels with commas between them (or ; where one is m,s,g): none, low, high, a YAML file.")
-    ] = "none,low,high",
+        str | None,
+        typer.Option(
+            help="Levels with commas between them (or ; where one is m,s,g): none, low, high, a YAML file; of impulse "
+            "responses none, 20 dB ... Default: none,low,high; of responses none."
+        ),
+    ] = None,
     part: Annotated[
         str | None, typer.Option(help="train, validation, test (default where it is), all; dealt out as in training.")
     ] = None,
@@ -54,7 +58,7 @@ def evaluate(
 
     if out is not None:
         _check_folder(out, overwrite)
-    levels = list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
+    levels = None if noise is None else list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
     words: dict[str, Any] = {"part": part, "pairs": pairs, "force": force, "seed": seed, "batch": batch}
     with ExitStack() as bar:
         report = evaluated(
@@ -102,6 +106,7 @@ def checkpoint_from(run: str) -> Checkpoint:
 def report_lines(report: dict[str, Any]) -> list[str]:
     """The tables of :func:`mitsonar.training.evaluation.evaluate` as Markdown."""
     units = "height mm" if len(report["names"]) == 1 else "sideways mm / forward mm / yaw deg"
+    units = units.removesuffix(" / yaw deg") if len(report["names"]) == 2 else units
     lines = [
         f"{report['data']} ({report['recipe']}), part {report['part']} by {report['split']}: {report['pairs']} samples of "
         f"{report['scenes']} scenes, {report['model']} model; {units}"

@@ -13,6 +13,7 @@ from mitsonar.cli.render import SIX
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
+    from mitsonar.mapping.odometry import Method, Source
     from mitsonar.mapping.source import FrameSource
 
 __all__ = ["Frames", "frames_from", "odometry"]
@@ -26,14 +27,20 @@ PAIRS_A_WORKER = 50
 
 @answered
 def odometry(
-    frames: Frames,
+    frames: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN|FRAMES|DATA.zarr", help="A run of frames or impulse responses, or a data set of frames."
+        ),
+    ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to make: path, motions, table, figure.")],
     estimator: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, corrnet, or a network's checkpoint; with options NAME:key=value:key=value."
+            help="zero, ecc, flow, phase, direct, corrnet, or a network's checkpoint; NAME:key=value:key=value; of impulse "
+            "responses: zero, correlation, likelihood."
         ),
-    ] = "direct",
+    ] = None,
     smooth: Annotated[
         str, typer.Option(help="none, spline or kalman; motions that are not believed are bridged anyway.")
     ] = "none",
@@ -44,7 +51,9 @@ def odometry(
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
     view: Annotated[str | None, typer.Option(help="Of a data set (default: the first).")] = None,
-    noise: Annotated[str, typer.Option(help="Added to the frames: none, low, high, m,s,g or a YAML file.")] = "none",
+    noise: Annotated[
+        str, typer.Option(help="Added: none, low, high, m,s,g or a YAML file; to impulse responses a ratio such as '20 dB'.")
+    ] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes (default: as many as pay, up to the cores).")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an odometry that is there.")] = False,
@@ -57,14 +66,25 @@ def odometry(
     Writes into OUT: estimated.tum, true.tum where poses are known, motions.csv, covariances.npz, table.md, table.json,
     path.png, run.json, and estimates.jsonl, from which --resume goes on.
     """
-    from mitsonar.estimation.estimators import estimator_from
+    from mitsonar.mapping.response_source import holds_responses
     from mitsonar.mapping.results import run_odometry, table_lines
     from mitsonar.motion import Pose
 
-    method = estimator_from(estimator)
     factors = scale if scale is None or scale == "fit" else numbers(scale, 3, "--scale (or fit)")
     first = numbers(start, 6, "--from")
-    source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+    source: Source
+    method: Method
+    if holds_responses(frames):
+        if any(option is not None for option in (sequence, view, pitch_deg)):
+            raise MitsonarError("--sequence, --view and --pitch-deg belong to frames; impulse responses have none of them")
+        estimator = estimator or "likelihood"
+        source, method = _responses(frames, estimator, noise, seed, height)
+    else:
+        from mitsonar.estimation.estimators import estimator_from
+
+        estimator = estimator or "direct"
+        method = estimator_from(estimator)
+        source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
@@ -94,6 +114,14 @@ def odometry(
     count, lost = len(found.estimates), int((~found.believed).sum())
     say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} not believed and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")
+
+
+def _responses(where: str, estimator: str, noise: str, seed: int, height: float | None) -> tuple[Source, Method]:
+    """Impulse responses and their estimator."""
+    from mitsonar.estimation.impulse_estimators import create_impulse_estimator
+    from mitsonar.mapping.response_source import open_responses
+
+    return open_responses(where).told(noise, seed, height), create_impulse_estimator(estimator)
 
 
 def frames_from(

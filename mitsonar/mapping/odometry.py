@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -22,8 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.estimation.estimator import Estimate, Estimator
+from mitsonar.estimation.impulse import ImpulseEstimator
 from mitsonar.frames import SonarFrames
 from mitsonar.mapping.assessment import assess, path_length
+from mitsonar.mapping.continuity import continued
 from mitsonar.mapping.paths import (
     MotionSeries,
     fit_scale,
@@ -33,11 +35,12 @@ from mitsonar.mapping.paths import (
     scaled,
     spline_smoothed,
 )
+from mitsonar.mapping.response_source import ResponseSource
 from mitsonar.mapping.source import FrameSource
 from mitsonar.metrics import AXES, in_units, motion_errors
 from mitsonar.motion import Pose, Trajectory, motions
 
-__all__ = ["Odometry", "Row", "Smoothing", "bridged", "estimate_motions", "odometry", "series_of"]
+__all__ = ["Method", "Odometry", "Row", "Smoothing", "Source", "bridged", "estimate_motions", "odometry", "series_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -45,6 +48,10 @@ Row = tuple[str, float, str]
 """Name, value, unit."""
 
 Smoothing = Literal["none", "spline", "kalman"]
+
+Source = FrameSource | ResponseSource
+Method = Estimator | ImpulseEstimator
+"""Frames with an estimator of frames, or pings with one of impulse responses."""
 
 PAIRS_A_BATCH = 8
 """What a worker is given at a time, and what a kill may cost."""
@@ -130,8 +137,8 @@ class Odometry:
 
 
 def odometry(
-    frames: FrameSource | SonarFrames,
-    estimator: Estimator,
+    frames: Source | SonarFrames,
+    estimator: Method,
     *,
     smooth: Smoothing = "none",
     scale: ArrayLike | Literal["fit"] | None = None,
@@ -171,6 +178,7 @@ def odometry(
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     numbers = _frames_used(source, smooth, scale, every)
     estimates = estimate_motions(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
+    estimates = continued(estimates)
     measured = series_of(estimates, source.time_s[numbers])
     true = source.true
     factors = np.ones(3)
@@ -185,7 +193,7 @@ def odometry(
     return Odometry(numbers, estimates, series, path, true, smooth, factors, isinstance(scale, str))
 
 
-def _frames_used(source: FrameSource, smooth: str, scale: ArrayLike | str | None, every: int) -> Index:
+def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int) -> Index:
     """Numbers of the frames; what cannot work is refused before hours of estimating."""
     if every < 1:
         raise MitsonarError(f"every must be at least 1: got {every}")
@@ -205,7 +213,7 @@ def _frames_used(source: FrameSource, smooth: str, scale: ArrayLike | str | None
     return numbers
 
 
-def _start(source: FrameSource, first: int) -> Pose:
+def _start(source: Source, first: int) -> Pose:
     """The true first pose, or what is known of it."""
     if source.poses is not None:
         return Pose(*(float(value) for value in source.poses[first]))
@@ -273,8 +281,8 @@ def _usual(reasons: list[str]) -> str:
 
 
 def estimate_motions(
-    source: FrameSource,
-    estimator: Estimator,
+    source: Source,
+    estimator: Method,
     frames: ArrayLike,
     *,
     workers: int = 1,
@@ -323,7 +331,7 @@ def _batches(pairs: list[int]) -> list[range]:
 
 
 def _made_here(
-    source: FrameSource, estimator: Estimator, numbers: Index, batches: list[range], workers: int
+    source: Source, estimator: Method, numbers: Index, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimates of this process."""
     with _one_opencv_thread():
@@ -332,7 +340,7 @@ def _made_here(
 
 
 def _made_beside(
-    source: FrameSource, estimator: Estimator, numbers: Index, batches: list[range], workers: int
+    source: Source, estimator: Method, numbers: Index, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimates of processes that are started anew; this one reads the frames."""
     with _one_thread_each():
@@ -357,8 +365,8 @@ def _made_beside(
             pool.shutdown(cancel_futures=True)
 
 
-def _estimates(estimator: Estimator, frames: SonarFrames) -> list[Estimate]:
-    """Of consecutive frames."""
+def _estimates(estimator: Any, frames: Any) -> list[Estimate]:
+    """Of consecutive frames or pings."""
     return [estimator.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
 
 
@@ -387,11 +395,11 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-_worker: Estimator
+_worker: Method
 """Of this process, where it is a worker."""
 
 
-def _begin_worker(estimator: Estimator) -> None:
+def _begin_worker(estimator: Method) -> None:
     global _worker
     _worker = estimator
     cv2.setNumThreads(1)
@@ -409,5 +417,5 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _in_worker(frames: SonarFrames) -> list[Estimate]:
+def _in_worker(frames: Any) -> list[Estimate]:
     return _estimates(_worker, frames)

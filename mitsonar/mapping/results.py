@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, Estimator
+from mitsonar.estimation.estimator import Estimate
 from mitsonar.files import read_json, write_json, write_whole
 from mitsonar.mapping.charts import path_figure, save_figure
-from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
-from mitsonar.mapping.source import FrameSource
+from mitsonar.mapping.odometry import Method, Odometry, Row, Smoothing, Source, odometry
 from mitsonar.metrics import AXES, in_units
 from mitsonar.motion import Motion, Pose, Trajectory
 
@@ -163,9 +162,9 @@ class OdometryFolder:
 
 
 def run_odometry(
-    source: FrameSource,
+    source: Source,
     name: str,
-    estimator: Estimator,
+    estimator: Method,
     out: str | Path,
     *,
     smooth: Smoothing = "none",
@@ -259,14 +258,16 @@ def _line_of(pair: int, estimate: Estimate) -> str:
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
     said = {"pair": pair, "motion": motion, "covariance": covariance, "believe": bool(estimate.believe)}
-    return json.dumps(said | {"reason": estimate.reason}) + "\n"
+    alike = {name: estimate.about[name] for name in ("modes", "spreads") if name in estimate.about}
+    return json.dumps(said | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
 
 
 def _estimate_in(line: bytes) -> tuple[int, Estimate]:
     said = json.loads(line)
     covariance = None if said["covariance"] is None else np.array(said["covariance"], dtype=float).reshape(3, 3)
     motion = Motion(*(float(value) for value in said["motion"]))
-    return int(said["pair"]), Estimate(motion, covariance, bool(said["believe"]), str(said["reason"]))
+    about = dict(said.get("about", {}))
+    return int(said["pair"]), Estimate(motion, covariance, bool(said["believe"]), str(said["reason"]), about)
 
 
 def _save_tum(path: Path, trajectory: Trajectory) -> None:

@@ -287,7 +287,8 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
 
 
 def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
-    from mitsonar.dataset.store import DataStore, array_names  # half a second that other frames, and workers, do without
+    from mitsonar.dataset.image_recording import array_names
+    from mitsonar.dataset.store import DataStore  # half a second that other frames, and workers, do without
 
     store = DataStore.open(url)
     stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}

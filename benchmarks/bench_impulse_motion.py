@@ -1,0 +1,321 @@
+"""Motion from impulse responses: table 5.2 and 5.3, noise, leaks, what is told wrongly, and the six courses of table 5.6.
+
+    python benchmarks/bench_impulse_motion.py rows --out bench/impulse [--samples 100] [--only NAME] [--model rays]
+    python benchmarks/bench_impulse_motion.py noise --out bench/impulse
+    python benchmarks/bench_impulse_motion.py courses --out bench/impulse
+
+Samples are made as the data sets `impulse-*` make them, over 5 scenes that no network saw (seed 4201), and kept in OUT: a
+run that is broken off goes on. `rows`: every row of table 5.2 by each estimator, the thesis's figure and the bound of the
+law beside it. `noise`: the standard row at signal to noise ratios, two pings of different scenes, one ping twice, and a
+height or sound speed told wrongly. `courses`: trajectories 1 to 6 over flat objects, positions 50 ms apart, each motion from
+ten pings (--pings 2: from the pings at both positions; motions that fit alike are then told apart by their neighbours).
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench_impulse import cpu
+from numpy.typing import NDArray
+
+from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, load_recipe, load_scene
+from mitsonar.courses import COURSES, course
+from mitsonar.dataset.packing import with_noise
+from mitsonar.dataset.plan import scenes_of, sequences_of, steady_velocities
+from mitsonar.dataset.recipe import Recipe
+from mitsonar.estimation.impulse_estimators import create_impulse_estimator
+from mitsonar.estimation.impulse_limit import impulse_limit
+from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.response_source import ResponseSource
+from mitsonar.metrics import in_units
+from mitsonar.motion import Pose, motions, velocities
+
+SEED, SCENES = 4201, 5
+
+ROWS = {
+    "impulse-two-receivers": "6.0 / 5.9",
+    "impulse-40khz": "8.8 / 10.5",
+    "impulse-60khz": "6.3 / 6.2",
+    "impulse-standard": "5.1 / 4.2",
+    "impulse-narrow": "2.7 / 2.3",
+    "impulse-circular-4800": "11.0 / 15.2",
+    "impulse-100khz": "7.7 / 7.6",
+    "impulse-160khz": "9.05 / 8.84",
+    "impulse-wideband-9600": "3.9 / 3.8",
+    "impulse-wideband-19200": "1.9 / 2.4",
+    "impulse-circular-19200": "2.0 / 3.5",
+    "impulse-high-objects": "5.4 / 5.2",
+    "impulse-ten-80khz": "1.8 / 1.7",
+    "impulse-ten-160khz": "1.58 / 1.51",
+    "impulse-ten-320khz": "1.53 / 1.27",
+    "impulse-yaw": "-",
+}
+"""Data sets, and the RMSE of the thesis's network in its own simulator (`rays`), sideways / forward [mm]."""
+
+COSTLY = {"impulse-wideband-19200": 0.3, "impulse-circular-19200": 0.3, "impulse-wideband-9600": 0.5}
+"""Part of the samples for rows whose likelihood takes long."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["rows", "noise", "courses"])
+    parser.add_argument("--out", type=Path, default=Path("bench/impulse"))
+    parser.add_argument("--samples", type=int, default=100)
+    parser.add_argument("--only", choices=[*ROWS, *COURSES], nargs="*")
+    parser.add_argument("--model", choices=["scatterers", "rays"], default="scatterers")
+    parser.add_argument("--estimators", default="zero,correlation,likelihood")
+    parser.add_argument("--pings", type=int, default=10, help="of each motion of a course")
+    parser.add_argument("--processes", type=int, default=2)
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, model {asked.model}", flush=True)
+    {"rows": rows, "noise": noise, "courses": courses}[asked.what](asked)
+
+
+# ---------------------------------------------------------------- samples
+
+
+def made(out: Path, name: str, model: str, samples: int) -> list[ImpulseResponses]:
+    """Samples of a data set's kind, from OUT or new."""
+    recipe = load_recipe(name, {"seed": SEED, "channel.model": model})
+    path = out / f"{name}-{model}-{samples}.npz"
+    if not path.exists():
+        parts = list(fresh(recipe, samples))
+        np.savez(
+            path,
+            response=np.array([one.response for one in parts]),
+            poses=np.array([one.poses for one in parts]),
+            time_s=parts[0].time_s,
+        )
+    table = np.load(path)
+    sonar = recipe.channel_sonar
+    return [
+        ImpulseResponses(response, table["time_s"], sonar, poses=poses, height_m=poses[:, 2])
+        for response, poses in zip(table["response"], table["poses"], strict=True)
+    ]
+
+
+_LAST: dict[Any, ChannelSimulator] = {}
+"""A simulator of each scene that is open: rows over the same scene share its scatterers."""
+
+
+def fresh(recipe: Recipe, samples: int) -> Iterator[ImpulseResponses]:
+    """The first sequences of the first scenes of a recipe."""
+    sonar = recipe.channel_sonar
+    for scene in scenes_of(recipe, recipe.sequences)[:SCENES]:
+        simulator = simulator_of(recipe, scene)
+        for sequence in itertools.islice(sequences_of(recipe, scene), samples // SCENES):
+            time_s = np.arange(len(sequence.vehicle)) / sonar.frame_rate_hz
+            speeds = steady_velocities(sequence.vehicle, sonar.frame_rate_hz)
+            parts = list(simulator.pings(sequence.vehicle, speeds))
+            response = np.concatenate([part.response for part in parts])
+            yield ImpulseResponses(response, time_s, sonar, poses=sequence.vehicle)
+
+
+def simulator_of(recipe: Recipe, scene: Any) -> ChannelSimulator:
+    """Of a scene, whose mesh is loaded once for all rows."""
+    key = (recipe.family(scene.group).model_dump_json(), scene.seed)
+    if key not in _LAST:
+        if len(_LAST) >= SCENES:
+            _LAST.clear()
+        with tempfile.TemporaryDirectory() as folder:
+            path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
+            _LAST[key] = ChannelSimulator(load_scene(path, **parameters), recipe.channel_sonar)
+    like = _LAST[key]
+    return ChannelSimulator(like.hearing.scene, recipe.channel_sonar, like=like)
+
+
+# ---------------------------------------------------------------- estimates
+
+
+def told(work: tuple[str, dict[str, Any], ImpulseResponses]) -> list[float]:
+    """Answer of an estimator: motion, standard deviations, whether it believes, seconds."""
+    name, options, responses = work
+    begun = time.perf_counter()
+    try:
+        found = create_impulse_estimator(name, **options).estimate(responses)
+    except MitsonarError:
+        return [0.0] * 6 + [0.0, time.perf_counter() - begun]
+    spread = np.full(3, np.nan) if found.covariance is None else np.sqrt(np.abs(np.diag(found.covariance)))
+    return [*found.motion, *spread, float(found.believe), time.perf_counter() - begun]
+
+
+def estimates(
+    asked: argparse.Namespace, label: str, name: str, samples: list[ImpulseResponses], **options: Any
+) -> NDArray[np.float64]:
+    """Answers ``(samples, 8)``, from OUT or new."""
+    path = asked.out / f"{label}-{name}.json"
+    if not path.exists():
+        work = [(name, options, one) for one in samples]
+        with multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
+            answers = pool.map(told, work, chunksize=max(1, len(work) // (4 * asked.processes)))
+        path.write_text(json.dumps(answers))
+    return np.array(json.loads(path.read_text()))
+
+
+def truth(samples: list[ImpulseResponses]) -> NDArray[np.float64]:
+    """Motions from first to last ping ``(samples, 3)``."""
+    return np.array([motions(one.poses[[0, -1]])[0] for one in samples if one.poses is not None])
+
+
+def said(answers: NDArray[np.float64], true: NDArray[np.float64]) -> str:
+    """RMSE of all, median, believed share and their RMSE, milliseconds."""
+    error = in_units(answers[:, :3] - true)
+    rmse, median = np.sqrt((error**2).mean(axis=0)), np.median(np.abs(error), axis=0)
+    sure = answers[:, 6] > 0
+    believed = np.sqrt((error[sure] ** 2).mean(axis=0)) if sure.any() else np.full(3, np.nan)
+    seconds = float(np.median(answers[:, 7]))
+    columns = [" / ".join(f"{value:.3g}" for value in row) for row in (rmse, median, believed)]
+    return f"{columns[0]} | {columns[1]} | {sure.mean():.0%}: {columns[2]} | {1e3 * seconds:.0f}"
+
+
+HEAD = (
+    "| data | estimator | RMSE sideways mm / forward mm / yaw deg | median | believed: RMSE | ms | thesis | bound, rms |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
+
+
+def rows(asked: argparse.Namespace) -> None:
+    """Every row of table 5.2."""
+    print(HEAD, flush=True)
+    for name in asked.only or ROWS:
+        samples = made(asked.out, name, asked.model, asked.samples)
+        true, part = truth(samples), COSTLY.get(name, 1.0)
+        turning = bool(np.abs(true[:, 2]).max() > 1e-9)
+        for estimator in asked.estimators.split(","):
+            used = samples[:: round(1 / part)] if estimator == "likelihood" else samples
+            options = {"yaw": True} if turning and estimator == "likelihood" else {}
+            answers = estimates(asked, f"{name}-{asked.model}-{asked.samples}", estimator, used, **options)
+            bound = bound_of(asked, name, used, turning) if estimator == "likelihood" and asked.model == "scatterers" else ""
+            figure = ROWS[name] if estimator == "likelihood" else ""
+            mine = true[:: round(1 / part)] if estimator == "likelihood" else true
+            print(f"| {name} ({len(used)}) | {estimator} | {said(answers, mine)} | {figure} | {bound} |", flush=True)
+
+
+def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponses], turning: bool) -> str:
+    """Root mean square of the local bound over some of the samples' motions, noiseless."""
+    path = asked.out / f"{name}-bound.json"
+    if not path.exists():
+        free = (0, 1, 2) if turning else (0, 1)
+        stds = []
+        for one, true in list(zip(samples, truth(samples), strict=True))[:24]:
+            span = float(one.time_s[-1] - one.time_s[0])
+            stds.append(impulse_limit(one.sonar, 10.0, true, pings=len(one), span_s=span, free=free).tolist())
+        path.write_text(json.dumps(stds))
+    stds = np.array(json.loads(path.read_text()))
+    scale = np.array([1e3, 1e3, 180 / np.pi])[: stds.shape[1]]
+    rms, median = np.sqrt((stds**2).mean(axis=0)) * scale, np.median(stds, axis=0) * scale
+    return " / ".join(f"{value:.3g}" for value in rms) + " (median " + " / ".join(f"{v:.3g}" for v in median) + ")"
+
+
+# ---------------------------------------------------------------- noise, leaks, wrong words
+
+
+def noise(asked: argparse.Namespace) -> None:
+    """The standard row, and ten pings, in noise; leaks; perturbed."""
+    print(
+        "| data | noise or change | estimator | RMSE | median | believed: RMSE | ms |\n|---|---|---|---|---|---|---|",
+        flush=True,
+    )
+    for name in asked.only or ("impulse-standard", "impulse-ten-80khz"):
+        samples = made(asked.out, name, asked.model, asked.samples)
+        true = truth(samples)
+        cases: dict[str, list[ImpulseResponses]] = {}
+        for snr in (30.0, 20.0, 10.0, 0.0):
+            cases[f"{snr:g} dB"] = [noisy(one, number, snr) for number, one in enumerate(samples)]
+        cases["one ping, again and again"] = [again(one) for one in samples]
+        cases["pings of two scenes"] = [
+            strangers(one, samples[number - 2 * len(samples) // 5]) for number, one in enumerate(samples)
+        ]
+        for percent in (-5, 5):
+            cases[f"height told {percent:+d} %"] = [
+                replace(one, height_m=one.height_m * (1 + percent / 100)) for one in samples if one.height_m is not None
+            ]
+        for percent in (-1, 1):
+            sonar = samples[0].sonar.replace(sound_speed=1500 * (1 + percent / 100))
+            cases[f"sound speed told {percent:+d} %"] = [replace(one, sonar=sonar) for one in samples]
+        for case, changed in cases.items():
+            for estimator in asked.estimators.split(","):
+                if estimator == "zero":
+                    continue
+                label = f"{name}-{asked.model}-{asked.samples}-{case.replace(' ', '_').replace('%', 'pc')}"
+                answers = estimates(asked, label, estimator, changed)
+                print(f"| {name} | {case} | {estimator} | {said(answers, true)} |", flush=True)
+
+
+def noisy(one: ImpulseResponses, number: int, snr_db: float) -> ImpulseResponses:
+    """With white complex noise."""
+    return replace(one, response=with_noise(one.response, np.arange(len(one)) + 1000 * number, snr_db, SEED))
+
+
+def again(one: ImpulseResponses) -> ImpulseResponses:
+    """The first ping in place of all."""
+    return replace(one, response=np.repeat(one.response[:1], len(one), axis=0))
+
+
+def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponses:
+    """The first ping, and those of another scene after it."""
+    return replace(one, response=np.concatenate([one.response[:1], other.response[1:]]))
+
+
+# ---------------------------------------------------------------- courses
+
+
+def courses(asked: argparse.Namespace) -> None:
+    """Table 5.6: motion by motion, and where the path ends."""
+    print(
+        "| course | estimator | RMSE sideways mm / forward mm | believed | path m | end error cm | of the path |\n"
+        "|---|---|---|---|---|---|---|",
+        flush=True,
+    )
+    recipe = load_recipe("impulse-standard", {"seed": SEED, "channel.model": asked.model})
+    for name in asked.only or COURSES:
+        flown, steps = course(name, Pose(0, 0, 10)), asked.pings - 1
+        path = asked.out / f"course-{name}-{asked.model}-{asked.pings}.npz"
+        if not path.exists():
+            fine = flown.resample((len(flown) - 1) * steps + 1)
+            simulator = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0])
+            simulator.responses(fine, velocities(fine)).save(path)
+        responses = ImpulseResponses.load(path)
+        pairs = [responses.select(slice(k * steps, (k + 1) * steps + 1)) for k in range(len(flown) - 1)]
+        true = motions(flown.poses)
+        length = float(np.hypot(*true[:, :2].T).sum())
+        for estimator in asked.estimators.split(","):
+            if estimator == "zero":
+                continue
+            label = f"course-{name}-{asked.model}-{asked.pings}"
+            answers = driven(asked, label, estimator, responses) if steps == 1 else estimates(asked, label, estimator, pairs)
+            error = answers[:, :2] - true[:, :2]
+            rmse, end = 1e3 * np.sqrt((error**2).mean(axis=0)), float(np.hypot(*error.sum(axis=0)))
+            print(
+                f"| {name} | {estimator} | {rmse[0]:.2f} / {rmse[1]:.2f} | {answers[:, 6].mean():.0%} | {length:.1f} | "
+                f"{100 * end:.2f} | {end / length:.2%} |",
+                flush=True,
+            )
+
+
+def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseResponses) -> NDArray[np.float64]:
+    """Motions ``(n, 7)`` from ping to ping as odometry has them: told apart by their neighbours, bridged where none is
+    believed; the last column whether it is."""
+    path = asked.out / f"{label}-{name}.json"
+    if not path.exists():
+        found = odometry(ResponseSource(label, responses), create_impulse_estimator(name), workers=asked.processes)
+        rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.believed])
+        path.write_text(json.dumps(rows.tolist()))
+    return np.array(json.loads(path.read_text()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""The estimator ``correlation``: the expert's, as correlation velocity logs and displaced-phase-centre navigation do it.
+
+An echo from the level ground at incidence theta comes earlier by 2 d sin(theta) / c once the vehicle has moved d towards it:
+taps of one receiver turn against each other by 4 pi d sin(theta) / lambda from ping to ping, the more the later they are.
+Coarse: of all motions the one after which the products of both pings' taps add up best, all receivers together; the slope
+over delay is what tells turns apart. Fine: the phases that remain in short windows along delay, by weighted least squares.
+Motions across a receiver's look count for nothing here, though they cost likeness.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from mitsonar.channel_sonar import ChannelSonar
+from mitsonar.estimation.estimator import Estimate, unbelieved
+from mitsonar.estimation.impulse import pings_of, standing_height
+from mitsonar.motion import Motion
+from mitsonar.responses import ImpulseResponses
+
+__all__ = ["Correlation"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+STEP = 1 / 16
+"""Of the motions that are tried, in wavelengths."""
+
+WINDOW = 8
+"""Taps whose products are averaged."""
+
+LEAST = 4.0
+"""By which the best sum must exceed what pings with nothing in common sum up to, in its standard deviations."""
+
+CLOSE = 0.9
+"""A second motion that sums up to this part of the best leaves open which it is."""
+
+
+class Products(NamedTuple):
+    """What one receiver's neighbouring pings share.
+
+    Attributes:
+        product: of each tap of a ping with that of the next, conjugate, over all pairs ``(taps,)``.
+        energy: of both ``(taps,)``.
+        turn: radians a metre by which taps turn with a motion along the look ``(taps,)``.
+        look: its direction: to starboard, forward ``(2,)``.
+    """
+
+    product: Complex
+    energy: Array
+    turn: Array
+    look: Array
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Ping-to-ping correlation, coarse to fine; two degrees of freedom, the heading is taken to stay.
+
+    Args:
+        height_m: of the transmitter over the ground; default: what the responses say.
+        speed: the fastest that is looked for along an axis [m/s].
+    """
+
+    height_m: float | None = None
+    speed: float = 2.1
+
+    inputs = "height"
+
+    def estimate(self, responses: ImpulseResponses) -> Estimate:
+        """The motion, and whether to believe it."""
+        pings = pings_of(responses)
+        height = standing_height(responses, "correlation", self.height_m)
+        heard = [_products(responses.sonar, z, number, height) for number, z in enumerate(pings.response.swapaxes(0, 1))]
+        heard = [one for one in heard if one.energy.any()]
+        if not heard:
+            return unbelieved("no receiver heard anything")
+        if np.linalg.matrix_rank(np.array([one.look for one in heard]), tol=0.1) < 2:
+            return unbelieved("all receivers look along one line: motions across it do not show")
+        reach = self.speed * pings.interval_s
+        coarse, doubt = _coarse(heard, reach, responses.sonar.wavelength_m * STEP)
+        motion = (len(responses) - 1) * _fine(heard, coarse)
+        return Estimate(Motion(float(motion[0]), float(motion[1]), 0.0), None, not doubt, doubt)
+
+
+def _products(sonar: ChannelSonar, response: Complex, number: int, height_m: float) -> Products:
+    """Of one receiver's pings ``(pings, taps)``; taps before the first echo and outside its look count nothing."""
+    field = sonar.receivers[number].field
+    cosine = height_m / np.maximum(sonar.delay_s * sonar.sound_speed / 2, height_m)
+    sine = np.sqrt(1 - cosine**2)
+    widest = math.radians(field.tilt_deg + field.along_deg / 2) if field.shape == "rectangular" else math.pi / 2
+    inside = (cosine < 1) & (cosine > math.cos(min(widest, math.pi / 2)))
+    product = np.where(inside, (response[:-1] * response[1:].conj()).sum(axis=0), 0)
+    energy = np.where(inside, np.sqrt((np.abs(response[:-1]) ** 2).sum(axis=0) * (np.abs(response[1:]) ** 2).sum(axis=0)), 0)
+    heading = math.radians(field.heading_deg)
+    return Products(product, energy, 4 * np.pi / sonar.wavelength_m * sine, np.array([math.sin(heading), math.cos(heading)]))
+
+
+def _coarse(heard: list[Products], reach: float, step: float) -> tuple[Array, str]:
+    """The motion whose turned products add up best ``(2,)`` [m], and what speaks against it."""
+    line = np.linspace(-reach, reach, 2 * math.ceil(reach / step) + 1)
+    sideways, forward = np.meshgrid(line, line, indexing="ij")
+    total, spread = np.zeros(sideways.shape), 0.0
+    far = np.linspace(-1.5 * reach, 1.5 * reach, 6 * math.ceil(reach / step) + 1)
+    for one in heard:
+        weight = one.product / max(float(one.energy.sum()), 1e-300)
+        sums = (np.exp(1j * far[:, None] * one.turn) @ weight).real
+        total += np.interp(one.look[0] * sideways + one.look[1] * forward, far, sums)
+        spread += float((np.abs(weight) ** 2).sum()) / 2
+    peaks = np.argwhere((total == maximum_filter(total, size=5)) & (total > 0))
+    if not len(peaks):
+        return np.zeros(2), "the pings have nothing in common"
+    peaks = peaks[np.argsort(-total[tuple(peaks.T)])]
+    best = total[tuple(peaks[0])]
+    doubt = "" if best > LEAST * math.sqrt(spread) else "the pings have nothing in common"
+    if not doubt and len(peaks) > 1 and total[tuple(peaks[1])] > CLOSE * best:
+        doubt = "two motions fit alike"
+    return line[peaks[0]], doubt
+
+
+def _fine(heard: list[Products], motion: Array) -> Array:
+    """The motion ``(2,)`` from the phases that remain after a coarse one."""
+    for _ in range(3):
+        information, pull = np.zeros((2, 2)), np.zeros(2)
+        for one in heard:
+            product = _windows(one.product * np.exp(1j * (one.look @ motion) * one.turn))
+            energy = _windows(one.energy)
+            turn = _windows(one.turn * one.energy) / np.maximum(energy, 1e-300)
+            likeness = np.minimum(np.abs(product) / np.maximum(energy, 1e-300), 0.999)
+            # variance of the phase of the mean of n products (Rodriguez and Martin, 1992)
+            weight = np.where(energy > 0, 2 * WINDOW * likeness**2 / (1 - likeness**2), 0)
+            information += (weight * turn**2).sum() * np.outer(one.look, one.look)
+            pull += (weight * turn * -np.angle(product)).sum() * one.look
+        motion = motion + np.linalg.lstsq(information, pull, rcond=None)[0]
+    return motion
+
+
+def _windows(taps: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    """Sums over neighbouring taps."""
+    whole = len(taps) // WINDOW * WINDOW
+    return np.asarray(taps[:whole].reshape(-1, WINDOW).sum(axis=1))

@@ -1,0 +1,137 @@
+"""Impulse responses of one run, for odometry, as :class:`~mitsonar.mapping.source.FrameSource` gives frames."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.dataset.packing import snr_of, snr_said, with_noise
+from mitsonar.errors import MitsonarError
+from mitsonar.motion import Trajectory
+from mitsonar.responses import ImpulseResponses
+
+__all__ = ["ResponseSource", "holds_responses", "open_responses"]
+
+
+@dataclass(frozen=True)
+class ResponseNoise:
+    """White complex noise at a ratio of signal to noise."""
+
+    snr_db: float
+
+    def model_dump(self) -> dict[str, str]:
+        """For the record."""
+        return {"kind": "white", "snr": snr_said(self.snr_db)}
+
+
+@dataclass(frozen=True)
+class ResponseSource:
+    """The pings of one run.
+
+    Attributes:
+        name: what errors call it.
+        responses: all of them.
+        told_height_m: that was given for responses that lack theirs.
+        noise: that is added when pings are read, and its seed.
+        seed: see noise.
+        note: empty; data sets are read by their samples.
+    """
+
+    name: str
+    responses: ImpulseResponses
+    told_height_m: float | None = None
+    noise: ResponseNoise | None = None
+    seed: int = 0
+    note: str = ""
+    pitch_rad: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.responses)
+
+    @property
+    def time_s(self) -> NDArray[np.float64]:
+        """Of the pings ``(pings,)``."""
+        return self.responses.time_s
+
+    @property
+    def poses(self) -> NDArray[np.float64] | None:
+        """Of the transmitter ``(pings, 6)``, where known: the truth."""
+        return self.responses.poses
+
+    @property
+    def height_m(self) -> NDArray[np.float64] | None:
+        """Over the ground ``(pings,)``, where known."""
+        return self.responses.height_m
+
+    @property
+    def true(self) -> Trajectory | None:
+        """Where the transmitter was, where that is known."""
+        return None if self.poses is None else Trajectory(self.poses, self.time_s)
+
+    def told(self, snr: str = "none", seed: int = 0, height_m: float | None = None) -> Self:
+        """The same pings with noise at a ratio as ``20 dB``, and with a height [m] where they lack it.
+
+        Raises:
+            MitsonarError: a ratio that is none; a height that cannot be or that would not be used.
+        """
+        ratio = snr_of(snr)
+        if height_m is not None and not 0 < height_m < np.inf:
+            raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
+        known = self.responses.height_m
+        if height_m is not None and known is not None and np.isfinite(known).all():
+            raise MitsonarError(f"{self.name} tells its heights, so that {height_m:g} m would not be used: leave it out")
+        responses = self.responses
+        if height_m is not None:
+            responses = replace(responses, height_m=np.full(len(responses), height_m))
+        noise = None if ratio is None else ResponseNoise(ratio)
+        return replace(self, responses=responses, told_height_m=height_m, noise=noise, seed=seed)
+
+    def check_times(self) -> None:
+        """Pings follow each other.
+
+        Raises:
+            MitsonarError: they do not, or have no times.
+        """
+        if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
+            raise MitsonarError(f"{self.name}: times of pings must be finite and increase; write the pings in order")
+
+    def read(self, index: ArrayLike) -> ImpulseResponses:
+        """Pings of these numbers ``(n,)``, as estimators may see them: with height and attitude, but with place, heading and
+        velocity unknown, so that no truth can leak."""
+        chosen = np.asarray(index, dtype=np.intp)
+        seen = self.responses.select(chosen)
+        response = seen.response
+        if self.noise is not None:
+            response = with_noise(response, chosen, self.noise.snr_db, self.seed)
+        poses = None if seen.poses is None else seen.poses * [0, 0, 1, 1, 1, 0]
+        return replace(seen, response=response.astype(np.complex64), poses=poses, velocity=None)
+
+    def digest(self) -> str:
+        """SHA-256 of the responses and what is known of them."""
+        told = hashlib.sha256(self.responses.sonar.model_dump_json().encode())
+        for values in (self.responses.response, self.time_s, self.poses, self.height_m):
+            told.update(b"-" if values is None else np.ascontiguousarray(values).tobytes())
+        told.update(repr((self.noise, self.seed)).encode())
+        return told.hexdigest()
+
+
+def holds_responses(where: str | Path) -> bool:
+    """Whether impulse responses lie there: the folder that ``mitsonar impulse`` made, or its responses.npz or .zarr."""
+    path = Path(where)
+    if path.name.startswith("responses."):
+        return path.exists()
+    return path.is_dir() and (path / "responses.npz").is_file()
+
+
+def open_responses(where: str | Path) -> ResponseSource:
+    """The responses at a path.
+
+    Raises:
+        MitsonarError: damaged, or no responses.
+    """
+    return ResponseSource(str(where), ImpulseResponses.load(where))
