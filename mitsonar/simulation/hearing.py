@@ -18,6 +18,7 @@ from mitsonar.plugins.surfaces import Surfaces
 from mitsonar.simulation.paths import delay_exact, delay_iterated
 from mitsonar.simulation.scatterers import Scatterers
 from mitsonar.simulation.tracing import height_below, hidden
+from mitsonar.simulation.variant import garbage_stays
 
 __all__ = ["Heard", "Hearing"]
 
@@ -69,7 +70,8 @@ class Hearing:
         if (receiver, wanted) not in self.launches:
             self.launches[receiver, wanted] = self._compile(receiver, wanted)
         table = mi.Float64(where_and_whither(self.sonar, receiver, pose, velocity))
-        heard = self.launches[receiver, wanted](mi.UInt32(asked), self.scene, table, self.source.tables(receiver))
+        with garbage_stays():
+            heard = self.launches[receiver, wanted](mi.UInt32(asked), self.scene, table, self.source.tables(receiver))
         return {name: np.array(values) for name, values in zip(wanted, heard, strict=True)}
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
@@ -19,7 +17,7 @@ from mitsonar.frames import SonarFrames
 from mitsonar.motion import Trajectory
 from mitsonar.noise import NoiseModel
 from mitsonar.simulation.echoes import Echoes
-from mitsonar.simulation.variant import ensure_variant
+from mitsonar.simulation.variant import ensure_variant, garbage_stays
 from mitsonar.sonar import Sonar
 
 if TYPE_CHECKING:
@@ -126,7 +124,7 @@ class Simulator:
             self._launches[key] = self._compile(*key)
         inputs = self.tracer.inputs(poses, first)
         tables = [view.tables(poses) for view in self.views]
-        with _garbage_stays():
+        with garbage_stays():
             height, made = self._launches[key](self.tracer.scene, *inputs, tables)
         height_m = np.array(height, dtype=float)
         looks = []
@@ -231,18 +229,6 @@ class Simulator:
             level_scale=1 / gain,
             **labelled,
         )
-
-
-@contextmanager
-def _garbage_stays() -> Iterator[None]:
-    """No garbage collection while a launch is recorded: Dr.Jit 1.5 ends the process where an array is freed then."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def constant_gain(batches: Iterable[Pings]) -> tuple[float, Iterator[Pings]]:

@@ -4,11 +4,22 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError, nearest_names
 
-__all__ = ["VARIANTS", "Backend", "backend", "ensure_variant", "release_memory", "thread_count", "use_threads"]
+__all__ = [
+    "VARIANTS",
+    "Backend",
+    "backend",
+    "ensure_variant",
+    "garbage_stays",
+    "release_memory",
+    "thread_count",
+    "use_threads",
+]
 
 VARIANTS = ("cuda_ad_mono", "llvm_ad_mono", "cuda_ad_rgb", "llvm_ad_rgb")
 """The variants that mitsonar works with; monochrome ones need less memory."""
@@ -69,6 +80,18 @@ def thread_count() -> int:
     import drjit as dr
 
     return max(1, int(dr.thread_count()))
+
+
+@contextmanager
+def garbage_stays() -> Iterator[None]:
+    """No garbage collection while a launch is recorded: Dr.Jit 1.5 ends the process where an array is freed then."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
 
 
 def release_memory() -> None:
