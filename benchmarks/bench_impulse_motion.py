@@ -60,6 +60,8 @@ ROWS = {
     "impulse-ten-160khz": "1.58 / 1.51",
     "impulse-ten-320khz": "1.53 / 1.27",
     "impulse-yaw": "-",
+    "impulse-yaw-narrow": "-",
+    "impulse-yaw-ten": "-",
 }
 """Data sets, and the RMSE of the thesis's network in its own simulator (`rays`), sideways / forward [mm]."""
 

@@ -175,6 +175,9 @@ def test_no_place_in_a_small_scene_is_one_sentence() -> None:
 
 # ---------------------------------------------------------------- recipes
 
+TURNING = {"impulse-yaw": "impulse-standard", "impulse-yaw-narrow": "impulse-narrow", "impulse-yaw-ten": "impulse-ten-80khz"}
+"""Recipes that turn, and those that do not."""
+
 TABLE: dict[str, tuple[int, float, float, int, int, str, float, float]] = {
     "impulse-two-receivers": (2, 80, 4.8, 800, 2, "rectangular", 10, 0.001),
     "impulse-40khz": (4, 40, 4.8, 800, 2, "rectangular", 10, 0.001),
@@ -196,7 +199,7 @@ TABLE: dict[str, tuple[int, float, float, int, int, str, float, float]] = {
 
 
 def test_recipes_are_the_rows_of_the_table() -> None:
-    assert {name for name in shipped_recipes() if name.startswith("impulse-")} == {*TABLE, "impulse-yaw"}
+    assert {name for name in shipped_recipes() if name.startswith("impulse-")} == {*TABLE, *TURNING}
     for name, (receivers, carrier, band, taps, pings, shape, across, thick) in TABLE.items():
         recipe = load_recipe(name)
         sonar, flight, family = recipe.channel_sonar, recipe.flight, recipe.family(0)
@@ -213,14 +216,11 @@ def test_recipes_are_the_rows_of_the_table() -> None:
         assert [one.name for one in sonar.receivers] == (
             ["front", "right"] if receivers == 2 else ["front", "left", "back", "right"]
         )
-    turning = load_recipe("impulse-yaw")
-    assert turning.flight.yaw_deg == 0.45
-    assert {**turning.model_dump(), "flight": 0, "name": 0, "about": 0} == {
-        **load_recipe("impulse-standard").model_dump(),
-        "flight": 0,
-        "name": 0,
-        "about": 0,
-    }
+    for name, still in TURNING.items():
+        turning = load_recipe(name)
+        assert turning.flight.yaw_deg * (turning.flight.pings - 1) == pytest.approx(0.45)
+        own = {"flight": 0, "name": 0, "about": 0}
+        assert {**turning.model_dump(), **own} == {**load_recipe(still).model_dump(), **own}
     assert load_recipe("impulse-standard", {"channel.model": "rays"}).channel_sonar.model == "rays"
 
 

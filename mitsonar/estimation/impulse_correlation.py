@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from mitsonar.channel_sonar import ChannelSonar
+from mitsonar.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.estimation.estimator import Estimate, unbelieved
 from mitsonar.estimation.impulse import pings_of, standing_height
 from mitsonar.motion import Motion
@@ -27,6 +27,9 @@ __all__ = ["Correlation"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+
+ACROSS = 41
+"""Angles across a beam that are averaged over."""
 
 STEP = 1 / 16
 """Of the motions that are tried, in wavelengths."""
@@ -91,13 +94,25 @@ def _products(sonar: ChannelSonar, response: Complex, number: int, height_m: flo
     """Of one receiver's pings ``(pings, taps)``; taps before the first echo and outside its look count nothing."""
     field = sonar.receivers[number].field
     cosine = height_m / np.maximum(sonar.delay_s * sonar.sound_speed / 2, height_m)
-    sine = np.sqrt(1 - cosine**2)
+    sine = _along(field, cosine)
     widest = math.radians(field.tilt_deg + field.along_deg / 2) if field.shape == "rectangular" else math.pi / 2
     inside = (cosine < 1) & (cosine > math.cos(min(widest, math.pi / 2)))
     product = np.where(inside, (response[:-1] * response[1:].conj()).sum(axis=0), 0)
     energy = np.where(inside, np.sqrt((np.abs(response[:-1]) ** 2).sum(axis=0) * (np.abs(response[1:]) ** 2).sum(axis=0)), 0)
     heading = math.radians(field.heading_deg)
     return Products(product, energy, 4 * np.pi / sonar.wavelength_m * sine, np.array([math.sin(heading), math.cos(heading)]))
+
+
+def _along(field: FieldOfView, cosine: Array) -> Array:
+    """How far along its look a receiver's echoes come from, of a unit way ``(taps,)``: the sine of their incidence less what
+    the beam's width takes, mean by energy.
+
+    At a slant range R and an angle psi aside, sin^2 psi + along^2 + (height / R)^2 = 1.
+    """
+    aside = np.linspace(-0.5, 0.5, ACROSS) * math.radians(min(field.across_deg, 90.0))
+    energy = field.sensitivity(np.cos(aside), np.sin(aside), 0 * aside) ** 2 if field.shape != "all" else np.ones(ACROSS)
+    along = np.sqrt(np.maximum(np.cos(aside)[:, None] ** 2 - cosine**2, 0))
+    return np.asarray((energy[:, None] * along).sum(axis=0) / energy.sum())
 
 
 def _coarse(heard: list[Products], reach: float, step: float) -> tuple[Array, str]:
