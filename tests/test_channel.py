@@ -154,6 +154,18 @@ def test_frequency_response_is_the_direct_sum(carrier: float) -> None:
     assert np.abs(found - direct).max() < 1e-8 * np.abs(direct).max()
 
 
+@pytest.mark.gpu
+def test_sums_on_the_device_are_those_of_the_host() -> None:
+    from mitsonar.simulation import transform
+
+    pytest.importorskip("cufinufft")
+    rng = np.random.default_rng(0)
+    turn, strength = rng.uniform(-np.pi, np.pi, 5000), rng.normal(size=(5000, 2)) @ [1, 1j]
+    k = np.arange(-360, 361)
+    direct = np.exp(-1j * np.outer(k, turn)) @ strength
+    assert np.abs(transform._on_the_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
+
+
 def test_response_is_the_sum_of_pulses_and_nothing_wraps() -> None:
     """Two routes: padded transform, and pulses written down in time; echoes at the very beginning too."""
     sonar = ChannelSonar()

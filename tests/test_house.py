@@ -41,7 +41,7 @@ STAGES = (
     "simulation.worlds.families",
     *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "tracing", "views", "segments", "bistatic")),
     *(f"simulation.{name}" for name in ("binning", "imaging", "runs", "derivatives")),
-    *(f"simulation.{name}" for name in ("paths", "scatterers", "hearing", "channel", "impulse_runs")),
+    *(f"simulation.{name}" for name in ("paths", "scatterers", "hearing", "transform", "channel", "impulse_runs")),
     *(
         f"dataset.{name}"
         for name in ("recipe", "recording", "image_recording", "response_recording", "recordings", "plan", "split", "place")

@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import finufft
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -16,6 +15,7 @@ from mitsonar.channel_sonar import PADDING, ChannelSonar
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import Trajectory
 from mitsonar.responses import ImpulseResponses
+from mitsonar.simulation.transform import phasor_sums
 from mitsonar.simulation.variant import thread_count
 
 if TYPE_CHECKING:
@@ -26,9 +26,6 @@ __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impul
 FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
 """What is fetched of :class:`~mitsonar.simulation.hearing.Heard`."""
-
-TOLERANCE = 1e-9
-"""Of the non-uniform FFT, relative."""
 
 PINGS_AT_A_TIME = 16
 """Whose launches wait for their transforms: 50 bytes an echo and receiver."""
@@ -225,10 +222,7 @@ def _spectrum(
     sonar: ChannelSonar, turn: NDArray[np.float64], strength: NDArray[np.complex128], padding: int
 ) -> NDArray[np.complex128]:
     """Sum of strength exp(-i k turn) for k of the band ``(2 half + 1,)``."""
-    modes = 2 * _half(sonar, padding) + 1
-    if not len(turn):
-        return np.zeros(modes, np.complex128)
-    return np.asarray(finufft.nufft1d1(turn, strength, modes, eps=TOLERANCE, isign=-1, nthreads=1))
+    return phasor_sums(turn, strength, 2 * _half(sonar, padding) + 1)
 
 
 def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -> NDArray[np.complex128]:

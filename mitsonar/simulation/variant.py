@@ -14,6 +14,7 @@ __all__ = [
     "VARIANTS",
     "Backend",
     "backend",
+    "current_variant",
     "ensure_variant",
     "garbage_stays",
     "release_memory",
@@ -73,6 +74,14 @@ def use_threads(count: int) -> None:
 
     if dr.thread_count() != count:
         dr.set_thread_count(count)
+
+
+def current_variant() -> str:
+    """The variant that is set; empty where Mitsuba is not loaded or none is."""
+    import sys
+
+    mi = sys.modules.get("mitsuba")
+    return str(mi.variant() or "") if mi is not None else ""
 
 
 def thread_count() -> int:

@@ -1,0 +1,46 @@
+"""The sum over echoes, a non-uniform FFT of type 1: finufft, or cufinufft where the renderer runs on CUDA."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import finufft
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.simulation.variant import current_variant
+
+__all__ = ["TOLERANCE", "phasor_sums"]
+
+TOLERANCE = 1e-9
+"""Relative, of the sums."""
+
+
+def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
+    """Sums of strength exp(-i k turn) ``(modes,)`` for an odd number of k around 0.
+
+    Args:
+        turn: of each echo, -pi..pi ``(n,)``.
+        strength: of each echo ``(n,)``.
+        modes: how many k.
+    """
+    if not len(turn):
+        return np.zeros(modes, np.complex128)
+    if current_variant().startswith("cuda") and _has_cufinufft():
+        return _on_the_device(turn, strength, modes)
+    return np.asarray(finufft.nufft1d1(turn, strength, modes, eps=TOLERANCE, isign=-1, nthreads=1))
+
+
+@cache
+def _has_cufinufft() -> bool:
+    return find_spec("cufinufft") is not None and find_spec("torch") is not None
+
+
+def _on_the_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
+    import cufinufft
+    import torch
+
+    there: Any = (torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength))
+    return np.asarray(cufinufft.nufft1d1(*there, modes, eps=TOLERANCE, isign=-1).cpu().numpy())
