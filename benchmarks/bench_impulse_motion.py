@@ -3,12 +3,14 @@
     python benchmarks/bench_impulse_motion.py rows --out bench/impulse [--samples 100] [--only NAME] [--model rays]
     python benchmarks/bench_impulse_motion.py noise --out bench/impulse
     python benchmarks/bench_impulse_motion.py courses --out bench/impulse
+    python benchmarks/bench_impulse_motion.py figure --out bench/impulse
 
 Samples are made as the data sets `impulse-*` make them, over 5 scenes that no network saw (seed 4201), and kept in OUT: a
 run that is broken off goes on. `rows`: every row of table 5.2 by each estimator, the thesis's figure and the bound of the
 law beside it. `noise`: the standard row at signal to noise ratios, two pings of different scenes, one ping twice, and a
 height or sound speed told wrongly. `courses`: trajectories 1 to 6 over flat objects, positions 50 ms apart, each motion from
 ten pings (--pings 2: from the pings at both positions; motions that fit alike are then told apart by their neighbours).
+`figure`: figure 5.11, the sinusoid by impulse responses, and by images of a DIDSON 2.5 m above the same field (`direct`).
 """
 
 from __future__ import annotations
@@ -29,14 +31,16 @@ import numpy as np
 from bench_impulse import cpu
 from numpy.typing import NDArray
 
-from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, load_recipe, load_scene
+from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, Simulator, load_recipe, load_scene, load_sonar
 from mitsonar.courses import COURSES, course
 from mitsonar.dataset.packing import with_noise
 from mitsonar.dataset.plan import scenes_of, sequences_of, steady_velocities
 from mitsonar.dataset.recipe import Recipe
+from mitsonar.estimation.estimators import create_estimator
 from mitsonar.estimation.impulse_estimators import create_impulse_estimator
 from mitsonar.estimation.impulse_limit import impulse_limit
 from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.paths import path_of
 from mitsonar.mapping.response_source import ResponseSource
 from mitsonar.metrics import in_units
 from mitsonar.motion import Pose, motions, velocities
@@ -71,7 +75,7 @@ COSTLY = {"impulse-wideband-19200": 0.3, "impulse-circular-19200": 0.3, "impulse
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["rows", "noise", "courses"])
+    parser.add_argument("what", choices=["rows", "noise", "courses", "figure"])
     parser.add_argument("--out", type=Path, default=Path("bench/impulse"))
     parser.add_argument("--samples", type=int, default=100)
     parser.add_argument("--only", choices=[*ROWS, *COURSES], nargs="*")
@@ -83,7 +87,7 @@ def main() -> None:
     asked.out.mkdir(parents=True, exist_ok=True)
     os.environ["OMP_NUM_THREADS"] = "1"
     print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, model {asked.model}", flush=True)
-    {"rows": rows, "noise": noise, "courses": courses}[asked.what](asked)
+    {"rows": rows, "noise": noise, "courses": courses, "figure": figure}[asked.what](asked)
 
 
 # ---------------------------------------------------------------- samples
@@ -317,6 +321,41 @@ def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseR
         rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.believed])
         path.write_text(json.dumps(rows.tolist()))
     return np.array(json.loads(path.read_text()))
+
+
+def figure(asked: argparse.Namespace) -> None:
+    """Paths of the sinusoid: true, by impulse responses (after `courses`), by sonar images."""
+    from matplotlib.figure import Figure
+
+    recipe = load_recipe("impulse-standard", {"seed": SEED, "channel.model": asked.model})
+    scene = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0]).hearing.scene
+    flown = course("sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
+    sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
+    frames = Simulator(scene, sonar).render(flown)
+    seen = odometry(frames, create_estimator("direct"), start=Pose(*flown.poses[0]))
+    path = asked.out / f"course-sinusoid-{asked.model}-{asked.pings}-correlation.json"
+    heard = np.array(json.loads(path.read_text()))[:, :3]
+    driven_by = {
+        "impulse responses, correlation of ten pings": path_of(heard, Pose(*flown.poses[0]), flown.time_s).poses,
+        "DIDSON images, direct": seen.path.poses,
+    }
+    drawn = Figure(figsize=(10, 5), layout="constrained")
+    axes = drawn.add_subplot()
+    axes.plot(*flown.poses[:, :2].T, "k--", lw=2, label="true")
+    true = motions(flown.poses)
+    for (name, poses), answers in zip(driven_by.items(), (heard, seen.series.motions), strict=True):
+        rmse = np.sqrt((in_units(answers - true) ** 2).mean(axis=0))
+        end = float(np.hypot(*(poses[-1, :2] - flown.poses[-1, :2])))
+        print(
+            f"{name}: RMSE {rmse[0]:.2f} / {rmse[1]:.2f} mm, {rmse[2]:.3f} deg; end-point error {100 * end:.1f} cm",
+            flush=True,
+        )
+        axes.plot(*poses[:, :2].T, lw=1.2, label=f"{name}: ends {100 * end:.1f} cm off")
+    print(f"images: {int((~seen.believed).sum())} of {len(true)} motions not believed, bridged", flush=True)
+    axes.set(xlabel="starboard (m)", ylabel="forward (m)", aspect="equal", title="Trajectory 5 (sinusoid), no noise")
+    axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
+    axes.grid(alpha=0.3)
+    drawn.savefig(asked.out / "sinusoid.png", dpi=110)
 
 
 if __name__ == "__main__":

@@ -272,8 +272,8 @@ def test_energy_is_that_of_the_imaging_sonar() -> None:
     from mitsonar.sonar import Sonar
 
     field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)
-    sonar = ChannelSonar(receivers=(Receiver(name="one", field=field),), points_per_m2=4000.0)
-    ground = scene(floor=floor(diffuse(0.5), 20.0))
+    sonar = ChannelSonar(receivers=(Receiver(name="one", field=field),), points_per_m2=2000.0)
+    ground = scene(floor=floor(diffuse(0.5), 16.0))
     heard = ChannelSimulator(ground, sonar).paths(LEVEL)
     fan = Sonar(
         azimuth_fov_deg=20.0,
@@ -397,6 +397,7 @@ def test_doppler_of_an_angle(tilt: float) -> None:
     assert doppler == pytest.approx(2 * speed * np.sin(np.radians(tilt)) / sonar.wavelength_m, rel=0.005)
 
 
+@pytest.mark.slow
 def test_correlation_does_not_depend_on_the_density_of_points() -> None:
     """Its curve over the way, at one density and at twice as many points: correlation 0.99 at least, means over places."""
     steps, places = np.linspace(0.5e-3, 20e-3, 12), np.random.default_rng(5).uniform(-2, 2, (8, 2))
