@@ -55,6 +55,9 @@ APART = 5.0
 NEAR = 0.1
 """Starts within so many wavelengths of a motion that was found lead to it."""
 
+TURNS = (-0.006, -0.003, 0.003, 0.006)
+"""Turns over all pings that are begun from [rad]."""
+
 PLACES = 33
 """At which the likelihood across a look is computed."""
 
@@ -157,11 +160,23 @@ class Likelihood:
                 mode = refined(ears, data, np.array([*start, 0.0, 0.0]), self.free, 1)
                 if all(_apart(mode, other) > APART for other in found):
                     found.append(mode)
+        if self.yaw:
+            found = self._turned(ears, data, found)
         depth = min(SURE_PINGS, len(data[0]) - 1)
         if depth > 1:
             best = max(one.mass for one in found)
             found = [refined(ears, data, one.motion, self.free, depth) for one in found if one.mass > best - 20]
         return sorted(found, key=lambda one: -one.mass)
+
+    def _turned(self, ears: list[Ear], data: list[Complex], found: list[Mode]) -> list[Mode]:
+        """The same modes begun from turns to both sides: a turn shows as loss of likeness, which hardly has a sign."""
+        all_ = list(found)
+        for mode in found:
+            for yaw in TURNS:
+                other = refined(ears, data, np.array([*mode.motion[:2], yaw / max(1, len(data[0]) - 1), 0.0]), self.free, 1)
+                if other.likelihood > found[0].likelihood - 20 and all(_far(other, one) for one in all_):
+                    all_.append(other)
+        return all_
 
     def _answer(self, found: list[Mode], alone: float, responses: ImpulseResponses, silent: tuple[str, ...]) -> Estimate:
         """One motion of several that fit."""
@@ -239,6 +254,13 @@ def _apart(one: Mode, other: Mode) -> float:
     return float(np.sqrt(min(way @ np.linalg.solve(mode.covariance[:2, :2], way) for mode in (one, other))))
 
 
+def _far(one: Mode, other: Mode) -> bool:
+    """Whether two modes are not one: by more than a few standard deviations in place or turn."""
+    way = (one.motion - other.motion)[:3]
+    spread = np.sqrt(np.maximum(np.diag(one.covariance)[:3], np.diag(other.covariance)[:3]))
+    return bool((np.abs(way) > APART * np.maximum(spread, 1e-6)).any())
+
+
 def _whole(motion: Array, intervals: int) -> Motion:
     """The motion over many intervals of one that stays the same, along the last heading (eq. 3.4)."""
     sideways, forward, yaw = motion[:3]
@@ -301,12 +323,13 @@ def judged(ear: Ear, response: Complex, motion: Array, free: Sequence[int], dept
     parts = [part for part in told if part is not None]
     noise = NOISE * power
     energy = sum(part.sign * (part.power[:, None] / (part.size[:, None] + noise)).sum(axis=0) for part in parts)
-    level = np.maximum(energy, 1e-300) / response.size
+    there = energy > 0  # what is left of ping given ping may be nothing, where a motion fits not at all
+    level = np.where(there, energy, 1.0) / response.size
     log = sum(part.sign * part.count * np.log(part.size[:, None] + noise).sum(axis=0) for part in parts)
-    likelihood = -response.size * np.log(level) - log
+    likelihood = np.where(there, -response.size * np.log(level) - log, -np.inf)
     best = int(likelihood.argmax())
     gradient, information = np.zeros(len(free)), np.zeros((len(free),) * 2)
-    for part in parts if free else []:
+    for part in parts if free and there[best] else []:
         slopes = [
             block_toeplitz([np.zeros((taps, taps), dtype=complex), *(block[1 + k] for block in blocks[1 : part.pings])])
             for k in range(len(free))
