@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, Simulator, load_recipe, load_scene, load_sonar
 from mitsonar.courses import COURSES, course
 from mitsonar.dataset.packing import with_noise
-from mitsonar.dataset.plan import scenes_of, sequences_of, steady_velocities
+from mitsonar.dataset.plan import scenes_of, sequences_of
 from mitsonar.dataset.recipe import Recipe
 from mitsonar.estimation.estimators import create_estimator
 from mitsonar.estimation.impulse_estimators import create_impulse_estimator
@@ -123,11 +123,8 @@ def fresh(recipe: Recipe, samples: int) -> Iterator[ImpulseResponses]:
     for scene in scenes_of(recipe, recipe.sequences)[:SCENES]:
         simulator = simulator_of(recipe, scene)
         for sequence in itertools.islice(sequences_of(recipe, scene), samples // SCENES):
-            time_s = np.arange(len(sequence.vehicle)) / sonar.frame_rate_hz
-            speeds = steady_velocities(sequence.vehicle, sonar.frame_rate_hz)
-            parts = list(simulator.pings(sequence.vehicle, speeds))
-            response = np.concatenate([part.response for part in parts])
-            yield ImpulseResponses(response, time_s, sonar, poses=sequence.vehicle)
+            flown = sequence.at_rate(sonar.frame_rate_hz)
+            yield simulator.responses(flown, velocities(flown))
 
 
 def simulator_of(recipe: Recipe, scene: Any) -> ChannelSimulator:

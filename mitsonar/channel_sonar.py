@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.sonar import Instrument
 
-__all__ = ["LOOKS", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar", "FieldOfView", "Maths", "Receiver", "four_receivers"]
+__all__ = [
+    *("LOOKS", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
+    *("FieldOfView", "Hydrophone", "Maths", "four_receivers"),
+]
 
 ChannelModel = Literal["scatterers", "rays"]
 SEE = " (see docs/impulse.md)"
@@ -96,7 +99,7 @@ class FieldOfView(BaseModel):
         return 0.5 + 0.5 * maths.cos(ramp * math.pi)
 
 
-class Receiver(BaseModel):
+class Hydrophone(BaseModel):
     """A receiver: its name, its place from the transmitter in the vehicle's axes, and where it looks."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -118,17 +121,17 @@ LOOKS = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
 """Receivers 1 to 4 of Almanza-Medina, 5.4, and where they look [deg]."""
 
 
-def four_receivers(distance_m: float = 0.1, **field: Any) -> tuple[Receiver, ...]:
+def four_receivers(distance_m: float = 0.1, **field: Any) -> tuple[Hydrophone, ...]:
     """The thesis's receivers (5.4): forward, left, back and right of the transmitter, each looking away from it."""
     made = []
     for name, heading in LOOKS.items():
         turn = math.radians(heading)
         place = (round(distance_m * math.sin(turn), 12), round(distance_m * math.cos(turn), 12), 0.0)
-        made.append(Receiver(name=name, position=place, field=FieldOfView(heading_deg=heading, **field)))
+        made.append(Hydrophone(name=name, position=place, field=FieldOfView(heading_deg=heading, **field)))
     return tuple(made)
 
 
-class ChannelSonar(BaseModel):
+class ChannelSonar(Instrument):
     """A transmitter that sends all the time, and receivers whose channels are measured all the time (Almanza-Medina, ch. 5).
 
     All SI but for angles in degrees (the edge of the program). The same names are the XML properties of the sensor
@@ -138,9 +141,9 @@ class ChannelSonar(BaseModel):
         MitsonarError: through :meth:`create` and :meth:`replace`, for an unknown key or a value outside its limits.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    called: ClassVar[str] = "channel sonar"
+    see: ClassVar[str] = SEE
 
-    name: str = Field("custom", description="what the instrument is called")
     carrier_hz: float = Field(80e3, le=1e9, description="carrier f_c [Hz]")
     bandwidth_hz: float = Field(4.8e3, gt=0, le=1e9, description="bandwidth F_d [Hz]")
     sampling_hz: float = Field(8e3, gt=0, le=1e9, description="sampling rate f_d of the complex baseband [Hz]")
@@ -157,7 +160,7 @@ class ChannelSonar(BaseModel):
     rays: int = Field(50_000, ge=1, le=10**8, description="rays within each receiver's field of view, model rays")
     seed: int = Field(0, ge=0, lt=2**31, description="of where scatterers lie")
     transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="where it sends")
-    receivers: tuple[Receiver, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
+    receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -192,22 +195,6 @@ class ChannelSonar(BaseModel):
         if round(taps) * len(names) > 2**24:
             raise ValueError(f"a measurement has at most {2**24:,} taps: got {round(taps) * len(names):,}")
         return self
-
-    @classmethod
-    def create(cls, **fields: Any) -> Self:
-        """The instrument with these keys.
-
-        Raises:
-            MitsonarError: an unknown key, a value outside its limits.
-        """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "channel sonar", SEE)) from None
-
-    def replace(self, **changes: Any) -> Self:
-        """This instrument with some keys changed, checked again."""
-        return self.create(**{**self.model_dump(), **changes})
 
     @property
     def taps(self) -> int:

@@ -99,14 +99,21 @@ def motions(poses: ArrayLike) -> NDArray[np.float64]:
 
 def velocities(flown: Trajectory) -> NDArray[np.float64]:
     """Velocity along a trajectory in the vehicle's own axes: starboard, forward, up [m/s], turn to starboard [rad/s]
-    ``(frames, 4)``; of each step, the last again (one pose: zero)."""
+    ``(frames, 4)``; of each step, the last again (one pose: zero).
+
+    A velocity that is kept leads along an arc; its chord lies half a turn off the first heading, shorter by the sinc of half
+    a turn: exact for level vehicles, as :func:`steady` drives them.
+    """
     if len(flown) == 1:
         return np.zeros((1, 4))
     step = np.diff(flown.time_s)[:, None]
-    moved = vehicle_rotation(flown.poses[:-1]).inv().apply(np.diff(flown.poses[:, :3], axis=0)) / step
+    chord = vehicle_rotation(flown.poses[:-1]).inv().apply(np.diff(flown.poses[:, :3], axis=0))
     turn = np.diff(flown.poses[:, 5])
-    turned = (turn - 2 * np.pi * np.rint(turn / (2 * np.pi)))[:, None] / step
-    table = np.concatenate([moved, turned], axis=1)
+    turn -= 2 * np.pi * np.rint(turn / (2 * np.pi))
+    shorter = np.sinc(turn / (2 * np.pi))
+    sin, cos = np.sin(turn / 2) / shorter, np.cos(turn / 2) / shorter
+    starboard, forward, up = chord.T
+    table = np.column_stack([starboard * cos - forward * sin, forward * cos + starboard * sin, up, turn]) / step
     return np.concatenate([table, table[-1:]])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,45 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from mitsonar.errors import MitsonarError, complaint
 
-__all__ = ["Bearing", "Model", "Sonar"]
+__all__ = ["Bearing", "Instrument", "Model", "Sonar"]
 
 Model = Literal["physical", "thesis"]
 Bearing = Literal["azimuth", "cone"]
 SEE = " (see `mitsonar presets --help` and docs/sonar.md)"
 
 
-class Sonar(BaseModel):
+class Instrument(BaseModel):
+    """What all instruments have, and how one is made so that a mistake is answered by one sentence."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str]
+    see: ClassVar[str]
+
+    name: str = Field("custom", description="what the instrument is called")
+
+    if TYPE_CHECKING:  # each has its own, where it stands among its keys
+        model: Any
+        frame_rate_hz: float
+
+    @classmethod
+    def create(cls, **fields: Any) -> Self:
+        """The instrument with these fields.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits.
+        """
+        try:
+            return cls(**fields)
+        except ValidationError as error:
+            raise MitsonarError(complaint(error, cls, cls.called, cls.see)) from None
+
+    def replace(self, **fields: Any) -> Self:
+        """This instrument with some fields changed, checked again."""
+        return self.create(**{**self.model_dump(), **fields})
+
+
+class Sonar(Instrument):
     """An imaging sonar. Angles in degrees (the edge of the program), all else SI.
 
     The same names are the XML properties of the sensor ``imaging_sonar`` and the keys of a sonar's YAML file
@@ -28,9 +59,9 @@ class Sonar(BaseModel):
         MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    called: ClassVar[str] = "sonar"
+    see: ClassVar[str] = SEE
 
-    name: str = Field("custom", description="what the instrument is called")
     azimuth_fov_deg: float = Field(29.0, gt=0, le=360, description="field of view across the beams [deg]")
     elevation_fov_deg: float = Field(14.0, gt=0, le=180, description="field of view within a beam [deg]")
     beams: int = Field(96, ge=1, le=65_536, description="number of beams")
@@ -87,18 +118,6 @@ class Sonar(BaseModel):
 
     def _outermost_deg(self) -> float:
         return math.degrees(self.bearing_rad[-1] + self.beam_width_rad / 2)
-
-    @classmethod
-    def create(cls, **fields: Any) -> Self:
-        """The sonar with these fields; a mistake is answered by a :class:`MitsonarError` of one sentence."""
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "sonar", SEE)) from None
-
-    def replace(self, **fields: Any) -> Self:
-        """This sonar with some fields changed, checked again."""
-        return self.create(**{**self.model_dump(), **fields})
 
     @property
     def across(self) -> int:

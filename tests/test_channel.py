@@ -9,7 +9,7 @@ import pytest
 from helpers import box, diffuse, floor, plate, scene, sphere
 from numpy.typing import NDArray
 
-from mitsonar.channel_sonar import ChannelSonar, FieldOfView, Receiver, four_receivers
+from mitsonar.channel_sonar import ChannelSonar, FieldOfView, Hydrophone, four_receivers
 from mitsonar.errors import MitsonarError
 from mitsonar.motion import Pose, Trajectory, steady
 from mitsonar.responses import ImpulseResponses
@@ -24,8 +24,8 @@ CELLS = {"type": "cell_noise", "cells": 512.0, "seed": 5}
 EVERYWHERE = FieldOfView(shape="all")
 
 
-def heard_from(place: tuple[float, float, float] = (0, 0, 0), **field: Any) -> Receiver:
-    return Receiver(name="one", position=place, field=FieldOfView(**field) if field else EVERYWHERE)
+def heard_from(place: tuple[float, float, float] = (0, 0, 0), **field: Any) -> Hydrophone:
+    return Hydrophone(name="one", position=place, field=FieldOfView(**field) if field else EVERYWHERE)
 
 
 def cells_floor(half: float = 14.0, cells: float = 512.0) -> dict[str, Any]:
@@ -240,7 +240,7 @@ def test_what_a_field_of_view_asks_for_holds_all_that_it_hears() -> None:
         field.model_copy(update={"shape": "circular"}),
         FieldOfView(tilt_deg=90.0, across_deg=100.0, along_deg=170.0),
     ):
-        sonar = ChannelSonar(receivers=(Receiver(name="one", field=one),))
+        sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=one),))
         made = simulator(sonar, floor=cells_floor(), body=box((3, 4, 1), (1, 1, 1)))
         pose = np.array([1.0, -2.0, 6.0, 0.2, -0.1, 0.7])
         stored = made.hearing.source.scatterers
@@ -272,7 +272,7 @@ def test_energy_is_that_of_the_imaging_sonar() -> None:
     from mitsonar.sonar import Sonar
 
     field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)
-    sonar = ChannelSonar(receivers=(Receiver(name="one", field=field),), points_per_m2=2000.0)
+    sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2000.0)
     ground = scene(floor=floor(diffuse(0.5), 16.0))
     heard = ChannelSimulator(ground, sonar).paths(LEVEL)
     fan = Sonar(
@@ -384,7 +384,7 @@ def test_doppler_of_an_angle(tilt: float) -> None:
     """Within 0.5 %: phase between responses 40 um apart of a narrow beam, mean over places. (A beam that moves over the
     ground changes which points it holds: the narrower, the more places are needed.)"""
     field = FieldOfView(shape="circular", tilt_deg=tilt, across_deg=4.0, taper=1.0)
-    sonar = ChannelSonar(receivers=(Receiver(name="one", field=field),), points_per_m2=2500.0)
+    sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2500.0)
     made = simulator(sonar, floor=rough_floor(half=18.0, rms=0.01))
     speed, apart, places = 2.0, 2e-5, 100
     rng = np.random.default_rng(2)

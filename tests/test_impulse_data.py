@@ -16,14 +16,14 @@ from mitsonar.dataset.check import check
 from mitsonar.dataset.generate import make
 from mitsonar.dataset.impulse_samples import ImpulseSamples, displacement_labels
 from mitsonar.dataset.packing import Packing, noise_power, packed, snr_of, with_noise
-from mitsonar.dataset.plan import Plan, footprints_at, steady_velocities
+from mitsonar.dataset.plan import Plan, footprints_at
 from mitsonar.dataset.recipe import load_recipe, shipped_recipes
 from mitsonar.dataset.recordings import recording_of
 from mitsonar.dataset.sheet import info
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.regressors import REGRESSORS, Turned, flattened, score_all
-from mitsonar.motion import Motion, Pose, compose, motions, steady
+from mitsonar.motion import Motion, Pose, Trajectory, compose, motions, steady, velocities
 from mitsonar.simulation.scenes import load_scene
 
 
@@ -137,14 +137,14 @@ def test_a_velocity_is_the_derivative_of_the_way() -> None:
     """Moved for 1 us at that velocity, by hand, and along the arc to the next ping in 10,000 steps."""
     start, motion = Pose(1, 2, 4, 0, 0, 0.7), Motion(0.1, -0.06, 0.3)
     way = np.array([start, compose(start, motion)])
-    (starboard, forward, _, turn), last = steady_velocities(way, 20.0)
+    (starboard, forward, _, turn), last = velocities(Trajectory(way, np.arange(len(way)) / 20.0))
     np.testing.assert_array_equal([starboard, forward, 0, turn], last)
     steps = 10_000
     heading = 0.7 + turn * (np.arange(steps) + 0.5) / steps / 20
     x = 1 + np.sum(forward * np.sin(heading) + starboard * np.cos(heading)) / steps / 20
     y = 2 + np.sum(forward * np.cos(heading) - starboard * np.sin(heading)) / steps / 20
     np.testing.assert_allclose([x, y], way[1, :2], atol=1e-9)
-    assert steady_velocities(way[:1], 20.0).tolist() == [[0, 0, 0, 0]]
+    assert velocities(Trajectory(way[:1], np.zeros(1))).tolist() == [[0, 0, 0, 0]]
 
 
 @pytest.mark.parametrize("shape", ["rectangular", "circular"])

@@ -60,21 +60,6 @@ class ImageRecording:
         self.recipe, self.sonar = recipe, recipe.instrument
 
     @property
-    def name(self) -> str:
-        """Of the sonar."""
-        return self.sonar.name
-
-    @property
-    def model(self) -> str:
-        """Of the simulation."""
-        return self.sonar.model
-
-    @property
-    def frame_rate_hz(self) -> float:
-        """Frames a second."""
-        return self.sonar.frame_rate_hz
-
-    @property
     def stored(self) -> dict[str, Stored]:
         """Pixels, and what rendering tells of each frame."""
         views = {view.name: view for view in self.recipe.views}

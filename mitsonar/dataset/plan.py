@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from mitsonar.dataset.recipe import Flight, Recipe
 from mitsonar.dataset.recordings import recording_of
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import Motion, Pose, compose, motions, mounted
+from mitsonar.motion import Motion, Pose, Trajectory, compose, motions, mounted, velocities
 from mitsonar.simulation.worlds.world import Family, stream
 
-__all__ = ["Plan", "Scene", "Sequence", "footprints_at", "scenes_of", "sequences_of", "steady_velocities"]
+__all__ = ["Plan", "Scene", "Sequence", "footprints_at", "scenes_of", "sequences_of"]
 
 FEWEST_SEQUENCES = 10
 """Sequences of a scene before a small data set opens another: worlds cost more than frames."""
@@ -47,6 +47,10 @@ class Sequence:
 
     vehicle: NDArray[np.float64]
 
+    def at_rate(self, rate_hz: float) -> Trajectory:
+        """The vehicle's path at so many pings a second."""
+        return Trajectory(self.vehicle, np.arange(len(self.vehicle)) / rate_hz)
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -60,7 +64,7 @@ class Plan:
         vehicle: poses of the vehicle ``(frames, 6)``.
         poses: of the sonar ``(frames, 6)``.
         motion: sideways, forward [m], yaw [rad] to the next frame of the sequence ``(frames, 3)``; nan for its last.
-        velocity: of the vehicle in its own axes; see :func:`steady_velocities` ``(frames, 4)``.
+        velocity: of the vehicle in its own axes; see :func:`~mitsonar.motion.velocities` ``(frames, 4)``.
     """
 
     scenes: list[Scene]
@@ -90,7 +94,7 @@ class Plan:
         last = np.cumsum(lengths) - 1
         inner = np.setdiff1d(np.arange(len(vehicle)), last)
         motion[inner] = motions(vehicle)[inner]
-        rate = recording_of(recipe).frame_rate_hz
+        rate = recording_of(recipe).sonar.frame_rate_hz
         step = np.concatenate([np.arange(length) for length in lengths])
         return cls(
             scenes=scenes,
@@ -100,7 +104,7 @@ class Plan:
             vehicle=vehicle,
             poses=mounted(vehicle, recipe.mount.pose),
             motion=motion,
-            velocity=np.concatenate([steady_velocities(one.vehicle, rate) for _, one in flown]),
+            velocity=np.concatenate([velocities(one.at_rate(rate)) for _, one in flown]),
         )
 
 
@@ -217,21 +221,6 @@ def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
     for _ in range(pings - 1):
         poses.append(compose(poses[-1], motion))
     return np.array(poses)
-
-
-def steady_velocities(vehicle: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
-    """Velocities of a level vehicle that keeps one from each pose ``(pings, 6)`` to the next, along an arc: starboard,
-    forward, up [m/s] in its own axes, turn to starboard [rad/s] ``(pings, 4)``; the last again, of one ping nothing.
-
-    Eq. 3.4 moves along the new heading; the arc's chord lies half a turn before it, shorter by the sinc of half a turn.
-    """
-    sideways, forward, yaw = motions(vehicle).T
-    half = yaw / 2
-    shorter = np.sinc(half / np.pi)
-    sin, cos = np.sin(half) / shorter, np.cos(half) / shorter
-    up = np.diff(vehicle[:, 2])
-    steps = np.column_stack([sideways * cos + forward * sin, forward * cos - sideways * sin, up, yaw]) * rate_hz
-    return np.concatenate([steps, steps[-1:]]) if len(steps) else np.zeros((1, 4))
 
 
 def run_poses(name: str, height_m: float) -> NDArray[np.float64]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.sonar import Instrument
 
 __all__ = ["Axis", "Read", "Recording", "Stored", "ground_reach"]
 
@@ -51,9 +54,7 @@ class Recording(Protocol):
 
     Attributes:
         what: one ping's record is called.
-        name: of the instrument.
-        model: of the simulation.
-        frame_rate_hz: pings a second.
+        sonar: the instrument: its name, model and frame rate are what all have.
         stored: arrays that are filled ping by ping, those with a shape first.
         axes: arrays along their dimensions.
         attributes: of the store.
@@ -69,11 +70,7 @@ class Recording(Protocol):
     decided_by: tuple[str, ...]
 
     @property
-    def name(self) -> str: ...
-    @property
-    def model(self) -> str: ...
-    @property
-    def frame_rate_hz(self) -> float: ...
+    def sonar(self) -> Instrument: ...
     @property
     def stored(self) -> dict[str, Stored]: ...
     @property

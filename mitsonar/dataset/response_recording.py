@@ -31,21 +31,6 @@ class ResponseRecording:
         self.recipe, self.sonar = recipe, recipe.channel_sonar
 
     @property
-    def name(self) -> str:
-        """Of the instrument."""
-        return self.sonar.name
-
-    @property
-    def model(self) -> str:
-        """Of the simulation."""
-        return self.sonar.model
-
-    @property
-    def frame_rate_hz(self) -> float:
-        """Pings a second."""
-        return self.sonar.frame_rate_hz
-
-    @property
     def stored(self) -> dict[str, Stored]:
         """Responses, and what the simulation tells of each ping."""
         count = len(self.sonar.receivers)

@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.channel_sonar import ChannelSonar, Receiver
+from mitsonar.channel_sonar import ChannelSonar, Hydrophone
 from mitsonar.errors import MitsonarError
+from mitsonar.simulation.paths import delay_exact
 
 __all__ = ["GroundLaw", "Look", "block_toeplitz", "look_at"]
 
@@ -70,7 +71,7 @@ class Look(NamedTuple):
 
 
 def look_at(
-    sonar: ChannelSonar, receiver: Receiver, height_m: float, points: Array, pose: ArrayLike, velocity: ArrayLike
+    sonar: ChannelSonar, receiver: Hydrophone, height_m: float, points: Array, pose: ArrayLike, velocity: ArrayLike
 ) -> Look:
     """What a ping makes of points of the level ground.
 
@@ -92,7 +93,7 @@ def look_at(
     there, back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((heard**2).sum(axis=0))
     speed = np.asarray(velocity, dtype=float)
     own = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
-    delay = _delay(there, heard, own, sonar.sound_speed)
+    delay = np.asarray(delay_exact(list(sent), list(heard), list(own), sonar.sound_speed))
     amplitude = _sensitivity(sonar, None, sent / there) * _sensitivity(sonar, receiver, heard / back)
     amplitude *= np.sqrt(height_m / there * (height_m + up) / back)
     if sonar.spreads:
@@ -100,16 +101,7 @@ def look_at(
     return Look(delay, amplitude)
 
 
-def _delay(there: Array, heard: Array, velocity: Array, sound_speed: float) -> Array:
-    """Root of c (tau - tau_0) = | v tau - heard |: when sound meets the receiver that moves on."""
-    first = sound_speed * there
-    square = sound_speed**2 - velocity @ velocity
-    half = first - velocity @ heard
-    rest = there**2 - (heard**2).sum(axis=0)
-    return np.asarray((half + np.sqrt(half**2 - square * rest)) / square)
-
-
-def _sensitivity(sonar: ChannelSonar, receiver: Receiver | None, direction: Array) -> Array:
+def _sensitivity(sonar: ChannelSonar, receiver: Hydrophone | None, direction: Array) -> Array:
     """Of the transmitter, or of a receiver, to unit directions ``(3, n)`` in the vehicle's axes."""
     field = sonar.transmitter if receiver is None else sonar.field_of_view[receiver.name]
     return np.asarray(field.sensitivity(*(field.axes @ direction)), dtype=float)
@@ -135,7 +127,7 @@ class GroundLaw:
     """
 
     sonar: ChannelSonar
-    receiver: Receiver
+    receiver: Hydrophone
     height_m: float
     interval_s: float
     reach_m: float = 0.12
@@ -265,7 +257,7 @@ def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, A
     return (edge[:-1, None] + half * (1 + x)).ravel(), (half * weight).ravel()
 
 
-def _extent(sonar: ChannelSonar, receiver: Receiver, height_m: float) -> tuple[Array, tuple[Array, Array]]:
+def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple[Array, tuple[Array, Array]]:
     """The ground that a receiver hears: places along its look ``(n,)``, and there its edges across ``(n,)`` each [m]."""
     far = math.sqrt(max(sonar.range_max**2 - height_m**2, 0.0))
     step = height_m / 200

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import maximum_filter
 
-from mitsonar.channel_sonar import ChannelSonar, Receiver
+from mitsonar.channel_sonar import ChannelSonar, Hydrophone
 from mitsonar.estimation.ground_law import GroundLaw
 
 __all__ = ["Ear", "Search", "ears_of", "ground_law_of", "heard_alone"]
@@ -55,7 +55,7 @@ class Ear(NamedTuple):
     number: int
 
 
-def heard_alone(sonar: ChannelSonar, receiver: Receiver) -> ChannelSonar:
+def heard_alone(sonar: ChannelSonar, receiver: Hydrophone) -> ChannelSonar:
     """The instrument with this receiver only, and turned so that it looks forward."""
     heading = math.radians(receiver.field.heading_deg)
     x, y, z = receiver.position
@@ -65,7 +65,7 @@ def heard_alone(sonar: ChannelSonar, receiver: Receiver) -> ChannelSonar:
     sender = sonar.transmitter
     if sender.shape != "all":
         sender = sender.model_copy(update={"heading_deg": sender.heading_deg - receiver.field.heading_deg})
-    one = Receiver(name="forward", position=place, field=field)
+    one = Hydrophone(name="forward", position=place, field=field)
     return sonar.model_copy(update={"receivers": (one,), "transmitter": sender, "name": "one", "seed": 0})
 
 

@@ -29,9 +29,6 @@ OVERSPREAD = 0.3
 MOST_ENERGY = (0.01, 0.99)
 """Quantiles of the echoes' energy between which delays and Doppler shifts are counted as spread."""
 
-AT_A_TIME = 16
-"""Pings of a chunk on disk, and of a batch."""
-
 
 @dataclass(frozen=True)
 class Spread:
@@ -92,6 +89,7 @@ def run_impulse(
         progress(int(state["frames_done"]))
         made = _make(simulator, flown, velocity, folder, state, progress)
         state["warnings"] = [*simulator.notes, *warnings_of(made, spread)]
+        write_json(folder / "run.json", state)
         made.about |= {"spread_factor": spread.factor}
         write_whole(folder / "response.png", response_png(made))
         write_whole(folder / "waterfall.png", waterfall_png(made))

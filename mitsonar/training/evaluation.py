@@ -138,7 +138,7 @@ def evaluate(
         "trained": {"data": checkpoint.data, "model": checkpoint.model, "noise": checkpoint.noise, **checkpoint.trained},
         "data": str(data),
         "recipe": recipe.name,
-        "model": recording_of(recipe).model,
+        "model": recording_of(recipe).sonar.model,
         "part": part or first.split.unseen,
         "split": first.split.by,
         "pairs": len(numbers),
@@ -299,7 +299,7 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str
     same = checkpoint.data_recipe == recipe.model_dump(mode="json")
     if same and part in ("train", "all"):
         found.append(f"part {part} of this data set holds pairs that training has seen")
-    model = recording_of(recipe).model
+    model = recording_of(recipe).sonar.model
     if model != checkpoint.model:
         found.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")
     if not checkpoint.arrangement["ground"]:
