@@ -12,8 +12,13 @@ import pytest
 from helpers import Command, Done
 
 
+LONGEST = ("test_readme.py", "04_networks.ipynb", "03_odometry.ipynb", "02_dataset.ipynb")
+"""Run first: begun last, one of them would keep one core busy while the other waits."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what this machine lacks and say so; with MITSONAR_REQUIRE_LEARN=1 an absent torch fails the tests instead."""
+    items.sort(key=lambda item: not item.nodeid.split("::")[0].endswith(LONGEST))
     skips = []
     if importlib.util.find_spec("torch") is None and os.environ.get("MITSONAR_REQUIRE_LEARN") != "1":
         reason = "torch is not installed: install mitsonar[learn]; MITSONAR_REQUIRE_LEARN=1 makes this a failure"

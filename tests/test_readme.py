@@ -24,6 +24,10 @@ COMMANDS = [
 ]
 
 
+FEW = {"compare": "8", "train": "24", "evaluate": "8"}
+"""Pairs of commands that take a while with as many as the README has."""
+
+
 def run(command: list[str], folder: Path) -> str:
     done = subprocess.run([sys.executable, *command], capture_output=True, text=True, cwd=folder, timeout=300)
     assert done.returncode == 0, (command, done.stderr)
@@ -41,7 +45,7 @@ def test_commands_and_python_blocks_run_in_order(tmp_path: Path) -> None:
             continue
         # few frames and pairs are enough to see that a command works; odometry needs the frames of its run
         fewer = ["--frames", "2"] if "--trajectory" in command and "out/run" not in command else []
-        fewer += ["--pairs", "8"] if command[1] == "compare" else []
+        fewer += ["--pairs", FEW[command[1]]] if command[1] in FEW else []
         run(["-m", *command, *fewer], tmp_path)
     for code in [*PYTHON, *(FOR_TORCH if has_torch else [])]:
         assert run(["-c", code], tmp_path)

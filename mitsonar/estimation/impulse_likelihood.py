@@ -25,6 +25,7 @@ from scipy.ndimage import maximum_filter
 from mitsonar.estimation.estimator import Estimate, unbelieved
 from mitsonar.estimation.ground_law import block_toeplitz
 from mitsonar.estimation.impulse import pings_of, standing_height
+from mitsonar.estimation.impulse_bands import bands_of
 from mitsonar.estimation.impulse_search import Ear, Search, ears_of
 from mitsonar.motion import Motion
 from mitsonar.responses import ImpulseResponses
@@ -139,9 +140,15 @@ class Likelihood:
         if not heard:
             return unbelieved("no receiver heard anything")
         reach = self.speed * pings.interval_s
-        ears = [ear for ear in ears_of(responses.sonar, height, pings.interval_s, 1.1 * reach) if ear.number in heard]
-        data = [pings.response[:, ear.number, ear.law.taps] for ear in ears]
-        search = Search.of(responses.sonar, pings.response, height, pings.interval_s, reach, heard)
+        bands = bands_of(responses.sonar)
+        ears, data = [], []
+        for band in bands:
+            part = band.of(pings.response)
+            for ear in ears_of(band.sonar, height, pings.interval_s, 1.1 * reach):
+                if ear.number in heard:
+                    ears.append(ear)
+                    data.append(part[:, ear.number, ear.law.taps])
+        search = Search.of(bands, pings.response, height, pings.interval_s, reach, heard)
         found = self._modes(ears, data, search)
         alone = sum(judged(ear, z, np.zeros(4), (), 0).likelihood for ear, z in zip(ears, data, strict=True))
         return self._answer(found, alone, responses, pings.silent)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.channel_sonar import ChannelSonar
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.ground_law import GroundLaw, block_toeplitz
+from mitsonar.estimation.impulse_bands import bands_of
 from mitsonar.estimation.impulse_search import Ear, ears_of
 
 __all__ = ["NOISELESS_DB", "impulse_information", "impulse_limit"]
@@ -82,8 +83,9 @@ def impulse_information(
     given[: len(np.atleast_1d(motion))] = motion
     reach = 1.2 * max(float(np.abs(given[:2]).max()) / (pings - 1), 0.1 * sonar.wavelength_m)
     total = np.zeros((len(free), len(free)))
-    for ear in ears_of(sonar, height_m, span_s / (pings - 1), reach):
-        total += _told(ear, given, pings, 10 ** (-snr_db / 10), free)
+    for band in bands_of(sonar):
+        for ear in ears_of(band.sonar, height_m, span_s / (pings - 1), reach):
+            total += _told(ear, given, pings, 10 ** (-snr_db / 10), free)
     return total
 
 

@@ -19,6 +19,7 @@ from scipy.ndimage import maximum_filter
 
 from mitsonar.channel_sonar import ChannelSonar, Hydrophone
 from mitsonar.estimation.ground_law import GroundLaw
+from mitsonar.estimation.impulse_bands import Band
 
 __all__ = ["Ear", "Search", "ears_of", "ground_law_of", "heard_alone"]
 
@@ -30,9 +31,6 @@ FLOOR = 1e-2
 
 ALONG, ACROSS = 7.5, 1.9
 """Motions of the grid along the look and across, a wavelength."""
-
-COARSE_HZ = 4800.0
-"""Bandwidth of the search: that of a wider signal is cut down to it."""
 
 FINE = 15.0
 """Places of the map that all receivers' scores are added in, a wavelength."""
@@ -136,7 +134,7 @@ def _grid(reach: float, step: float) -> Array:
     return np.linspace(-1, 1, 2 * count + 1) * reach
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _table_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> Table:
     return Table.of(ground_law_of(alone, height_m, interval_s, reach_m))
 
@@ -147,7 +145,7 @@ class Search:
 
     Attributes:
         line: motions along either axis, from ping to ping ``(n,)`` [m].
-        scores: of each receiver for sideways and forward motions ``(receivers, n, n)``.
+        scores: of each receiver in each band for sideways and forward motions ``(bands x receivers, n, n)``.
     """
 
     line: Array
@@ -155,18 +153,19 @@ class Search:
 
     @classmethod
     def of(
-        cls, sonar: ChannelSonar, response: Complex, height_m: float, interval_s: float, reach_m: float, heard: list[int]
+        cls, bands: list[Band], response: Complex, height_m: float, interval_s: float, reach_m: float, heard: list[int]
     ) -> Self:
         """Of pings ``(pings, receivers, taps)``, by the receivers ``heard``, for motions to ``reach_m`` along each axis."""
-        sonar, response = _narrowed(sonar, response)
-        line = _grid(reach_m, sonar.wavelength_m / FINE)
+        line = _grid(reach_m, min(band.sonar.wavelength_m for band in bands) / FINE)
         plane, scores = np.stack(np.meshgrid(line, line, indexing="ij")), []
-        for ear in ears_of(sonar, height_m, interval_s, 1.5 * reach_m):
-            if ear.number in heard:
-                table = _table_of(ear.law.sonar, height_m, interval_s, 1.5 * reach_m)
-                across, along = np.tensordot(ear.turn[:2, :2], plane, 1)
-                score = RectBivariateSpline(table.along, table.across, table.score(response[:, ear.number, ear.law.taps]))
-                scores.append(score.ev(along.ravel(), across.ravel()).reshape(along.shape))
+        for band in bands:
+            part = band.of(response)
+            for ear in ears_of(band.sonar, height_m, interval_s, 1.5 * reach_m):
+                if ear.number in heard:
+                    table = _table_of(ear.law.sonar, height_m, interval_s, 1.5 * reach_m)
+                    across, along = np.tensordot(ear.turn[:2, :2], plane, 1)
+                    score = RectBivariateSpline(table.along, table.across, table.score(part[:, ear.number, ear.law.taps]))
+                    scores.append(score.ev(along.ravel(), across.ravel()).reshape(along.shape))
         return cls(line, np.array(scores))
 
     def peaks(self) -> Array:
@@ -179,16 +178,3 @@ class Search:
         """Scores of one receiver on the line through a motion along an axis ``(n,)``."""
         place = int(np.abs(self.line - motion[1 - axis]).argmin())
         return self.scores[receiver, :, place] if axis == 0 else self.scores[receiver, place]
-
-
-def _narrowed(sonar: ChannelSonar, response: Complex) -> tuple[ChannelSonar, Complex]:
-    """An instrument of no more bandwidth than the search needs, and what it would have heard."""
-    factor = int(sonar.bandwidth_hz / COARSE_HZ)
-    if factor < 2 or sonar.taps % factor:
-        return sonar, response
-    narrow = sonar.replace(bandwidth_hz=sonar.bandwidth_hz / factor, sampling_hz=sonar.sampling_hz / factor)
-    frequency = np.asarray(np.fft.fftfreq(narrow.taps, 1 / narrow.sampling_hz), dtype=np.float64)
-    keep = np.rint(frequency / sonar.frequency_step_hz).astype(int) % sonar.taps
-    wide = sonar.raised_cosine(frequency)
-    gain = narrow.raised_cosine(frequency) / np.where(wide > 0, wide, 1)
-    return narrow, np.fft.ifft(np.fft.fft(response, axis=-1)[..., keep] * gain, axis=-1)

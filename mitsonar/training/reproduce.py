@@ -27,7 +27,6 @@ from mitsonar.training.evaluation import evaluate
 from mitsonar.training.recipe import TrainingRecipe, load_training_recipe, training_recipe_from
 from mitsonar.training.run import Report, train
 from mitsonar.training.tables import (
-    NOISES,
     Found,
     Reached,
     Score,
@@ -37,6 +36,7 @@ from mitsonar.training.tables import (
     table_figure,
     table_lines,
     table_named,
+    tables_with,
 )
 
 __all__ = ["Effort", "Watch", "reproduce"]
@@ -283,8 +283,9 @@ class Bench:
         other = recipe_from({**data.model_dump(mode="json"), **named})
         seen, unseen = self._made(data, sequences, crew), self._made(other, fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
+        noises = list(table_named(tables_with(name)[0]).noises)
         scores = [
-            _scores(evaluate(checkpoint, url, noise=list(NOISES), part=part, begin=_teller(crew.watch, f"{name}, {said}")))
+            _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_teller(crew.watch, f"{name}, {said}")))
             for url, part, said in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
         ]
         reached = _reached(checkpoint, recipe, self._run(name) / "run.json")

@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.resources import files
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.metrics import AXES
+from mitsonar.metrics import AXES, Axis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,6 +25,7 @@ __all__ = [
     "Row",
     "Score",
     "Table",
+    "errors_said",
     "load_tables",
     "plain_table",
     "rows_named",
@@ -35,12 +36,14 @@ __all__ = [
 ]
 
 NOISES = {"none": "noiseless", "high": "high noise"}
-"""Of the validation images: the two halves of every table."""
+"""Of what validation is on: the halves of a table, where the thesis prints both."""
 
-BOX = (20 / np.sqrt(3), 20 / np.sqrt(3), 0.45 / np.sqrt(3))
-"""RMSE of always answering no motion, on motions that are even within +-20 mm and +-0.45 deg."""
+CHAPTERS = ("chapter3", "chapter5")
+"""Files of tables."""
 
-Errors = tuple[float, float, float]
+Errors = Annotated[tuple[float, ...], Field(min_length=2, max_length=3)]
+"""Sideways [mm], forward [mm], and yaw [deg] where the vehicle turns."""
+
 Part = Literal["validation", "unseen"]
 
 # ---------------------------------------------------------------- what the thesis prints
@@ -56,19 +59,19 @@ class Row(_Part):
     Attributes:
         approach: what the thesis calls it.
         recipe: name of the training recipe; rows of several tables that are the same network name the same one.
-        none: RMSE on noiseless images, sideways [mm], forward [mm], yaw [deg].
-        high: RMSE on images with high noise.
+        none: RMSE without noise.
+        high: RMSE with high noise, where it is printed.
     """
 
     approach: str
     recipe: str
     none: Errors
-    high: Errors
+    high: Errors | None = None
 
     @property
     def printed(self) -> dict[str, Errors]:
-        """The errors that the thesis prints, by noise of the validation images."""
-        return {"none": self.none, "high": self.high}
+        """The errors that the thesis prints, by noise."""
+        return {"none": self.none} | ({} if self.high is None else {"high": self.high})
 
 
 class Table(_Part):
@@ -79,6 +82,8 @@ class Table(_Part):
         title: what its rows differ in.
         section: where the thesis speaks of it.
         note: what a reader should know who compares.
+        differs: in what the thesis's validation and simulation are not ours.
+        largest: the largest motions of its data, even within plus and minus these.
         rows: in the thesis's order.
     """
 
@@ -86,14 +91,35 @@ class Table(_Part):
     title: str
     section: str
     note: str = ""
+    differs: str = (
+        "The thesis chose and validated on the same pairs (8,000 in most tables); its scenes, gain and windows differ from "
+        "ours."
+    )
+    largest: Errors = (20.0, 20.0, 0.45)
     rows: list[Row] = Field(min_length=1)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Numbers of a motion that its rows estimate."""
+        return tuple(AXES[: len(self.largest)])
+
+    @property
+    def noises(self) -> dict[str, str]:
+        """What it says errors with, and that for people."""
+        return {noise: said for noise, said in NOISES.items() if noise in self.rows[0].printed}
+
+    @property
+    def no_motion(self) -> tuple[float, ...]:
+        """RMSE of always answering no motion."""
+        return tuple(end / np.sqrt(3) for end in self.largest)
 
 
 @cache
 def load_tables() -> dict[str, Table]:
     """All tables by their number."""
-    text = (files("mitsonar.recipes") / "tables" / "chapter3.yaml").read_text(encoding="utf-8")
-    return {name: Table(name=name, **fields) for name, fields in yaml.safe_load(text).items()}
+    folder = files("mitsonar.recipes") / "tables"
+    texts = [(folder / f"{chapter}.yaml").read_text(encoding="utf-8") for chapter in CHAPTERS]
+    return {name: Table(name=name, **fields) for text in texts for name, fields in yaml.safe_load(text).items()}
 
 
 def table_named(name: str) -> Table:
@@ -130,7 +156,7 @@ def tables_with(recipe: str) -> list[str]:
 
 
 class Score(_Part):
-    """Errors on some pairs, each sideways [mm], forward [mm], yaw [deg].
+    """Errors on some samples, each sideways [mm], forward [mm], and yaw [deg] where the network estimates it.
 
     Attributes:
         pairs: how many.
@@ -147,7 +173,7 @@ class Score(_Part):
     rmse: Errors
     low: Errors
     high: Errors
-    slope: tuple[float | None, float | None, float | None]
+    slope: tuple[float | None, ...]
     zero: Errors
 
 
@@ -231,16 +257,19 @@ REACHED: dict[str, Callable[[Found], str]] = {
 def table_lines(table: Table, found: Mapping[str, Found]) -> list[str]:
     """A table as Markdown; rows that are not in ``found`` stay visible."""
     first = next((found[row.recipe] for row in table.rows if row.recipe in found), None)
-    errors = [["RMSE, mm sideways / mm forward / deg yaw"], ["*always answering no motion*"]]
-    for noise, said in NOISES.items():
+    units = " / ".join(f"{axis.unit} {axis.name}" for axis in table.axes)
+    errors = [[f"RMSE, {units}"], ["*always answering no motion*"]]
+    for noise, said in table.noises.items():
         errors[0] += [f"thesis, {said}", *(f"{part}, {said}" for part in PARTS.values())]
-        errors[1] += [_three(BOX), *(_three(first.score(part, noise).zero) if first else "-" for part in PARTS)]
+        zero = (errors_said(first.score(part, noise).zero) if first else "-" for part in PARTS)
+        errors[1] += [errors_said(table.no_motion), *zero]
     reached = [["row", "recipe", "also in", *REACHED]]
     for row in table.rows:
         ours = found.get(row.recipe)
         errors.append([row.approach])
         for noise, printed in row.printed.items():
-            errors[-1] += [_three(printed), *(_three(ours.score(part, noise).rmse) if ours else NOT_YET for part in PARTS)]
+            mine = (errors_said(ours.score(part, noise).rmse) if ours else NOT_YET for part in PARTS)
+            errors[-1] += [errors_said(printed), *mine]
         others = ", ".join(name for name in tables_with(row.recipe) if name != table.name) or "-"
         cells = [tell(ours) for tell in REACHED.values()] if ours else [NOT_YET, *["-"] * (len(REACHED) - 1)]
         reached.append([row.approach, row.recipe, others, *cells])
@@ -254,8 +283,7 @@ def table_lines(table: Table, found: Mapping[str, Found]) -> list[str]:
         f"*validation* (split: {split}): one pair a sequence of those kept from training, "
         f"{'of the same scenes, as in the thesis' if split == 'sequence' else 'of other scenes'}; the network kept of a "
         "training is the best on them. *unseen scenes*: one pair a sequence of a data set of another seed, whose scenes no "
-        "network has seen: what a user meets. The thesis chose and validated on the same pairs (8,000 in most tables); its "
-        "scenes, gain and windows differ from ours.",
+        f"network has seen: what a user meets. {table.differs}",
         "",
         "The scale at which each figure was reached:",
         "",
@@ -278,12 +306,14 @@ def plain_table(table: Table, found: Mapping[str, Found]) -> dict[str, Any]:
                 "ours": ours.model_dump(mode="json", exclude={"recipe"}) if ours else None,
             }
         )
-    about = {"title": table.title, "section": table.section, "note": table.note, "units": [axis.unit for axis in AXES]}
-    return {**about, "no_motion": list(BOX), "rows": rows}
+    about = {"title": table.title, "section": table.section, "note": table.note, "units": [axis.unit for axis in table.axes]}
+    return {**about, "no_motion": list(table.no_motion), "rows": rows}
 
 
-def _three(errors: Errors) -> str:
-    return f"{errors[0]:.2f} / {errors[1]:.2f} / {errors[2]:.3f}"
+def errors_said(errors: tuple[float, ...]) -> str:
+    """RMSE along the axes, for people."""
+    named = zip(errors, AXES, strict=False)
+    return " / ".join(f"{value:.3f}" if axis.unit == "deg" else f"{value:.2f}" for value, axis in named)
 
 
 def _framed(rows: list[list[str]]) -> list[str]:
@@ -299,11 +329,11 @@ def table_figure(table: Table, found: Mapping[str, Found], *, title: str = "") -
 
     figure = Figure(figsize=(13, 2.6 + 1.1 * len(table.rows)), layout="constrained")
     figure.suptitle("\n".join(wrap(title or f"Table {table.name}: {table.title}", 150)), fontsize="medium")
-    grid = figure.subplots(2, 3, sharey=True)
+    grid = figure.subplots(len(table.noises), len(table.axes), sharey=True, squeeze=False)
     place = {row.recipe: k for k, row in enumerate(table.rows) if row.recipe in found}
     handles: dict[str, Any] = {}
-    for panels, (noise, said) in zip(grid, NOISES.items(), strict=True):
-        for k, (panel, axis) in enumerate(zip(panels, AXES, strict=True)):
+    for panels, (noise, said) in zip(grid, table.noises.items(), strict=True):
+        for k, (panel, axis) in enumerate(zip(panels, table.axes, strict=True)):
             printed = [row.printed[noise][k] for row in table.rows]
             handles["thesis"] = panel.barh(np.arange(len(printed)) - 0.27, printed, 0.25, color="0.6")
             for offset, colour, (part, name) in zip((0.0, 0.27), ("C0", "C1"), PARTS.items(), strict=True):
@@ -312,7 +342,7 @@ def table_figure(table: Table, found: Mapping[str, Found], *, title: str = "") -
                 whiskers = {"xerr": np.array(spread).T, "error_kw": {"linewidth": 0.8}} if scores else {}
                 rmse = [score.rmse[k] for score in scores.values()]
                 handles[name] = panel.barh(list(scores), rmse, 0.25, color=colour, **whiskers)
-            handles["no motion"] = panel.axvline(BOX[k], color="black", linestyle=":")
+            handles["no motion"] = panel.axvline(table.no_motion[k], color="black", linestyle=":")
             panel.set(title=f"{said}: {axis.name}", xlabel=f"RMSE ({axis.unit})")
             panel.set_yticks(range(len(printed)), [_label(row, found.get(row.recipe)) for row in table.rows])
     grid[0, 0].invert_yaxis()
