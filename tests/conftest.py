@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from helpers import Command, Done
 
-
 LONGEST = ("test_readme.py", "04_networks.ipynb", "03_odometry.ipynb", "02_dataset.ipynb")
 """Run first: begun last, one of them would keep one core busy while the other waits."""
 
