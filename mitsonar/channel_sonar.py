@@ -131,6 +131,16 @@ def four_receivers(distance_m: float = 0.1, **field: Any) -> tuple[Hydrophone, .
     return tuple(made)
 
 
+def _few_digits(sampling_hz: float, taps: int) -> int:
+    """So many taps or some more that their frequency step is written in few digits."""
+    for digits in (1, 2, 3):
+        for more in range(taps, taps + taps // 3 + 1):
+            step = sampling_hz / more
+            if float(f"{step:.{digits}g}") == step:
+                return more
+    return taps
+
+
 class ChannelSonar(Instrument):
     """A transmitter that sends all the time, and receivers whose channels are measured all the time (Almanza-Medina, ch. 5).
 
@@ -150,7 +160,7 @@ class ChannelSonar(Instrument):
     frequency_step_hz: float = Field(10.0, gt=0, le=1e9, description="step of the frequency response [Hz]")
     rolloff: float = Field(0.5, ge=0, le=1, description="roll-off alpha of the raised cosine")
     range_max: float = Field(25.0, gt=0, le=1e5, description="echoes from farther away are dropped and counted [m]")
-    sound_speed: float = Field(1500.0, gt=0, le=1e4, description="sound speed [m/s]")
+    sound_speed: float = Field(1500.0, ge=100, le=1e4, description="sound speed [m/s]")
     frame_rate_hz: float = Field(20.0, gt=0, le=1e6, description="responses a second [Hz]")
     model: ChannelModel = Field("scatterers", description="scatterers of the world, or rays of the vehicle (the thesis's)")
     spreading: bool | None = Field(None, description="amplitudes fall with distance; default: scatterers yes, rays no")
@@ -177,7 +187,7 @@ class ChannelSonar(Instrument):
             )
         longest = 2 * self.range_max / self.sound_speed
         if not self.frequency_step_hz < 1 / (2 * longest):
-            enough = math.floor(2 * longest * self.sampling_hz) + 1
+            enough = _few_digits(self.sampling_hz, math.floor(2 * longest * self.sampling_hz) + 1)
             raise ValueError(
                 f"frequency_step_hz must be below 1 / (2 tau_max) = {1 / (2 * longest):.6g} Hz, tau_max being the delay "
                 f"from range_max {self.range_max:g} m: got {self.frequency_step_hz:g} Hz; give "

@@ -36,7 +36,7 @@ def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
         axes.grid(alpha=0.3)
     per_m = 2 * sonar.sampling_hz / sonar.sound_speed
     above = grid[0].secondary_xaxis("top", functions=(lambda tap: tap / per_m, lambda range_m: range_m * per_m))
-    above.set_xlabel("half the way (m)")
+    above.set_xlabel("half the path's length (m)")
     grid[0].legend(loc="upper right", fontsize=8, ncols=3)
     grid[-1].set_xlabel(f"tap ({1e3 / sonar.sampling_hz:.4g} ms each)")
     figure.suptitle(_title(responses, f"ping {ping}, divided by the largest magnitude"), fontsize=10)
@@ -53,6 +53,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
     decibel = 20 * np.log10(np.maximum(level / max(float(level.max()), 1e-30), 10 ** (FAINT_DB / 20)))
     time = responses.time_s
     half = 0.5 * (time[1] - time[0]) if len(time) > 1 else 0.5 / sonar.frame_rate_hz
+    # a row is drawn around its time
     extent = (1e3 * begin / sonar.sampling_hz, 1e3 * end / sonar.sampling_hz, time[-1] + half, time[0] - half)
     figure = Figure(figsize=(2.6 * count + 1.6, 4.5), layout="constrained")
     grid: Any = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
@@ -63,7 +64,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
         )
         axes.set(title=receiver.name, xlabel="delay (ms)")
     grid[0].set_ylabel("time (s)")
-    figure.colorbar(shown, ax=list(grid), label="dB of the largest", fraction=0.04)
+    figure.colorbar(shown, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
     figure.suptitle(_title(responses, f"{len(responses)} pings"), fontsize=10)
     return figure
 

@@ -61,6 +61,14 @@ class ImpulseResponses:
     def __len__(self) -> int:
         return len(self.response)
 
+    def __repr__(self) -> str:
+        names = ", ".join(one.name for one in self.sonar.receivers)
+        known = ", ".join(name for name in PER_PING[2:] if getattr(self, name) is not None)
+        return (
+            f"ImpulseResponses({len(self)} pings, {self.response.shape[1]} receivers ({names}), {self.sonar.taps} taps at "
+            f"{self.sonar.sampling_hz:g} Hz; {known})"
+        )
+
     @property
     def delay_s(self) -> NDArray[np.float64]:
         """Delay of each tap ``(taps,)`` [s]."""

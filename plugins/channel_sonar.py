@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsonar.channel_sonar import LOOKS, ChannelSonar, FieldOfView, four_receivers
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.motion import Pose, pose_from_to_world, to_world_matrices
 
 __all__ = ["ChannelSensor", "is_channel_sonar"]
@@ -31,13 +31,17 @@ class ChannelSensor(mi.Sensor):
     of the vehicle, local +z forward, +y up.
 
     Receivers that are called front, left, back or right stand 0.1 m from the transmitter and look that way unless told
-    otherwise; others must have a heading. As a camera it sends one ray, forward: responses are made by ``mitsonar impulse``.
-    It does not model a vehicle that shadows its own receivers, several bounces, or the way between transmitter and receiver.
+    otherwise; others must have a heading and a position. As a camera it sends one ray, forward: responses are made by
+    ``mitsonar impulse``. It does not model a vehicle that shadows its own receivers, several bounces, or the way between
+    transmitter and receiver.
 
     .. code-block:: xml
 
         <sensor type="channel_sonar">
-            <string name="receivers" value="front, right"/>
+            <string name="receivers" value="front, keel"/>
+            <float name="keel_heading_deg" value="90"/>
+            <point name="keel_position" value="0.2, 0, -0.1"/>
+            <float name="keel_across_deg" value="4"/>
             <float name="carrier_hz" value="80000"/>
             <transform name="to_world">
                 <lookat origin="0, 0, 10" target="0, 1, 10" up="0, 0, 1"/>
@@ -90,16 +94,50 @@ def _read(props: mi.Properties) -> ChannelSonar:
     receivers = []
     for name in names:
         own = _some(props, FIELD, f"{name}_")
-        if name not in known and "heading_deg" not in own:
-            raise MitsonarError(
-                f"receiver {name!r} must be told where it looks: give {name}_heading_deg (0 forward, 90 to starboard) and "
-                f"{name}_position; front, left, back and right know theirs"
-            )
+        if not name.isidentifier():
+            raise MitsonarError(f"receivers are names with commas between them, as 'bow, port': got {props['receivers']!r}")
         made = known.get(name, {"name": name, "field": {}})
         if f"{name}_position" in props:
-            made["position"] = tuple(float(value) for value in np.ravel(props[f"{name}_position"]))
+            made["position"] = _place(f"{name}_position", props[f"{name}_position"])
         receivers.append({**made, "field": {**made["field"], **shared, **own}})
+        missing = [
+            key for key, there in (("heading_deg", "heading_deg" in own), ("position", "position" in made)) if not there
+        ]
+        if name not in known and missing:
+            _refuse_unknown(props, names)
+            keys = " and ".join(f"{name}_{key}" for key in missing)
+            raise MitsonarError(
+                f"receiver {name!r} must be told where it is and looks: give {keys} (position: a point, starboard, forward, "
+                "up in m; heading: 0 forward, 90 to starboard); front, left, back and right know theirs"
+            )
+    _refuse_unknown(props, names)
     return ChannelSonar.create(**fields, transmitter=sends, receivers=receivers)
+
+
+def _place(key: str, value: Any) -> tuple[float, ...]:
+    """A point, or three numbers with commas."""
+    try:
+        given = value.replace(",", " ").split() if isinstance(value, str) else np.ravel(value)
+        place = tuple(float(number) for number in given)
+    except (TypeError, ValueError):
+        place = ()
+    if len(place) != 3:
+        example = f'<point name="{key}" value="0, 0.3, 0"/>'
+        raise MitsonarError(f"{key} is a point, starboard, forward, up in m, {example}: got {value!r}")
+    return place
+
+
+def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
+    """Properties that the sensor does not have.
+
+    Raises:
+        MitsonarError: some.
+    """
+    known = {*OWN, *FIELD, "receivers", "to_world", "id", *(f"transmitter_{key}" for key in FIELD)} - {"heading_deg"}
+    known |= {f"{name}_{key}" for name in names for key in (*FIELD, "position")}
+    for key in props:
+        if key not in known and props.type(key) not in (mi.Properties.Type.Object, mi.Properties.Type.Reference):
+            raise MitsonarError(f"the sensor channel_sonar has no property {key!r}: {nearest_names(key, sorted(known))}")
 
 
 def _some(props: mi.Properties, names: tuple[str, ...], before: str = "") -> dict[str, Any]:

@@ -454,7 +454,7 @@ def test_no_surface_to_carry_scatterers() -> None:
 
 @pytest.mark.parametrize("velocity", [[[0, 0, 0]], [[np.nan, 0, 0, 0]], [[1000, 0, 0, 0]]])
 def test_velocities_that_cannot_be(velocity: Any) -> None:
-    with pytest.raises(MitsonarError, match="velocity must"):
+    with pytest.raises(MitsonarError, match="velocity"):
         list(simulator(ChannelSonar(), floor=cells_floor(cells=32.0)).pings([LEVEL], velocity))
 
 

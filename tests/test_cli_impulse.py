@@ -41,7 +41,7 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
     assert done.returncode == 0, done.stderr
     assert "20 pings (scatterers model, custom: front, right) of 800 taps" in done.stdout
     assert "spread factor" in done.stdout
-    assert "turns of the carrier" in done.stdout
+    assert "turns the carrier by up to" in done.stdout
     assert "overspread" in done.stderr
     npz, stored = ImpulseResponses.load(out), ImpulseResponses.load(out / "responses.zarr")
     assert npz.response.dtype == np.complex64
@@ -95,14 +95,42 @@ def test_a_course_by_name_and_keys_of_the_instrument(mitsonar: Command, scene: P
     assert np.allclose(responses.velocity[:, :2], 1.0)
 
 
+def test_fewer_pings_of_a_path_keep_its_velocity_and_some_receivers_may_do(
+    mitsonar: Command, scene: Path, tmp_path: Path
+) -> None:
+    """A circle of 5 m in 20 s: chords across it would be another velocity."""
+    out = tmp_path / "out"
+    words = ("--trajectory", "circle", "--frames", 4, "--set", "receivers=right")
+    done = mitsonar("impulse", scene, *words, "-o", out)
+    assert done.returncode == 0, done.stderr
+    responses = ImpulseResponses.load(out)
+    assert [one.name for one in responses.sonar.receivers] == ["right"]
+    assert responses.velocity is not None
+    np.testing.assert_allclose(np.hypot(*responses.velocity[:, :2].T), 2 * np.pi * 5 / 20, rtol=0.01)
+    assert repr(responses).startswith("ImpulseResponses(4 pings, 1 receivers (right), 800 taps")
+
+
+def test_standing_still_is_told(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    done = mitsonar("impulse", scene, "--frames", 2, "-o", tmp_path / "out")
+    assert "stands still" in done.stderr
+    response = ImpulseResponses.load(tmp_path / "out").response
+    np.testing.assert_allclose(response[1], response[0], atol=1e-6 * np.abs(response).max())
+
+
 def test_a_receiver_that_hears_nothing_is_named(mitsonar: Command, tmp_path: Path) -> None:
     path = tmp_path / "scene.xml"
     path.write_text(
-        SCENE.format(names=", up", more='<float name="up_heading_deg" value="0"/><float name="up_tilt_deg" value="170"/>')
+        SCENE.format(
+            names=", up",
+            more='<float name="up_heading_deg" value="0"/><float name="up_tilt_deg" value="170"/>'
+            '<point name="up_position" value="0, 0, 20"/>',
+        )
     )
     done = mitsonar("impulse", path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "receiver up hears nothing in 1 of 1 pings" in done.stderr
+    assert "more than 90 looks up" in done.stderr
+    assert "receiver up sits 20 m from the transmitter: positions are in metres" in done.stderr
     assert "receiver front" not in done.stderr
     assert not ImpulseResponses.load(tmp_path / "out").response[0, 2].any()
 
@@ -120,8 +148,11 @@ def test_mistakes_are_answered(mitsonar: Command, scene: Path, tmp_path: Path, m
     refused(mitsonar("impulse", scene, "--set", "carrier_hz=0"), "carrier_hz must exceed")
     refused(mitsonar("impulse", scene, "--set", "carrier"), "KEY=VALUE")
     refused(mitsonar("impulse", scene, "--model", "points"), "scatterers")
-    refused(mitsonar("impulse", scene, "--velocity", "1"), "--velocity takes 3 numbers")
-    refused(mitsonar("impulse", scene, "--velocity", "900,0"), "a tenth of the sound speed")
+    refused(mitsonar("impulse", scene, "--velocity", "1"), "--velocity takes vx,vy or vx,vy,turn")
+    refused(mitsonar("impulse", scene, "--velocity", "900,0"), "a tenth of the sound speed", "m/s")
+    refused(mitsonar("impulse", scene, "--set", "receivers=front,bow"), "of the receivers front, right: got 'bow'")
+    refused(mitsonar("impulse", scene, "--set", "transmitter=all"), "in the scene, or in Python")
+    refused(mitsonar("impulse", scene, "--from", "0,0,-10,0,0,0"), "no receiver hears anything", "(0, 0, -10) m")
     refused(mitsonar("impulse", scene, "--trajectory", "sqare"), "unknown course 'sqare'", "square")
     refused(mitsonar("impulse", scene, "--trajectory", tmp_path / "no.tum"), "cannot read trajectory")
     refused(mitsonar("impulse", scene, "--trajectory", "square", "--velocity", "1,1"), "contradict")

@@ -64,8 +64,8 @@ STAGES = (
         f"estimation.{name}"
         for name in ("estimator", "zero", "ground", "ecc", "phase", "flow", "direct", "network", "estimators")
     ),
-    *(f"estimation.{name}" for name in ("limit", "comparison", "regressors")),
-    *(f"estimation.{name}" for name in ("impulse", "ground_law", "impulse_bands", "impulse_search", "impulse_limit")),
+    *(f"estimation.{name}" for name in ("limit", "impulse", "comparison", "regressors")),
+    *(f"estimation.{name}" for name in ("ground_law", "impulse_bands", "impulse_search", "impulse_limit")),
     *(f"estimation.{name}" for name in ("impulse_correlation", "impulse_likelihood", "impulse_estimators")),
     *(
         f"mapping.{name}"

@@ -22,6 +22,7 @@ from mitsonar.dataset.recordings import recording_of
 from mitsonar.dataset.sheet import info
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
+from mitsonar.estimation.impulse_estimators import create_impulse_estimator
 from mitsonar.estimation.regressors import REGRESSORS, Turned, flattened, score_all
 from mitsonar.motion import Motion, Pose, Trajectory, compose, motions, steady, velocities
 from mitsonar.simulation.scenes import load_scene
@@ -367,8 +368,27 @@ def test_the_wrong_kind_of_data_set_is_one_sentence(made: Path) -> None:
     pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
     from mitsonar.dataset.pairs import SonarPairs
 
-    with pytest.raises(MitsonarError, match="the data set heard is of impulse responses: read it with ImpulsePairs"):
+    with pytest.raises(MitsonarError, match="the data set heard is of impulse responses, this needs one of images"):
         SonarPairs(made)
+
+
+def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Path, tmp_path: Path) -> None:
+    """RMSE in the table against the estimator asked by hand."""
+    pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
+    words = ("compare", straight, "--part", "all", "--estimators", "zero,correlation", "--noise", "none,20 dB", "--seed", 3)
+    done = mitsonar(*words, "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    tables = json.loads((tmp_path / "out" / "table.json").read_text())["tables"]
+    assert [table["noise"] for table in tables] == ["none", "20 dB"]
+    for table in tables:
+        samples = ImpulseSamples(straight, part="all", noise=table["noise"], seed=3, one_a_sequence=True)
+        answers = [create_impulse_estimator("correlation").estimate(samples.responses(k)) for k in range(len(samples))]
+        said = np.array([one.motion[:2] if one.believe else (0, 0) for one in answers])
+        wanted = 1e3 * np.sqrt(((said - samples.targets()) ** 2).mean(axis=0))
+        row = next(row for row in table["rows"] if row["method"] == "correlation")
+        np.testing.assert_allclose(row["rmse"][:2], wanted, rtol=1e-9)
+    refused(mitsonar("compare", straight, "--part", "all", "--perturb"), "for data sets of images")
+    refused(mitsonar("odometry", straight, "-o", tmp_path / "path", "--estimator", "correlation"), "of impulse responses")
 
 
 # ---------------------------------------------------------------- regressors

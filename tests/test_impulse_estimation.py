@@ -12,12 +12,14 @@ from points import PointGround, run
 from mitsonar.channel_sonar import ChannelSonar, four_receivers
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.ground_law import GroundLaw, block_toeplitz, look_at
-from mitsonar.estimation.impulse_estimators import IMPULSE_ESTIMATORS, create_impulse_estimator
+from mitsonar.estimation.impulse_bands import bands_of
+from mitsonar.estimation.impulse_estimators import IMPULSE_ESTIMATORS, create_impulse_estimator, impulse_estimator_from
 from mitsonar.estimation.impulse_likelihood import Likelihood, judged
 from mitsonar.estimation.impulse_limit import impulse_information, impulse_limit
 from mitsonar.estimation.impulse_search import ears_of
 from mitsonar.motion import Motion
 from mitsonar.responses import ImpulseResponses
+from mitsonar.simulation.channel import impulse_response
 
 HEIGHT = 4.0
 SONAR = ChannelSonar.create(range_max=10.0, frequency_step_hz=20.0, receivers=four_receivers(across_deg=6.0))
@@ -247,8 +249,40 @@ def test_two_receivers_are_enough(name: str) -> None:
     assert np.abs(np.array(answer.motion) - MOTIONS[0]).max() < 3e-3
 
 
+@pytest.mark.parametrize("name", ["correlation", "likelihood"])
+def test_pings_too_far_apart_are_refused_at_once(name: str) -> None:
+    """Motions of hundreds of wavelengths would take minutes and gigabytes."""
+    good = pair(MOTIONS[0])
+    with pytest.raises(MitsonarError, match=r"10 s apart at up to 2\.1 m/s .*:speed="):
+        create_impulse_estimator(name).estimate(replace(good, time_s=good.time_s[0] + np.array([0.0, 10.0])))
+
+
+def test_parts_of_a_band_hold_all_of_it_and_tell_independently() -> None:
+    """Echoes in each part of the whole's response are those that the part would hear; two parts have nothing in common."""
+    wide = SONAR.replace(bandwidth_hz=9600.0, sampling_hz=16000.0)
+    parts = bands_of(wide)
+    assert [part.sonar.bandwidth_hz for part in parts] == [4800.0] * 2
+    assert [part.sonar.carrier_hz for part in parts] == [76400.0, 83600.0]
+    assert bands_of(SONAR)[0].sonar == SONAR.replace()
+    delay = np.array([0.0061, 0.0093])
+    whole = impulse_response(delay, [1.0, 0.5], wide)
+    for part in parts:
+        expected = impulse_response(delay, [1.0, 0.5], part.sonar)
+        np.testing.assert_allclose(part.of(whole)[100:], expected[100:], atol=2e-3 * np.abs(expected).max())
+    ground = [PointGround(seed, half_m=6.0) for seed in range(24)]
+    heard = np.array([run(wide, one, MOTIONS[0], pings=2, height_m=HEIGHT).response[0, 0] for one in ground])
+    low, high = (part.of(heard)[:, 45:90] for part in parts[:2])
+    likeness = np.abs((low * high.conj()).sum(axis=0)) / np.sqrt((np.abs(low) ** 2).sum(0) * (np.abs(high) ** 2).sum(0))
+    assert np.mean(likeness**2) < 2 / len(ground)
+
+
 def test_unknown_names_and_options_are_refused() -> None:
     with pytest.raises(MitsonarError, match="unknown estimator"):
         create_impulse_estimator("likelyhood")
     with pytest.raises(MitsonarError, match="likelihood"):
         create_impulse_estimator("likelihood", hight_m=1.0)
+    assert impulse_estimator_from("likelihood:yaw=1:speed=0.5") == Likelihood(yaw=True, speed=0.5)
+    with pytest.raises(MitsonarError, match="unknown option 'hight_m': correlation takes height_m, speed"):
+        impulse_estimator_from("correlation:hight_m=3")
+    with pytest.raises(MitsonarError, match="speed must be a number"):
+        impulse_estimator_from("likelihood:speed=fast")

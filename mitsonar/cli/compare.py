@@ -20,7 +20,6 @@ from mitsonar.errors import MitsonarError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from mitsonar.dataset.pairs import SonarPairs
     from mitsonar.estimation.comparison import Answers
     from mitsonar.estimation.estimator import Estimator
     from mitsonar.noise import NoiseModel
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["compare", "markdown", "table_lines"]
 
 METHODS = "zero,ecc,flow,phase,direct"
+IMPULSE_METHODS = "zero,correlation,likelihood"
 
 FEWEST_SCENES = 10
 """With fewer, clustered intervals hold much less than they say."""
@@ -35,17 +35,19 @@ FEWEST_SCENES = 10
 
 @answered
 def compare(
-    data: Annotated[str, typer.Argument(metavar="DATA.zarr", help="Path or URL of a data set of images.")],
+    data: Annotated[str, typer.Argument(metavar="DATA.zarr", help="Path or URL of a data set.")],
     estimators: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Names, or checkpoints of networks, with commas between them, each NAME or NAME:key=value:key=value."
+            help="Names, or checkpoints of networks, with commas between them, each NAME or NAME:key=value:key=value "
+            f"(default: {METHODS}; of impulse responses: {IMPULSE_METHODS})."
         ),
-    ] = METHODS,
+    ] = None,
     noise: Annotated[
         str,
         typer.Option(
-            help="Levels with commas between them (or ; where one is m,s,g): none, low, high, chapter2, a YAML file."
+            help="Levels with commas between them (or ; where one is m,s,g): none, low, high, chapter2, a YAML file; of "
+            "impulse responses ratios: none,20 dB."
         ),
     ] = "none",
     part: Annotated[str | None, typer.Option(help="train, validation, test (default where it is), all.")] = None,
@@ -70,26 +72,38 @@ def compare(
         from mitsonar.dataset.pairs import SonarPairs
     except ModuleNotFoundError:
         raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'") from None
+    from mitsonar.dataset.impulse_samples import ImpulseSamples
+    from mitsonar.dataset.recordings import recording_of
     from mitsonar.estimation.comparison import VARIATIONS, answers_of, chosen, limits_of, rows_of, with_prior
     from mitsonar.estimation.estimators import estimator_from
+    from mitsonar.estimation.impulse_estimators import impulse_estimator_from
     from mitsonar.estimation.network import Network
     from mitsonar.metrics import cluster_resamples, in_units
     from mitsonar.motion import motions
     from mitsonar.noise import load_noise
 
-    methods = {text: estimator_from(text) for text in dict.fromkeys(estimators.split(",")) if text}
+    heard = _holds_responses(data)
+    made: Callable[[str], Any] = impulse_estimator_from if heard else estimator_from
+    asked_for = estimators or (IMPULSE_METHODS if heard else METHODS)
+    methods = {text: made(text) for text in dict.fromkeys(asked_for.split(",")) if text}
     if not methods or (reference is not None and reference not in methods):
         raise MitsonarError(f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {reference!r}")
-    levels = {name: load_noise(name) for name in dict.fromkeys(noise.split(";" if ";" in noise else ","))}
+    if heard and (perturb or jitter or prior):
+        raise MitsonarError("--perturb, --jitter and --prior are for data sets of images: leave them out")
+    names = list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
+    levels: dict[str, Any] = dict.fromkeys(names) if heard else {name: load_noise(name) for name in names}
+    limit = 0 if heard else limit
     changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if perturb else []
     asked = ["as told", *changed, *(["jitter"] if jitter else [])]
-    samples = {name: _pairs(SonarPairs, data, part, name, seed) for name in levels}
+    reader = ImpulseSamples if heard else SonarPairs
+    samples: dict[str, Any] = {name: _pairs(reader, data, part, name, seed) for name in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
         raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
     numbers = chosen(len(first), pairs, seed)
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
-    truth = np.array([motions(first.pose[first.frame_numbers(number)])[0] for number in numbers])
+    poses = first.chosen.pose if heard else first.pose
+    truth = np.array([motions(poses[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
     resamples = cluster_resamples(first.scene[first.first[numbers]], seed=seed)
     if jitter and first.recipe.instrument.jittered:
         raise MitsonarError("the rays of this data set move already: --jitter is for the thesis's model")
@@ -108,7 +122,8 @@ def compare(
     if networks:
         settings["networks"] = networks
     store = _Kept(out, settings)
-    report: dict[str, Any] = {"data": data, "model": first.recipe.instrument.model, **settings, "tables": []}
+    model_name = recording_of(first.recipe).sonar.model
+    report: dict[str, Any] = {"data": data, "model": model_name, **settings, "tables": []}
     with progress_bar("comparing", len(levels) * len(asked) * len(numbers), "pairs") as progress:
         answers = {
             (level, variation): answers_of(
@@ -157,7 +172,7 @@ def compare(
         return
     say(
         f"{data}: {len(numbers)} pairs of {len(np.unique(first.scene[first.first[numbers]]))} scenes, "
-        f"{first.recipe.instrument.model} model; sideways mm / forward mm / yaw deg"
+        f"{model_name} model; sideways mm / forward mm / yaw deg"
     )
     for line in lines:
         say(line)
@@ -165,23 +180,34 @@ def compare(
         say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}")
 
 
-def _pairs(reader: type[SonarPairs], data: str, part: str | None, noise: str, seed: int) -> SonarPairs:
-    """One pair a sequence of the part that is asked for."""
+def _holds_responses(data: str) -> bool:
+    """Whether a data set is of impulse responses."""
+    from mitsonar.dataset.store import DataStore
+
+    return DataStore.open(data).recipe.channel is not None
+
+
+def _pairs(reader: type[Any], data: str, part: str | None, noise: str, seed: int) -> Any:
+    """One sample a sequence of the part that is asked for: pairs of images, or as many responses as the recipe has."""
     from mitsonar.dataset.store import DataStore
 
     recipe = DataStore.open(data).recipe
     part = part or recipe.split.unseen
-    return reader(data, part=part, frames=2, noise=noise, seed=seed, one_a_sequence=True)
+    frames = 2 if recipe.channel is None else recipe.frames
+    return reader(data, part=part, frames=frames, noise=noise, seed=seed, one_a_sequence=True)
 
 
-def _digest(pairs: SonarPairs) -> str:
+def _digest(pairs: Any) -> str:
     """Of what is compared on: the motions and the recipe."""
-    content = pairs.motion.tobytes() + pairs.pose.tobytes() + json.dumps(pairs.recipe.model_dump(), default=str).encode()
+    table = pairs.targets() if hasattr(pairs, "targets") else np.concatenate([pairs.motion.ravel(), pairs.pose.ravel()])
+    content = table.tobytes() + json.dumps(pairs.recipe.model_dump(), default=str).encode()
     return hashlib.sha256(content).hexdigest()
 
 
-def _key(level: str, model: NoiseModel) -> str:
-    """Names a noise level by what it is: a file of the same name may change."""
+def _key(level: str, model: NoiseModel | None) -> str:
+    """Names a noise level by what it is: a file of the same name may change; a ratio says all."""
+    if model is None:
+        return level
     return f"{level} {hashlib.sha256(model.model_dump_json().encode()).hexdigest()[:8]}"
 
 

@@ -30,7 +30,9 @@ def impulse(
         str | None,
         typer.Option(help="vx,vy of the vehicle, starboard and forward in m/s; vx,vy,turn with deg/s to starboard."),
     ] = None,
-    frames: Annotated[int | None, typer.Option(help="Number of pings.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of pings (default: 1); with --trajectory: at even times over all of it.")
+    ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     trajectory: Annotated[
         str | None, typer.Option(help="Poses to fly: a TUM file, or a course (square, stairs, zigzag, circle ...).")
@@ -74,8 +76,8 @@ def impulse(
     )
     still, twice = iteration_error(flown, speeds, sonar)
     say(
-        f"motion while sound travels: up to {still:.3g} turns of the carrier at {sonar.range_max:g} m; two rounds of the "
-        f"thesis's iteration leave {twice:.2g}, the exact root none"
+        f"motion while sound travels turns the carrier by up to {still:.3g} turns at {sonar.range_max:g} m, which is "
+        f"counted exactly (the thesis's two rounds would leave {twice:.2g})"
     )
     say(f"figures: {folder / 'response.png'}, {folder / 'waterfall.png'}")
 
@@ -92,10 +94,25 @@ def _instrument(
         key, equals, value = pair.partition("=")
         if not equals:
             raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
-        fields[key] = value
+        fields[key] = _listening(sonar, value) if key == "receivers" else value
+        if key == "transmitter":
+            raise MitsonarError(f"fields of view are set in the scene, or in Python, not by --set: got {pair!r}")
     fields |= {} if model is None else {"model": model}
     fields |= {} if seed is None else {"seed": seed}
     return sonar.replace(**fields), standing
+
+
+def _listening(sonar: ChannelSonar, names: str) -> list[dict[str, Any]]:
+    """Some of an instrument's receivers."""
+    known = {one.name: one for one in sonar.receivers}
+    wanted = [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in known:
+            raise MitsonarError(
+                f"--set receivers=NAME,NAME chooses of the receivers {', '.join(known)}: got {name!r}; others are described "
+                "in the scene's channel_sonar"
+            )
+    return [known[name].model_dump() for name in wanted]
 
 
 def _path(
@@ -107,6 +124,8 @@ def _path(
     path: str | None,
 ) -> tuple[Trajectory, NDArray[np.float64]]:
     """Poses and velocities that the options say."""
+    import numpy as np
+
     from mitsonar.courses import COURSES, course
     from mitsonar.motion import Pose, Trajectory, steady, velocities
 
@@ -121,12 +140,20 @@ def _path(
             )
         named = path in COURSES or not Path(path).suffix
         flown = course(path, begin or Pose(0.0, 0.0, 10.0)) if named else Trajectory.load_tum(path)
-        flown = flown if frames is None else flown.resample(frames)
-        return flown, velocities(flown)
+        speeds = velocities(flown)
+        if frames is not None:  # fewer pings do not make the vehicle cut corners
+            few = flown.resample(frames)
+            speeds = np.stack([np.interp(few.time_s, flown.time_s, column) for column in speeds.T], axis=1)
+            flown = few
+        return flown, speeds
     if begin is None:
         raise MitsonarError(
             f"the scene has no channel_sonar that gives a pose: add one, or give a pose with --from ({SIX}), or --trajectory"
         )
-    count = 2 if velocity is None or velocity.count(",") == 1 else 3
-    speed = [*(numbers(velocity, count, "--velocity") or [0.0, 0.0]), 0.0][:3]
+    if velocity is not None and velocity.count(",") not in (1, 2):
+        raise MitsonarError(f"--velocity takes vx,vy or vx,vy,turn (m/s, m/s, deg/s): got {velocity!r}")
+    count = 2 if velocity is None else velocity.count(",") + 1
+    speed = [*(numbers(velocity, count, "--velocity (m/s, m/s, deg/s)") or [0.0, 0.0]), 0.0][:3]
+    if velocity is None and (frames or 1) > 1:
+        warn("the vehicle stands still, so that all pings are alike: give --velocity vx,vy in m/s, or --trajectory")
     return steady(begin, (speed[0], speed[1], math.radians(speed[2])), frames or 1, sonar.frame_rate_hz)

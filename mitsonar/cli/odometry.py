@@ -83,8 +83,8 @@ def odometry(
         from mitsonar.estimation.estimators import estimator_from
 
         estimator = estimator or "direct"
-        method = estimator_from(estimator)
         source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+        method = estimator_from(estimator)
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
@@ -118,10 +118,10 @@ def odometry(
 
 def _responses(where: str, estimator: str, noise: str, seed: int, height: float | None) -> tuple[Source, Method]:
     """Impulse responses and their estimator."""
-    from mitsonar.estimation.impulse_estimators import create_impulse_estimator
+    from mitsonar.estimation.impulse_estimators import impulse_estimator_from
     from mitsonar.mapping.response_source import open_responses
 
-    return open_responses(where).told(noise, seed, height), create_impulse_estimator(estimator)
+    return open_responses(where).told(noise, seed, height), impulse_estimator_from(estimator)
 
 
 def frames_from(

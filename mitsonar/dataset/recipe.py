@@ -243,7 +243,8 @@ class Recipe(_Part):
         """
         if self.sonar is None:
             raise MitsonarError(
-                f"the data set {self.name} is of impulse responses: read it with ImpulsePairs, this needs one of images"
+                f"the data set {self.name} is of impulse responses, this needs one of images: `mitsonar compare` and "
+                "ImpulsePairs read it"
             )
         return sonar_from(dict(self.sonar)).replace(seed=self.seed)
 

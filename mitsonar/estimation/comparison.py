@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.dataset.again import rendered_again
+from mitsonar.dataset.impulse_samples import ImpulseSamples
 from mitsonar.dataset.pairs import SonarPairs
 from mitsonar.dataset.plan import scenes_of
 from mitsonar.dataset.rendering import SceneRenderer
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimator
+from mitsonar.estimation.impulse import ImpulseEstimator
 from mitsonar.estimation.limit import bounds_at, overall
 from mitsonar.frames import SonarFrames
 from mitsonar.metrics import MotionErrors, in_units, motion_errors
@@ -68,7 +70,7 @@ class Answers:
         """Which pairs have been asked for ``(n,)``."""
         return np.isfinite(self.ms)
 
-    def ask(self, place: int, estimator: Estimator, frames: SonarFrames) -> None:
+    def ask(self, place: int, estimator: Estimator | ImpulseEstimator, frames: Any) -> None:
         """Put an estimate in its place."""
         begun = time.process_time()
         estimate = estimator.estimate(frames)
@@ -94,9 +96,12 @@ def chosen(count: int, pairs: int | None, seed: int) -> list[int]:
     return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
-def frames_of(pairs: SonarPairs, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, SonarFrames]]:
-    """Samples as (number, frames) with a variation of :data:`VARIATIONS`."""
-    if variation == "heave 5 mm":
+def frames_of(pairs: SonarPairs | ImpulseSamples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Any]]:
+    """Samples as (number, frames or impulse responses) with a variation of :data:`VARIATIONS`; of responses only as told."""
+    if isinstance(pairs, ImpulseSamples):
+        for number in numbers:
+            yield number, pairs.responses(number)
+    elif variation == "heave 5 mm":
         yield from rendered_again(pairs, numbers, shift=_heaved)
     elif variation == "jitter":
         yield from rendered_again(pairs, numbers, jitter=True)
@@ -132,8 +137,8 @@ def _told(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
 
 
 def answers_of(
-    estimators: Mapping[str, Estimator],
-    pairs: SonarPairs,
+    estimators: Mapping[str, Estimator] | Mapping[str, ImpulseEstimator],
+    pairs: SonarPairs | ImpulseSamples,
     numbers: Sequence[int],
     variation: str = "as told",
     *,
@@ -163,8 +168,8 @@ def answers_of(
 
 
 def _answers_of(
-    estimators: Mapping[str, Estimator],
-    pairs: SonarPairs,
+    estimators: Mapping[str, Estimator] | Mapping[str, ImpulseEstimator],
+    pairs: SonarPairs | ImpulseSamples,
     numbers: Sequence[int],
     variation: str,
     known: dict[str, Answers] | None,

@@ -18,7 +18,7 @@ from mitsonar.estimation.phase import Phase
 from mitsonar.estimation.zero import Zero
 from mitsonar.networks.shipped import SHIPPED, shipped_path
 
-__all__ = ["ESTIMATORS", "NAMES", "create_estimator", "estimator_from"]
+__all__ = ["ESTIMATORS", "NAMES", "create_estimator", "estimator_from", "options_from"]
 
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     "zero": Zero,
@@ -55,12 +55,12 @@ def estimator_from(text: str) -> Estimator:
     """
     name, *words = text.split(":")
     if name in NAMES:
-        return create_estimator(name, **_options(name, words, _maker(name)))
+        return create_estimator(name, **options_from(name, words, _maker(name)))
     if "/" not in name and "." not in name and not Path(name).is_dir():
         names = nearest_names(name, NAMES)
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
     made = _trained(name)
-    return made(**_options(name, words, made))
+    return made(**options_from(name, words, made))
 
 
 def _maker(name: str) -> Callable[..., Estimator]:
@@ -84,8 +84,12 @@ def _trained(path: str | Path) -> Callable[..., Estimator]:
     return partial(Network, Checkpoint.load(path))
 
 
-def _options(name: str, words: list[str], made: Callable[..., Estimator]) -> dict[str, Any]:
-    """Options of what makes an estimator, from words as the command line gives them."""
+def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[str, Any]:
+    """Options of what makes an estimator, from words as the command line gives them.
+
+    Raises:
+        MitsonarError: unknown option, not a number.
+    """
     known, options = _numbers(made), {}
     for word in words:
         key, _, value = word.partition("=")
@@ -104,7 +108,7 @@ def _options(name: str, words: list[str], made: Callable[..., Estimator]) -> dic
     return options
 
 
-def _numbers(made: Callable[..., Estimator]) -> dict[str, tuple[str, str]]:
+def _numbers(made: Callable[..., Any]) -> dict[str, tuple[str, str]]:
     """Options that are numbers or yes and no, as the command line names them, with their own name and type."""
     parameters = inspect.signature(made).parameters.values()
     kinds = {one.name: str(one.annotation) for one in parameters}

@@ -198,7 +198,8 @@ class GroundLaw:
         found = []
         for half in (-lag / 2, lag / 2):
             pose, height = (*(half * way), half * yaw), self.height_m + half * heave
-            found.append(look_at(self.sonar, self.receiver, height, self.nodes.points, pose, way / self.interval_s))
+            velocity = _clockwise(way, half * yaw) / self.interval_s  # along the arc, whose chord the way is
+            found.append(look_at(self.sonar, self.receiver, height, self.nodes.points, pose, velocity))
         return found[0], found[1]
 
     def covariance(self, motion: ArrayLike, lag: float = 1.0) -> Complex:
@@ -241,6 +242,12 @@ class GroundLaw:
         """Taps of both pings ``(n, taps, taps)`` of spectra ``(n, frequencies, frequencies)``."""
         made = self.synthesis[2]
         return np.asarray(made @ spectra @ made.conj().T)
+
+
+def _clockwise(way: Array, turn: float) -> Array:
+    """A level way, turned."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    return np.array([way[0] * cos + way[1] * sin, way[1] * cos - way[0] * sin])
 
 
 def _four(motion: ArrayLike) -> Array:

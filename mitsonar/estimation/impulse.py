@@ -11,7 +11,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.responses import ImpulseResponses
 
-__all__ = ["ImpulseEstimator", "Pings", "pings_of", "standing_height"]
+__all__ = ["ImpulseEstimator", "Pings", "pings_of", "reach_of", "standing_height"]
 
 UNEVEN = 0.01
 """Part of an interval by which pings may come too early or late."""
@@ -67,6 +67,22 @@ def pings_of(responses: ImpulseResponses) -> Pings:
     quiet = np.asarray(~responses.response.any(axis=2).all(axis=0), dtype=bool)
     names = tuple(one.name for number, one in enumerate(responses.sonar.receivers) if quiet[number])
     return Pings(responses.response.astype(np.complex128), interval, names)
+
+
+def reach_of(interval_s: float, speed: float, wavelength_m: float, most_waves: float) -> float:
+    """The longest motion between pings [m].
+
+    Raises:
+        MitsonarError: more wavelengths than can be searched.
+    """
+    reach = speed * interval_s
+    if reach > most_waves * wavelength_m:
+        raise MitsonarError(
+            f"pings {interval_s:g} s apart at up to {speed:g} m/s leave motions of up to {reach:.3g} m open, "
+            f"{reach / wavelength_m:.3g} wavelengths, of which at most {most_waves:g} can be searched: measure more often, "
+            f"or tell the estimator a lower speed (NAME:speed={most_waves * wavelength_m / interval_s:.2g})"
+        )
+    return reach
 
 
 def standing_height(responses: ImpulseResponses, name: str, height_m: float | None) -> float:

@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter
 
 from mitsonar.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.estimation.estimator import Estimate, unbelieved
-from mitsonar.estimation.impulse import pings_of, standing_height
+from mitsonar.estimation.impulse import pings_of, reach_of, standing_height
 from mitsonar.motion import Motion
 from mitsonar.responses import ImpulseResponses
 
@@ -36,6 +36,9 @@ STEP = 1 / 16
 
 WINDOW = 8
 """Taps whose products are averaged."""
+
+MOST_WAVES = 50.0
+"""Motions between pings that are tried, either way."""
 
 LEAST = 4.0
 """By which the best sum must exceed what pings with nothing in common sum up to, in its standard deviations."""
@@ -83,8 +86,9 @@ class Correlation:
         if not heard:
             return unbelieved("no receiver heard anything")
         if np.linalg.matrix_rank(np.array([one.look for one in heard]), tol=0.1) < 2:
-            return unbelieved("all receivers look along one line: motions across it do not show")
-        reach = self.speed * pings.interval_s
+            deaf = f" (nothing heard: {', '.join(pings.silent)})" if pings.silent else ""
+            return unbelieved(f"receivers that hear look along one line{deaf}: motions across it do not show")
+        reach = reach_of(pings.interval_s, self.speed, responses.sonar.wavelength_m, MOST_WAVES)
         coarse, doubt = _coarse(heard, reach, responses.sonar.wavelength_m * STEP)
         motion = (len(responses) - 1) * _fine(heard, coarse)
         return Estimate(Motion(float(motion[0]), float(motion[1]), 0.0), None, not doubt, doubt)

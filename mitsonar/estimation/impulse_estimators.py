@@ -7,13 +7,14 @@ from typing import Any
 
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.estimators import options_from
 from mitsonar.estimation.impulse import ImpulseEstimator, pings_of
 from mitsonar.estimation.impulse_correlation import Correlation
 from mitsonar.estimation.impulse_likelihood import Likelihood
 from mitsonar.motion import Motion
 from mitsonar.responses import ImpulseResponses
 
-__all__ = ["IMPULSE_ESTIMATORS", "ImpulseZero", "create_impulse_estimator"]
+__all__ = ["IMPULSE_ESTIMATORS", "ImpulseZero", "create_impulse_estimator", "impulse_estimator_from"]
 
 
 class ImpulseZero:
@@ -46,3 +47,14 @@ def create_impulse_estimator(name: str, **options: Any) -> ImpulseEstimator:
         return IMPULSE_ESTIMATORS[name](**options)
     except TypeError as error:
         raise MitsonarError(f"estimator {name}: {error}") from None
+
+
+def impulse_estimator_from(text: str) -> ImpulseEstimator:
+    """What the command line says: ``NAME`` or ``NAME:key=value:key=value``.
+
+    Raises:
+        MitsonarError: unknown name or option, not a number.
+    """
+    name, *words = text.split(":")
+    options = options_from(name, words, IMPULSE_ESTIMATORS[name]) if name in IMPULSE_ESTIMATORS else {}
+    return create_impulse_estimator(name, **options)

@@ -24,7 +24,7 @@ from scipy.ndimage import maximum_filter
 
 from mitsonar.estimation.estimator import Estimate, unbelieved
 from mitsonar.estimation.ground_law import block_toeplitz
-from mitsonar.estimation.impulse import pings_of, standing_height
+from mitsonar.estimation.impulse import pings_of, reach_of, standing_height
 from mitsonar.estimation.impulse_bands import bands_of
 from mitsonar.estimation.impulse_search import Ear, Search, ears_of
 from mitsonar.motion import Motion
@@ -58,6 +58,9 @@ NEAR = 0.1
 
 TURNS = (-0.006, -0.003, 0.003, 0.006)
 """Turns over all pings that are begun from [rad]."""
+
+MOST_WAVES = 25.0
+"""Motions between pings that are looked for, either way."""
 
 PLACES = 33
 """At which the likelihood across a look is computed."""
@@ -121,6 +124,7 @@ class Likelihood:
         yaw: whether the vehicle may turn; otherwise its heading is taken to stay.
         heave: whether it may rise or sink between pings.
         speed: the fastest that is looked for along an axis [m/s].
+        turn_rate: the fastest turn that is believed [rad/s].
         modes: motions that the search comes up with and that are compared in full.
     """
 
@@ -128,6 +132,7 @@ class Likelihood:
     yaw: bool = False
     heave: bool = False
     speed: float = 2.1
+    turn_rate: float = 0.4
     modes: int = 5
 
     inputs = "height"
@@ -139,7 +144,7 @@ class Likelihood:
         heard = [k for k, one in enumerate(responses.sonar.receivers) if one.name not in pings.silent]
         if not heard:
             return unbelieved("no receiver heard anything")
-        reach = self.speed * pings.interval_s
+        reach = reach_of(pings.interval_s, self.speed, responses.sonar.wavelength_m, MOST_WAVES)
         bands = bands_of(responses.sonar)
         ears, data = [], []
         for band in bands:
@@ -211,7 +216,10 @@ class Likelihood:
         if gain < LEAST_GAIN:
             reason = "the pings have nothing in common"
         covariance = intervals**2 * spread[:3, :3]
-        doubtful = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+        doubtful = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2])[-1], 0.0)))
+        turn, span = float(intervals * mean[2]), float(responses.time_s[-1] - responses.time_s[0])
+        if not reason and abs(turn) > self.turn_rate * span:
+            reason = f"turns by {np.degrees(turn):.2g} deg, faster than {np.degrees(self.turn_rate):.3g} deg/s"
         if not reason and doubtful > UNSURE * wavelength_m:
             alike = int((share > ALIKE).sum())
             reason = f"{f'{alike} motions fit alike: ' if alike > 1 else ''}known to {1e3 * doubtful:.0f} mm only"

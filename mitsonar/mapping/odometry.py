@@ -237,8 +237,8 @@ def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
     if estimates and not any(estimate.believe for estimate in estimates):
         reasons = _usual([estimate.reason for estimate in estimates])
         raise MitsonarError(
-            f"none of {len(estimates)} motions is believed, so that nothing tells the path ({reasons}): check height, pitch "
-            "and window, or try another estimator"
+            f"none of {len(estimates)} motions is believed, so that nothing tells the path ({reasons}): check what the "
+            "estimator is told (height, attitude, window or receivers), or try another one"
         )
     return MotionSeries.from_estimates(estimates, time_s)
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.channel_sonar import PADDING, ChannelSonar
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import Trajectory
+from mitsonar.motion import Trajectory, velocities
 from mitsonar.responses import ImpulseResponses
 from mitsonar.simulation.transform import phasor_sums
 from mitsonar.simulation.variant import thread_count
@@ -103,13 +103,15 @@ class ChannelSimulator:
 
         Args:
             flown: poses of the transmitter and times.
-            velocity: in the vehicle's axes, see :class:`~mitsonar.responses.ImpulseResponses`; default: standing still.
+            velocity: in the vehicle's axes, see :class:`~mitsonar.responses.ImpulseResponses`; default: that of the
+                trajectory (:func:`~mitsonar.motion.velocities`).
             progress: called with the number of pings that were added.
 
         Raises:
             MitsonarError: velocities that do not fit.
         """
         parts = []
+        velocity = velocities(flown) if velocity is None else velocity
         for part in self.pings(flown.poses, velocity):
             parts.append(part)
             progress(len(part))
@@ -129,7 +131,8 @@ class ChannelSimulator:
 
         Args:
             poses: of the transmitter when a ping is sent ``(pings, 6)``.
-            velocity: in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s].
+            velocity: in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s], or one
+                of all pings ``(4,)``; default: standing still.
             first: number of the first ping.
 
         Raises:
@@ -143,8 +146,21 @@ class ChannelSimulator:
                 yield self._channels(table[here], speeds[here], first + begin, threads)
 
     def paths(self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int = 0) -> Paths:
-        """The echoes that one receiver's response is made of."""
-        table = np.reshape(np.asarray(pose, dtype=float), (1, 6))
+        """The echoes that one receiver's response is made of.
+
+        Args:
+            pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
+            velocity: as of :meth:`pings`.
+            receiver: its number.
+
+        Raises:
+            MitsonarError: other numbers than these.
+        """
+        table = np.asarray(pose, dtype=float).reshape(1, -1)
+        if table.shape != (1, 6) or not np.isfinite(table).all():
+            raise MitsonarError(f"a pose is six numbers x, y, z [m], pitch, roll, heading [rad]: got {table.size}")
+        if not 0 <= receiver < len(self.sonar.receivers):
+            raise MitsonarError(f"receiver must be 0..{len(self.sonar.receivers) - 1}, its number: got {receiver!r}")
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
         heard = self.hearing.hear(table[0], speeds[0], receiver, FOR_PATHS)
         keep = heard["counts"].astype(bool)
@@ -242,6 +258,8 @@ def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDAr
         MitsonarError: another shape, not finite, as fast as sound.
     """
     table = np.zeros((pings, 4)) if velocity is None else np.atleast_2d(np.asarray(velocity, dtype=float))
+    if table.shape == (1, 4):
+        table = np.repeat(table, pings, axis=0)
     if table.shape != (pings, 4) or not np.isfinite(table).all():
         raise MitsonarError(
             f"velocity must be finite numbers (pings, 4) = ({pings}, 4), starboard, forward, up in m/s and turn in rad/s: "
@@ -249,5 +267,7 @@ def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDAr
         )
     fastest, most = float(np.linalg.norm(table[:, :3], axis=1).max(initial=0)), 0.1 * sound_speed
     if fastest > most:
-        raise MitsonarError(f"velocity must stay below a tenth of the sound speed, {most:g} m/s: got {fastest:g}")
+        raise MitsonarError(
+            f"velocity is in m/s and must stay below a tenth of the sound speed, {most:g} m/s: got {fastest:g} m/s"
+        )
     return table

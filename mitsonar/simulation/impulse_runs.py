@@ -84,6 +84,8 @@ def run_impulse(
     recipe["velocity"] = velocity[0].tolist() if len(np.unique(velocity, axis=0)) == 1 else "of the path"
     paths = [simulator.paths(flown.poses[0], velocity[:1], receiver) for receiver in range(len(sonar.receivers))]
     spread = spread_of(paths)
+    if not any(path.amplitude.size for path in paths):
+        _refuse_silence(simulator, flown, paths)
     state = begin(folder, recipe, "responses", overwrite=overwrite, resume=resume)
     if not state["finished"]:
         progress(int(state["frames_done"]))
@@ -139,6 +141,31 @@ def _make(
     return ImpulseResponses.load(url)
 
 
+def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[Paths]) -> None:
+    """Nothing is heard in the first ping: neither may it be in the middle and the last.
+
+    Raises:
+        MitsonarError: it is not.
+    """
+    sonar = simulator.sonar
+    for pose in flown.poses[[len(flown) // 2, -1]]:
+        if any(simulator.paths(pose, None, receiver).amplitude.size for receiver in range(len(sonar.receivers))):
+            return
+    beyond = sum(path.dropped for path in paths)
+    x, y, z, pitch, *_ = flown.poses[0]
+    height = float(simulator.hearing.height_m(flown.poses[:1])[0])
+    below = f"{height:.3g} m above what is below it" if math.isfinite(height) else "with nothing below it"
+    raise MitsonarError(
+        f"no receiver hears anything: the vehicle is at ({x:g}, {y:g}, {z:g}) m, {below}, pitched by "
+        f"{math.degrees(pitch):.3g} deg; {beyond:,} echoes came from beyond range_max {sonar.range_max:g} m. z is upwards, "
+        "a level vehicle has pitch 0 (to_world's +z is forward), and receivers look tilt_deg away from straight down"
+    )
+
+
+FAR_ARM_M = 10.0
+"""A receiver farther from the transmitter is probably given in millimetres."""
+
+
 def spread_of(paths: list[Paths]) -> Spread:
     """Spread of the echoes of all receivers, of 98 % of their energy."""
     energy = np.concatenate([path.amplitude**2 for path in paths])
@@ -160,17 +187,23 @@ def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
     assert made.dropped is not None
     for number, receiver in enumerate(made.sonar.receivers):
         silent = int((made.echoes[:, number] == 0).sum())
+        away = math.dist(receiver.position, (0, 0, 0))
+        if away > FAR_ARM_M:
+            sentences.append(f"receiver {receiver.name} sits {away:g} m from the transmitter: positions are in metres")
         if silent:
+            looks = receiver.field
+            up = " (more than 90 looks up)" if looks.tilt_deg > 90 else ""
+            pitch = "" if made.poses is None else f" (pitched by {math.degrees(made.poses[0, 3]):.3g} deg)"
             sentences.append(
                 f"receiver {receiver.name} hears nothing in {silent} of {len(made)} pings: check where it looks "
-                f"(heading {receiver.field.heading_deg:g} deg, tilt {receiver.field.tilt_deg:g} deg from straight down), "
-                "the vehicle's pose and range_max"
+                f"(heading {looks.heading_deg:g} deg, tilt {looks.tilt_deg:g} deg from straight down{up}), "
+                f"the vehicle's pose{pitch} and range_max"
             )
     dropped = int(made.dropped.sum())
     if dropped:
         share = dropped / max(1, dropped + int(made.echoes.sum()))
         sentences.append(
-            f"{dropped:,} echoes ({100 * share:.2g} %) came from beyond range_max {made.sonar.range_max:g} m and were "
+            f"{dropped:,} echoes ({100 * share:.3g} %) came from beyond range_max {made.sonar.range_max:g} m and were "
             "dropped: raise it, with a frequency_step_hz below sound_speed / (4 range_max)"
         )
     if spread.factor > OVERSPREAD:
