@@ -58,7 +58,18 @@ STAGES = (
     ),
     *(
         f"networks.{name}"
-        for name in ("look", "matching", "slopes", "corrnet", "impulse_posenet", "create", "shipped", "checkpoint", "onnx")
+        for name in (
+            "look",
+            "matching",
+            "slopes",
+            "corrnet",
+            "impulse_posenet",
+            "posenetvec",
+            "create",
+            "shipped",
+            "checkpoint",
+            "onnx",
+        )
     ),
     *(
         f"estimation.{name}"

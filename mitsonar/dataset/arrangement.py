@@ -95,6 +95,9 @@ class Arrangement:
         noise: drawn from (seed, frame, cell).
         beams: of each view.
         maps: of scan conversion, for each view.
+        range_levels: of vectors, neighbouring ones added up to so many; None: as they are.
+        halves: vectors of the port and of the starboard half of each image, a pseudo-quadrant each (Almanza-Medina, fig.
+            4.18).
         levels: of noise, of which each sample draws one by (seed, its first frame); empty: ``noise``, the first of them.
     """
 
@@ -106,6 +109,8 @@ class Arrangement:
     beams: dict[str, int]
     maps: dict[str, CartesianMap] = field(default_factory=dict)
     levels: tuple[NoiseModel, ...] = ()
+    range_levels: int | None = None
+    halves: bool = False
 
     def __call__(self, frames: dict[str, Any], numbers: Any, seed: int) -> Any:
         """The input of a network.
@@ -122,7 +127,8 @@ class Arrangement:
         parts = [self.noisy(frames, view, numbers, seed + place) for place, view in enumerate(self.views)]
         if self.kind == "vector":
             axis = 1 if self.layout == "channels" else 3
-            columns = [part[:, q, :] for part in parts for q in range(part.shape[1])]
+            parts = [part[..., side] for part in parts for side in (0, 1)] if self.halves else parts
+            columns = [self._coarser(part[:, q, :]) for part in parts for q in range(part.shape[1])]
             return xp.stack(columns, axis=1) if axis == 1 else xp.expand_dims(xp.stack(columns, axis=2), axis=1)
         polar = self._laid_out(parts) if self.coordinates != "cartesian" else None
         if self.coordinates == "polar":
@@ -167,10 +173,22 @@ class Arrangement:
         if values.dtype == xp.uint8:
             flat = xp.astype(flat, xp.float32) * xp.asarray(1 / 255, dtype=xp.float32, device=device(flat))
         flat = self.noise.apply(flat, seed=seed, frames=numbers)
+        if self.kind == "vector" and self.halves:
+            middle = flat.shape[-1] // 2
+            both = [xp.sum(flat[..., :middle], axis=-1), xp.sum(flat[..., flat.shape[-1] - middle :], axis=-1)]
+            return xp.reshape(xp.stack(both, axis=-1), (*values.shape[:-1], 2))
         if self.kind == "vector":
             flat = xp.sum(flat, axis=-1)
             return xp.reshape(flat, values.shape[:-1])
         return xp.reshape(flat, values.shape)
+
+    def _coarser(self, vectors: Any) -> Any:
+        """Vectors ``(batch, bins)`` with neighbouring bins added up."""
+        if self.range_levels is None:
+            return vectors
+        batch, bins = vectors.shape
+        split = array_namespace(vectors).reshape(vectors, (batch, self.range_levels, bins // self.range_levels))
+        return array_namespace(vectors).sum(split, axis=-1)
 
     def _laid_out(self, parts: list[Any]) -> Any:
         """Frames of all views in one tensor ``(batch, channels, rows, columns)``."""
@@ -190,6 +208,8 @@ def arrangement_of(
     coordinates: str = "polar",
     noise: str | NoiseModel | Sequence[str | NoiseModel] = "none",
     cartesian_rows: int = 512,
+    range_levels: int | None = None,
+    halves: bool = False,
 ) -> Arrangement:
     """The arrangement that these words say, for the frames of a recipe; of several noise levels each sample draws one.
 
@@ -218,6 +238,7 @@ def arrangement_of(
         raise MitsonarError("the data set holds vectors only: read kind='vector', or make one with store: images or both")
     if kind == "vector" and (coordinates != "polar" or layout == "stack"):
         raise MitsonarError("vectors have no cartesian form and stand side by side or in channels: got " + layout)
+    _check_vectors(recipe, kind, range_levels, halves)
     beams = {name: len(known[name].bearing_rad) for name in chosen}
     if kind == "image" and len(set(beams.values())) > 1 and layout != "side":
         raise MitsonarError(f"views of different widths stand side by side only: {beams}")
@@ -237,4 +258,22 @@ def arrangement_of(
         beams,
         maps,
         models if len(models) > 1 else (),
+        range_levels,
+        halves,
     )
+
+
+def _check_vectors(recipe: Recipe, kind: str, range_levels: int | None, halves: bool) -> None:
+    """Words that are for vectors only.
+
+    Raises:
+        MitsonarError: they do not fit the others.
+    """
+    if (range_levels is not None or halves) and kind != "vector":
+        raise MitsonarError("range_levels and halves are for vectors: read kind='vector', or leave them out")
+    if halves and "image" not in recipe.kinds:
+        raise MitsonarError("halves are cut from images: this data set holds vectors only; make one with store: images")
+    bins = recipe.instrument.range_bins
+    if range_levels is not None and not (1 <= range_levels <= bins and bins % range_levels == 0):
+        fit = [str(count) for count in range(1, bins + 1) if bins % count == 0]
+        raise MitsonarError(f"range_levels must divide the {bins} of the data set ({', '.join(fit)}): got {range_levels}")

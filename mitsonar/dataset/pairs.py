@@ -58,6 +58,8 @@ class Samples(Batches):
         labels: str = "raw",
         seed: int = 0,
         ground: bool = False,
+        range_levels: int | None = None,
+        halves: bool = False,
     ) -> None:
         self.recipe = recipe
         self.frames = recipe.frames if frames is None else frames
@@ -71,6 +73,8 @@ class Samples(Batches):
             coordinates=coordinates,
             noise=noise,
             cartesian_rows=cartesian_rows,
+            range_levels=range_levels,
+            halves=halves,
         )
         self.labels = Labels.of(labels, recipe, self.frames)
         self.seed, self.epoch, self.ground = seed, 0, ground
@@ -116,8 +120,8 @@ class Samples(Batches):
 
     @property
     def stored_kind(self) -> str:
-        """What samples are made of: images also where vectors are wanted and only images are there."""
-        return self.arrange.kind if self.arrange.kind in self.recipe.kinds else "image"
+        """What samples are made of: images also where vectors are wanted and only images are there, or halves of them."""
+        return self.arrange.kind if self.arrange.kind in self.recipe.kinds and not self.arrange.halves else "image"
 
     def at_noise(self, level: str) -> Arrangement:
         """The arrangement with one level of noise."""
@@ -136,6 +140,8 @@ class Samples(Batches):
                 "coordinates": arrange.coordinates,
                 "cartesian_rows": rows.pop() if rows else 512,
                 "ground": self.ground,
+                "range_levels": arrange.range_levels,
+                "halves": arrange.halves,
             },
             "sonar": {view.name: view.sonar.model_dump(mode="json") for view in recipe.views if view.name in arrange.views},
             "stands": {
@@ -166,6 +172,8 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         layout: ``side``, ``stack`` or ``channels``; see :class:`~mitsonar.dataset.arrangement.Arrangement`.
         coordinates: ``polar``, ``cartesian`` or ``both`` (then the input is a pair).
         cartesian_rows: pixels of a fan in the forward direction.
+        range_levels: of vectors, neighbouring ones of the stored added up to so many (with their noise); default: as stored.
+        halves: vectors of both halves of each image in azimuth (fig. 4.18), port first.
         noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model; of a list each sample draws one.
         labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` goes back.
         seed: of noise and order; the split has its own (``Split.seed``), so that another seed never mixes its parts.

@@ -63,9 +63,13 @@ class Part:
         """
         dealt = split_for(split, store.recipe)
         scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
-        mine = deal(world_of(store.recipe, store.scenes)[scene], sequence, dealt, part)
         first = np.arange(max(0, len(sequence) - frames + 1))
-        first = first[mine[first] & (sequence[first] == sequence[first + frames - 1])]
+        first = first[sequence[first] == sequence[first + frames - 1]]
+        if dealt.by == "sample":  # neighbours share frames, and a sequence has one motion: what is validated has been seen
+            number = np.arange(len(first), dtype=np.int32)
+            first = first[deal(number.astype(np.int64), number, dealt, part)]
+        else:
+            first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, dealt, part)[first]]
         if not len(first):
             raise MitsonarError(
                 f"{store.place.url} has no sample of {frames} frames in part {part!r}: its sequences have "

@@ -127,7 +127,9 @@ class Flight(_Part):
 class Split(_Part):
     """Which frames are for training, validation and test, unless a reader asks for others."""
 
-    by: Literal["sequence", "scene"] = Field("sequence", description="what is dealt out: sequences, or whole scenes")
+    by: Literal["sequence", "scene", "sample"] = Field(
+        "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks: to show it only"
+    )
     train: float = Field(0.95, ge=0, le=1)
     validation: float = Field(0.05, ge=0, le=1)
     test: float = Field(0.0, ge=0, le=1)

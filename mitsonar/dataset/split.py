@@ -1,4 +1,4 @@
-"""Which frames are for training, validation and test: sequences, or whole worlds, dealt out at random."""
+"""Which frames are for training, validation and test: sequences, whole worlds, or samples, dealt out at random."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -130,7 +130,7 @@ class Network:
         relief_m: float | None = None,
     ) -> None:
         words = checkpoint.arrangement
-        if words["frames"] != 2 or len(words["views"]) != 1 or words["kind"] != "image":
+        if words["frames"] != 2 or len(words["views"]) != 1:
             raise MitsonarError(
                 f"an estimator has two frames of one view: this {checkpoint.network} is given {words['frames']} frames of "
                 f"{', '.join(words['views'])} as {words['kind']}s; use `mitsonar evaluate`, or another checkpoint"
@@ -216,7 +216,8 @@ class Network:
             if words["coordinates"] != "polar":
                 maps[view] = cartesian_map(frames.range_m, frames.bearing_rad, words["cartesian_rows"])
             beams = {view: len(frames.bearing_rad)}
-            made = Arrangement((view,), "image", words["layout"], words["coordinates"], NoiseModel(), beams, maps)
+            made = Arrangement((view,), words["kind"], words["layout"], words["coordinates"], NoiseModel(), beams, maps)
+            made = replace(made, range_levels=words.get("range_levels"), halves=words.get("halves", False))
             self._last = key, made
         return self._last[1]
 

@@ -22,6 +22,7 @@ __all__ = [
     "Size",
     "Table",
     "cells_after",
+    "column_convolutions",
     "convolution",
     "convolutions",
     "fully_connected",
@@ -159,6 +160,28 @@ def convolutions(table: Table, channels: int, width: float, *, bare_end: bool = 
         kind = SameConv2d if bare else convolution
         layers[f"conv{place}"] = kind(channels, scaled(full, width), kernel, stride)
         channels = scaled(full, width)
+    return layers
+
+
+def column_convolutions(
+    kernels: Sequence[int], table: Sequence[int], across: int, width: float, channels: int = 1
+) -> list[nn.Module]:
+    """Convolutions of stride 2 along the rows and 1 across columns, which stay as many as they are; each with normalisation
+    and ReLU but for the last, which has a bias.
+
+    Args:
+        kernels: rows of each.
+        table: channels of each.
+        across: columns of all.
+        width: factor on the table's channels.
+        channels: of the input.
+    """
+    layers: list[nn.Module] = []
+    for place, (kernel, full) in enumerate(zip(kernels, table, strict=True), start=1):
+        outputs, bare = scaled(full, width), place == len(kernels)
+        layers.append(SameConv2d(channels, outputs, (kernel, across), (2, 1), bias=bare))
+        layers += [] if bare else [nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
+        channels = outputs
     return layers
 
 

@@ -48,6 +48,9 @@ WORDS = {
 }
 """The words of :class:`~mitsonar.dataset.pairs.SonarPairs` that say what a network is given, with their types."""
 
+LATER: dict[str, Any] = {"range_levels": (int, type(None)), "halves": bool}
+"""Words that files of earlier versions lack: then they are what SonarPairs has without them."""
+
 LARGEST = 8 * 2**30
 """Bytes of a checkpoint once unpacked."""
 
@@ -339,7 +342,10 @@ def _faults(table: dict[Any, Any]) -> list[str]:
             found.append(f"weights {name} hold nan or inf")
     words = table["arrangement"]
     found += [f"arrangement {word} is not said" for word, kind in WORDS.items() if not isinstance(words.get(word), kind)]
-    found += [f"arrangement {word} is unknown ({nearest_names(word, WORDS)})" for word in words if word not in WORDS]
+    known = {**WORDS, **LATER}
+    found += [f"arrangement {word} is unknown ({nearest_names(word, known)})" for word in words if word not in known]
+    later = [word for word in LATER if word in words]
+    found += [f"arrangement {word} is not said" for word in later if not isinstance(words[word], LATER[word])]
     if not found and not (words["views"] and all(isinstance(view, str) for view in words["views"])):
         found.append("arrangement views are not names")
     hears = words["kind"] == "response" if not found else False

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mitsonar.errors import MitsonarError
-from mitsonar.networks.blocks import Network, SameAverage, SameConv2d, Size, glorot, scaled
+from mitsonar.networks.blocks import Network, SameAverage, Size, column_convolutions, glorot, scaled
 
 __all__ = ["CHANNELS", "KERNELS", "LAYERS", "ImpulsePoseNet"]
 
@@ -85,14 +85,7 @@ class ImpulsePoseNet(Network):
 
 
 def _pose_net(layers: int, width: float, dropout: float) -> nn.Sequential:
-    """Convolutions of Table 5.1, the mean, and dropout."""
-    parts: list[nn.Module] = []
-    inputs = 1
-    for place in range(layers):
-        outputs, kernel = scaled(CHANNELS[place], width), (KERNELS[place], ACROSS)
-        bare = place == layers - 1
-        parts.append(SameConv2d(inputs, outputs, kernel, (2, 1), bias=bare))
-        parts += [] if bare else [nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
-        parts += [nn.Dropout(dropout)] if place == 0 else []
-        inputs = outputs
+    """Convolutions of Table 5.1, the mean, and dropout, also after the first ReLU."""
+    parts = column_convolutions(KERNELS[:layers], CHANNELS[:layers], ACROSS, width)
+    parts.insert(3, nn.Dropout(dropout))
     return nn.Sequential(*parts, SameAverage(), nn.Dropout(dropout))

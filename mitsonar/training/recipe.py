@@ -45,6 +45,8 @@ class Input(_Part):
     layout: Literal["side", "stack", "channels"] = Field("side", description="frames side by side, stacked, or channels")
     coordinates: Literal["polar", "cartesian", "both"] = Field("polar", description="as stored, fans in metres, or both")
     cartesian_rows: int = Field(512, ge=2, le=8192, description="pixels of a fan in the forward direction")
+    range_levels: int | None = Field(None, ge=1, description="of vectors, stored ones added up to so many; null: as stored")
+    halves: bool = Field(False, description="vectors of both halves of images (fig. 4.18)")
     ground: bool = Field(False, description="with the geometry of the ground, for networks that know it")
     leak: Literal["none", "one_ping", "strangers"] = Field(
         "none", description="of impulse responses: no motion is shown, what is still learnt is a leak"
@@ -53,7 +55,7 @@ class Input(_Part):
     @model_validator(mode="after")
     def _of_one_kind(self) -> Self:
         plain = Input.model_construct(kind=self.kind, frames=self.frames)
-        images = ("views", "layout", "coordinates", "cartesian_rows", "ground")
+        images = ("views", "layout", "coordinates", "cartesian_rows", "range_levels", "halves", "ground")
         other = [name for name in (images if self.kind == "response" else ("leak",)) if _differ(self, plain, name)]
         if other:
             raise ValueError(f"input.{other[0]} is not for kind {self.kind}: leave it out")
@@ -97,12 +99,26 @@ class Optimiser(_Part):
 
     kind: Literal["adam", "adamw"] = "adam"
     rate: float = Field(1e-4, gt=0, le=10, description="learning rate at the start")
-    schedule: Literal["halve", "cosine", "constant"] = Field("halve", description="of the rate")
+    schedule: Literal["halve", "cosine", "constant", "steps"] = Field("halve", description="of the rate")
+    steps: list[tuple[float, float]] = Field(
+        default_factory=list, description="of schedule steps: [epoch, rate from then on]"
+    )
     halve_every: float = Field(12.0, gt=0, description="epochs after which the rate falls, again and again")
     fall_to: float = Field(0.5, gt=0, le=1, description="part of the rate that is left then, with schedule halve")
     warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the beginning")
     weight_decay: float = Field(0.0, ge=0, le=1)
     clip: float | None = Field(None, gt=0, description="largest norm of the gradient; null: any")
+
+    @model_validator(mode="after")
+    def _steps_follow(self) -> Self:
+        epochs, rates = [epoch for epoch, _ in self.steps], [rate for _, rate in self.steps]
+        follow = epochs == sorted(set(epochs)) and all(0 < rate <= 10 for rate in rates)
+        if (self.schedule == "steps") != bool(self.steps) or not follow:
+            raise ValueError(
+                "optimiser steps are [epoch, rate] of schedule steps, epochs rising, rates above 0 to 10: got "
+                f"{self.steps} with schedule {self.schedule}"
+            )
+        return self
 
     def rate_at(self, step: int, epoch_steps: int, steps: int) -> float:
         """The learning rate of a step, a function of the step alone.
@@ -116,6 +132,9 @@ class Optimiser(_Part):
         match self.schedule:
             case "halve":
                 return self.rate * rise * self.fall_to ** math.floor(step / (self.halve_every * epoch_steps))
+            case "steps":
+                begun = [rate for epoch, rate in self.steps if step >= epoch * epoch_steps]
+                return rise * (begun[-1] if begun else self.rate)
             case "cosine":
                 done = max(0, step - self.warmup) / max(1, steps - self.warmup)
                 return self.rate * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))

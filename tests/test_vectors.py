@@ -1,0 +1,197 @@
+"""Vectors: portions of a view summed over their beams, range levels, halves of images, and the network of table 4.2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import Command, tiny_recipe
+
+from mitsonar.dataset.generate import make
+from mitsonar.dataset.plan import scenes_of
+from mitsonar.dataset.rendering import SceneRenderer
+from mitsonar.errors import MitsonarError
+
+torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
+pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")
+pytestmark = [
+    pytest.mark.learn,
+    pytest.mark.usefixtures("variant"),
+    pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
+]
+
+from mitsonar.dataset.pairs import SonarPairs  # noqa: E402
+from mitsonar.estimation.network import Network  # noqa: E402
+from mitsonar.networks.create import create_network  # noqa: E402
+from mitsonar.training.recipe import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
+from mitsonar.training.run import train  # noqa: E402
+
+DOWN: dict[str, Any] = {
+    "sonar__azimuth_fov_deg": 100.0,
+    "sonar__elevation_fov_deg": 100.0,
+    "sonar__range_min": 2.0,
+    "sonar__range_max": 4.0,
+    "mount__pitch_deg": 90.0,
+    "mount__heading_deg": -90.0,
+}
+
+
+@pytest.fixture(scope="module")
+def portions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four circular segments of a looking-down sonar, as vectors."""
+    url = tmp_path_factory.mktemp("made") / "portions.zarr"
+    recipe = tiny_recipe(**DOWN, segments=["c1", "c2", "c3", "c4"], store="vectors", scenes=[{"count": 2, "sequences": 8}])
+    make(recipe, str(url))
+    return url
+
+
+@pytest.fixture(scope="module")
+def ahead(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Images of a sonar that looks forward."""
+    url = tmp_path_factory.mktemp("made") / "ahead.zarr"
+    make(tiny_recipe(scenes=[{"count": 2, "sequences": 8}]), str(url))
+    return url
+
+
+# ---------------------------------------------------------------- what is read
+
+
+def test_range_levels_are_those_of_a_sonar_with_fewer_bins(portions: Path) -> None:
+    """Added up when read, against rendered with fewer bins: the same echoes."""
+    pairs = SonarPairs(portions, part="all", range_levels=10, layout="channels", views=["c2"])
+    few = tiny_recipe(**{**recipe_words(), "sonar__range_bins": 10})
+    renderer = SceneRenderer(few, scenes_of(few, few.sequences)[0])
+    here = pairs.frame_numbers(3)
+    (looks,) = renderer.looks(pairs.pose[here], here.start)
+    wanted = looks[[view.name for view in renderer.simulator.views].index("c2")].levels.sum(axis=2)
+    wanted = wanted * float(pairs.store.about["gain"])
+    found = pairs[3][0].numpy()
+    assert found.shape == (2, 10)
+    # pixels at the maximum are cut off in the fine image, others lie on the border of two bins
+    np.testing.assert_allclose(found.sum(axis=1), wanted.sum(axis=1), rtol=0.02)
+    assert np.median(np.abs(found - wanted)[wanted > 0] / wanted[wanted > 0]) < 1e-3
+
+
+def recipe_words() -> dict[str, Any]:
+    return {**DOWN, "segments": ["c1", "c2", "c3", "c4"], "store": "vectors", "scenes": [{"count": 2, "sequences": 8}]}
+
+
+def test_halves_are_sums_over_port_and_starboard_beams(ahead: Path) -> None:
+    """Port first, both pings of each (fig. 4.18); noise is drawn for each pixel before they are added up."""
+    images = SonarPairs(ahead, part="all", layout="channels", noise="high", seed=4)
+    halves = SonarPairs(ahead, part="all", kind="vector", halves=True, noise="high", seed=4)
+    image, columns = images[5][0].numpy(), halves[5][0].numpy()[0]
+    middle = image.shape[2] // 2
+    wanted = [part for side in (image[..., :middle], image[..., middle:]) for part in side.sum(axis=2)]
+    np.testing.assert_allclose(columns.T, wanted, rtol=1e-5)
+    coarse = SonarPairs(ahead, part="all", kind="vector", halves=True, range_levels=20, noise="high", seed=4)
+    np.testing.assert_allclose(coarse[5][0][0], columns.reshape(20, -1, 4).sum(axis=1), rtol=1e-5)
+    assert coarse.described()["arrangement"]["range_levels"] == 20
+    assert coarse.described()["arrangement"]["halves"] is True
+
+
+def test_words_that_do_not_fit_are_refused(portions: Path, ahead: Path) -> None:
+    with pytest.raises(MitsonarError, match=r"range_levels must divide the \d+ of the data set \(1, 2, .*: got 7"):
+        SonarPairs(portions, range_levels=7)
+    with pytest.raises(MitsonarError, match="for vectors: read kind='vector'"):
+        SonarPairs(ahead, halves=True)
+    with pytest.raises(MitsonarError, match="this data set holds vectors only"):
+        SonarPairs(portions, halves=True)
+
+
+# ---------------------------------------------------------------- the network
+
+ROWS = ((256, 32), (128, 64), (64, 128), (32, 256), (16, 512), (8, 512), (4, 512), (2, 1024), (1, 1024))
+"""Table 4.2: cells along the range and channels of each convolution; as many across as there are columns."""
+
+
+@pytest.mark.parametrize("columns", [2, 8])
+def test_the_layers_are_those_of_the_table(columns: int) -> None:
+    network = create_network("posenetvec", size=[512, columns]).eval()
+    shapes: list[tuple[str, tuple[int, ...]]] = []
+    for layer in network.layers:
+        layer.register_forward_hook(lambda one, _, out: shapes.append((type(one).__name__, tuple(out.shape[1:]))))
+    with torch.no_grad():
+        assert network(torch.rand(2, 1, 512, columns)).shape == (2, 3)
+    assert [shape for name, shape in shapes if name == "SameConv2d"] == [(c, rows, columns) for rows, c in ROWS]
+    names = [name for name, _ in shapes]
+    assert names.count("BatchNorm2d") == names.count("ReLU") == 8
+    assert names[-1] == "SameAverage"
+    kernels = [tuple(part.weight.shape[-2:]) for part in network.layers if type(part).__name__ == "SameConv2d"]
+    assert kernels == [(7, 2), (5, 2), *[(3, 2)] * 7]
+    assert sum(part.numel() for part in network.parameters()) == 13_649_283 + (columns - 2) * 3072  # docs/networks.md
+
+
+@pytest.mark.parametrize("size", [(16, 8), (1024, 4), (512, 1)])
+def test_it_reads_any_levels_and_columns(size: tuple[int, int]) -> None:
+    network = create_network("posenetvec", width=0.05, outputs=1, size=list(size)).eval()
+    assert network(torch.rand(3, 1, *size)).shape == (3, 1)
+    with pytest.raises(MitsonarError, match="this network reads"):
+        network(torch.rand(3, 1, size[0], size[1] + 1))
+
+
+def test_the_schedule_of_the_chapter() -> None:
+    """1e-4, half of it from epoch 12, 1e-5 from epoch 16 (4.4.1)."""
+    rate = Optimiser(rate=1e-4, schedule="steps", steps=[(12, 5e-5), (16, 1e-5)])
+    assert [rate.rate_at(10 * epoch, 10, 240) for epoch in (0, 11, 12, 15, 16, 23)] == [1e-4, 1e-4, 5e-5, 5e-5, 1e-5, 1e-5]
+    for words in ({"schedule": "steps"}, {"steps": [(2, 1e-4)]}, {"schedule": "steps", "steps": [(2, 1e-4), (1, 1e-5)]}):
+        with pytest.raises(ValueError, match="optimiser steps are"):
+            Optimiser(**words)
+
+
+SMALL: dict[str, Any] = {
+    "network": {"name": "posenetvec", "width": 1 / 16},
+    "steps": 6,
+    "validate": {"noise": ["none"], "every_steps": 3, "pairs": 4},
+    "batch": 4,
+}
+
+
+def test_a_network_of_vectors_learns_and_is_evaluated(portions: Path, tmp_path: Path, mitsonar: Command) -> None:
+    recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "range_levels": 20}})
+    kept = train(recipe, portions, tmp_path / "run")
+    assert kept.options["size"] == [20, 8]
+    done = mitsonar("evaluate", tmp_path / "run", portions, "--part", "all", "--noise", "none")
+    assert done.returncode == 0, done.stderr
+    assert "posenetvec" in done.stdout
+    with pytest.raises(MitsonarError, match="two frames of one view"):
+        Network(kept)
+
+
+def test_a_network_of_halves_estimates_from_any_frames(ahead: Path, tmp_path: Path) -> None:
+    """As the training arranged them: frames in, the same answer as from the data set."""
+    recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "halves": True}})
+    kept = train(recipe, ahead, tmp_path / "run")
+    assert kept.options["size"][1] == 4
+    frames = SonarPairs(ahead, part="all", layout="channels").sonar_frames(7)
+    samples = SonarPairs(ahead, part="all", **kept.arrangement, labels=kept.labels["kind"])
+    with torch.inference_mode():
+        wanted = samples.labels.decode(kept.build()(samples[7][0][None]))[0]
+    np.testing.assert_allclose(Network(kept).estimate(frames).motion, wanted, rtol=1e-4, atol=1e-7)
+
+
+def test_heights_of_vectors(portions: Path, tmp_path: Path) -> None:
+    recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "frames": 1, "views": ["c1"]}})
+    kept = train(recipe, portions, tmp_path / "run")
+    assert (kept.options["size"][1], kept.options["outputs"]) == (1, 1)
+
+
+def test_recipes_of_the_chapter() -> None:
+    assert load_training_recipe("posenet-quantised").input.range_levels is None
+
+
+def test_samples_dealt_out_one_by_one_are_on_both_sides(portions: Path) -> None:
+    """The thesis's shuffle: half of what is validated shares a sequence, and so its motion, with what was learnt."""
+    split = {"by": "sample", "train": 0.75, "validation": 0.25}
+    parts = [SonarPairs(portions, part=part, split=split) for part in ("train", "validation")]
+    firsts = [set(pairs.first.tolist()) for pairs in parts]
+    whole = SonarPairs(portions, part="all")
+    assert firsts[0] | firsts[1] == set(whole.first.tolist())
+    assert not firsts[0] & firsts[1]
+    assert len(firsts[1]) == round(len(whole) / 4)
+    learnt, validated = (set(pairs.sequence[pairs.first].tolist()) for pairs in parts)
+    assert len(validated & learnt) > 0.9 * len(validated)
+    apart = [SonarPairs(portions, part=part, split={**split, "by": "sequence"}) for part in ("train", "validation")]
+    assert not set(apart[0].sequence[apart[0].first].tolist()) & set(apart[1].sequence[apart[1].first].tolist())
