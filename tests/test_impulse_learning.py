@@ -224,5 +224,5 @@ def test_mistakes_in_recipes_are_answered(changes: dict[str, Any], sentence: str
 def test_what_does_not_go_together_is_answered(made: Path, tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="not rendered in training"):
         train(recipe_of(FIELDS), None, tmp_path / "run", render=True)
-    with pytest.raises(MitsonarError, match="of impulse responses: read it with ImpulsePairs"):
+    with pytest.raises(MitsonarError, match="of impulse responses, this needs one of images"):
         train(recipe_of({**FIELDS, "input": {}, "noise": "none", "network": "posenet"}), made, tmp_path / "run")
