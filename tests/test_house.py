@@ -65,6 +65,7 @@ STAGES = (
             "corrnet",
             "impulse_posenet",
             "posenetvec",
+            "profilenet",
             "create",
             "shipped",
             "checkpoint",

@@ -430,7 +430,7 @@ def test_known_names_are_told() -> None:
         MitsonarError, match=r"unknown network 'posnet': did you mean posenet.*Known: posenet, sfmnet, cnn1b"
     ):
         create_network("posnet")
-    assert set(NETWORKS) == {*THESIS, "corrnet", "impulse_posenet", "posenetvec"}
+    assert set(NETWORKS) == {*THESIS, "corrnet", "impulse_posenet", "posenetvec", "profilenet"}
 
 
 def test_only_what_a_network_takes_is_settled() -> None:

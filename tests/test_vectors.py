@@ -11,6 +11,7 @@ from helpers import Command, tiny_recipe
 
 from mitsonar.dataset.generate import make
 from mitsonar.dataset.plan import scenes_of
+from mitsonar.dataset.recipe import load_recipe
 from mitsonar.dataset.rendering import SceneRenderer
 from mitsonar.errors import MitsonarError
 
@@ -22,9 +23,9 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.dataset.pairs import SonarPairs  # noqa: E402
+from mitsonar.dataset.pairs import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.network import Network  # noqa: E402
-from mitsonar.networks.create import create_network  # noqa: E402
+from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.training.recipe import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
 
@@ -132,6 +133,81 @@ def test_it_reads_any_levels_and_columns(size: tuple[int, int]) -> None:
         network(torch.rand(3, 1, size[0], size[1] + 1))
 
 
+MIRRORS = [([3, 2, 1, 0], (-1, 1, -1)), ([1, 0, 3, 2], (1, -1, -1)), ([2, 3, 0, 1], (-1, -1, 1))]
+"""Quadrants from fore-starboard clockwise, seen in a mirror to the side, fore and aft, in both; and the motion there."""
+
+
+def test_what_a_profile_net_says_turns_with_the_world() -> None:
+    torch.manual_seed(3)
+    network = create_network("profilenet", size=[64, 8], windows=5).eval()
+    pair = torch.rand(2, 64, 4, 2)
+
+    def told(vectors: Any) -> Any:
+        with torch.no_grad():
+            return network(vectors.reshape(2, 1, 64, 8))
+
+    plain = told(pair)
+    assert plain.abs().min() > 1e-4
+    for order, signs in MIRRORS:
+        torch.testing.assert_close(told(pair[:, :, order]), plain * torch.tensor(signs), rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(told(pair.flip(-1)), -plain, rtol=1e-4, atol=1e-6)  # backwards in time
+    torch.testing.assert_close(told(pair[..., :1].repeat(1, 1, 1, 2)), torch.zeros(2, 3), rtol=0, atol=1e-6)
+
+
+def test_a_profile_net_learns_shifts_of_a_part_of_a_level() -> None:
+    """Profiles of white ground, moved by up to half a level: unseen ones are told to a sixth of always answering nothing."""
+    rng = np.random.default_rng(5)
+    fine, moved = 16, 8
+
+    def ground(count: int) -> tuple[Any, Any]:
+        line = rng.random((count, 4, 66 * fine))
+        shift = rng.integers(-moved, moved + 1, count)
+        signs = np.array([1, -1, -1, 1])  # fore portions come nearer, aft ones go
+        first = line[..., fine:-fine].reshape(count, 4, 64, fine).sum(axis=-1)
+        second = (
+            np.array(
+                [
+                    [np.roll(row, s * n)[fine:-fine] for row, s in zip(four, signs, strict=True)]
+                    for four, n in zip(line, shift, strict=True)
+                ]
+            )
+            .reshape(count, 4, 64, fine)
+            .sum(axis=-1)
+        )
+        vectors = np.stack([first, second], axis=-1).transpose(0, 2, 1, 3).reshape(count, 1, 64, 8)
+        return torch.from_numpy(vectors).float(), torch.from_numpy(np.outer(shift / moved, [0, 1, 0])).float()
+
+    torch.manual_seed(0)
+    network = create_network("profilenet", size=[64, 8], width=0.5, lags=2, windows=4)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=5e-3)
+    inputs, labels = ground(1200)
+    for _ in range(6):
+        for pick in torch.randperm(len(inputs)).split(50):
+            loss = (network(inputs[pick]) - labels[pick]).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+    unseen, truth = ground(200)
+    with torch.no_grad():
+        error = (network.eval()(unseen) - truth).square().mean(dim=0).sqrt()
+    assert error[1] < truth[:, 1].square().mean().sqrt() / 6
+    assert max(error[0], error[2]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"size": [64, 6]}, "one, two or four portions: got 6 columns"),
+        ({"outputs": 1}, "and 1 outputs"),
+        ({"taps": 4}, r"taps must be a whole number of at least 1 \(taps: odd\): got 4"),
+        ({"size": [8, 8]}, "windows must be at most the 8 levels"),
+    ],
+)
+def test_profile_nets_that_cannot_be_are_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(MitsonarError, match=said):
+        create_network("profilenet", **{"size": [64, 8], **options})
+
+
 def test_the_schedule_of_the_chapter() -> None:
     """1e-4, half of it from epoch 12, 1e-5 from epoch 16 (4.4.1)."""
     rate = Optimiser(rate=1e-4, schedule="steps", steps=[(12, 5e-5), (16, 1e-5)])
@@ -178,8 +254,52 @@ def test_heights_of_vectors(portions: Path, tmp_path: Path) -> None:
     assert (kept.options["size"][1], kept.options["outputs"]) == (1, 1)
 
 
-def test_recipes_of_the_chapter() -> None:
-    assert load_training_recipe("posenet-quantised").input.range_levels is None
+SIZES = {
+    "portion-whole-image": (512, 2000),
+    "portion-whole-vector": (512, 2),
+    "portion-side-image": (512, 2000),
+    "portion-side-vector": (512, 2),
+    "portion-quadrant-image": (512, 1000),
+    "portion-quadrant-vector": (512, 2),
+    "portion-quadrants-image": (512, 4000),
+    "portion-quadrants-vector": (512, 8),
+    "portion-circular-image": (512, 4000),
+    "portion-circular-vector": (512, 8),
+    "portion-circular-vector-high-noise": (512, 8),
+    "portion-circular-10m-vector": (512, 8),
+    "portion-circular-10m-vector-high-noise": (512, 8),
+    "height-rocky-image": (512, 1000),
+    "height-rocky-vector": (512, 1),
+    "height-hull-image": (512, 96),
+    "height-hull-image-high-noise": (512, 96),
+    "height-hull-vector": (512, 1),
+    "height-hull-vector-high-noise": (512, 1),
+    "profilenet-circular-10m": (1024, 8),
+    "profilenet-quadrants": (1024, 8),
+}
+"""Range levels and columns that the networks of chapter 4 read (tables 4.1, 4.2, 4.4)."""
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_recipes_of_the_chapter(name: str) -> None:
+    recipe = load_training_recipe(name)
+    samples = Samples(load_recipe(recipe.data, recipe.data_changes), **recipe.arrangement())
+    kind, frames = recipe.input.kind, recipe.input.frames
+    raw: dict[str, Any] = {"frames": torch.arange(frames)[None], "label": torch.zeros(1, 1 if frames == 1 else 3)}
+    for view in samples.recipe.views:
+        levels, beams = view.sonar.range_bins, len(view.bearing_rad)
+        raw[view.name] = torch.zeros(1, frames, levels, *([beams] if kind == "image" else []))
+        raw[f"nonzero_{view.name}"] = torch.zeros(1, frames, levels, dtype=torch.int32)
+    inputs, labels = samples.finished(raw)
+    assert inputs.shape == (1, 1, *SIZES[name])
+    network = create_network(recipe.network["name"], **options_for(recipe.network["name"], inputs, labels), width=1 / 16)
+    assert network.eval()(inputs).shape == labels.shape
+    assert recipe.noise == ("high" if "high-noise" in name else "none")
+    if not name.startswith("profilenet"):
+        rates = [recipe.optimiser.rate_at(epoch, 1, 24) for epoch in (0, 12, 16, 23)]
+        assert rates == [1e-4, 5e-5, 1e-5, 1e-5]
+        assert (recipe.epochs, recipe.batch, recipe.split) == (24, 4, "sequence")
+        assert recipe.about.startswith("Almanza-Medina 4.")
 
 
 def test_samples_dealt_out_one_by_one_are_on_both_sides(portions: Path) -> None:

@@ -16,6 +16,7 @@ from mitsonar.networks.impulse_posenet import ImpulsePoseNet
 from mitsonar.networks.posenet import PoseNet
 from mitsonar.networks.posenet_dual import PoseNetDual
 from mitsonar.networks.posenetvec import PoseNetVec
+from mitsonar.networks.profilenet import ProfileNet
 from mitsonar.networks.sfmnet import SfMNet
 
 __all__ = ["NETWORKS", "called", "create_network", "options_for", "options_of"]
@@ -30,6 +31,7 @@ NETWORKS: dict[str, Any] = {
     "corrnet": CorrNet,
     "impulse_posenet": ImpulsePoseNet,
     "posenetvec": PoseNetVec,
+    "profilenet": ProfileNet,
 }
 """Classes of networks; of each: ``needs``, ``any_sonar``, ``says_law``, as in :class:`~mitsonar.networks.blocks.Network`."""
 

@@ -1,0 +1,151 @@
+"""ProfileNet, ours for vectors: what moves between the range profiles of a few portions of the field of view.
+
+A vector is the range profile of a portion. Ground that comes nearer by a part of a range level hands so much of each
+level's echo to the one before it, so that products of both profiles at neighbouring lags tell the shift, which grows with
+the sine of incidence along the profile. The network takes such products of filtered profiles, averages them over windows of
+range, and a few layers weigh what all portions say.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mitsonar.errors import MitsonarError
+from mitsonar.networks.blocks import Network, Size
+
+__all__ = ["ProfileNet"]
+
+FAINT = 1e-2
+"""Variance of a level below which it does not count, in squares of a pixel's maximum."""
+
+SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] = {
+    # quadrants from fore-starboard clockwise: as they are, mirrored sideways, fore and aft, both
+    4: [
+        ((0, 1, 2, 3), (1, 1, 1)),
+        ((3, 2, 1, 0), (-1, 1, -1)),
+        ((1, 0, 3, 2), (1, -1, -1)),
+        ((2, 3, 0, 1), (-1, -1, 1)),
+    ],
+    # port and starboard half
+    2: [((0, 1), (1, 1, 1)), ((1, 0), (-1, 1, -1))],
+    1: [((0,), (1, 1, 1))],
+}
+"""By number of portions: their order in a mirrored world, and what becomes of sideways, forward, yaw."""
+
+
+class ProfileNet(Network):
+    """Products of filtered profiles at a few lags, averaged over windows of range, through a small perceptron.
+
+    The answer turns with the world by construction: it is the mean over mirrored portions and over both directions of time,
+    each with its motion turned back (along the heading between both pings, which differs from the last heading by half the
+    yaw: 0.1 mm at most). Portions are four (quadrants or circular segments, from fore-starboard clockwise), two halves (port
+    first), or one.
+
+    Args:
+        outputs: estimates: sideways, forward, yaw.
+        width: factor on filters and layers.
+        dropout: rate in training, before each layer.
+        size: range levels and columns, two of each portion.
+        filters: of the profiles.
+        taps: of a filter, odd.
+        lags: largest lag of the products, in levels.
+        windows: of range.
+
+    Raises:
+        MitsonarError: a value out of its range.
+    """
+
+    needs: ClassVar[dict[str, Any]] = {"kind": "vector", "frames": 2, "layout": "side"}
+    order: Tensor
+    turned: Tensor
+
+    def __init__(
+        self,
+        *,
+        outputs: int = 3,
+        width: float = 1.0,
+        dropout: float = 0.1,
+        size: Size = (1024, 8),
+        filters: int = 12,
+        taps: int = 7,
+        lags: int = 6,
+        windows: int = 16,
+    ) -> None:
+        super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
+        levels, columns = self.options["size"]
+        if columns % 2 or columns // 2 not in SYMMETRIES or outputs != 3:
+            raise MitsonarError(
+                "profilenet says sideways, forward and yaw of two vectors of each of one, two or four portions: got "
+                f"{columns} columns and {outputs} outputs; choose views, or posenetvec"
+            )
+        for name, value, least in (("filters", filters, 1), ("taps", taps, 1), ("lags", lags, 1), ("windows", windows, 1)):
+            if not isinstance(value, int) or value < least or (name == "taps" and value % 2 == 0):
+                raise MitsonarError(f"{name} must be a whole number of at least {least} (taps: odd): got {value!r}")
+        if windows > levels:
+            raise MitsonarError(f"windows must be at most the {levels} levels: got {windows}")
+        self.options |= {"filters": filters, "taps": taps, "lags": lags, "windows": windows}
+        self.portions, self.lags, self.windows = columns // 2, lags, windows
+        made, said, hidden = (max(1, round(n * width)) for n in (filters, 48, 128))
+        self.level = nn.BatchNorm1d(levels, eps=FAINT, affine=False)
+        self.filter = nn.Conv1d(1, made, taps, padding=taps // 2, bias=False)
+        self.shift = nn.Linear(made * (2 * lags + 1) * windows, said)
+        self.change = nn.Linear(made * windows, max(1, said // 3))
+        values = self.portions * (said + max(1, said // 3))
+        self.layers = nn.Sequential(
+            *(nn.Dropout(dropout), nn.Linear(values, hidden), nn.GELU()),
+            *(nn.Dropout(dropout), nn.Linear(hidden, hidden), nn.GELU()),
+            nn.Linear(hidden, outputs),
+        )
+        symmetries = SYMMETRIES[self.portions]
+        self.register_buffer("order", torch.tensor([order for order, _ in symmetries]), persistent=False)
+        self.register_buffer("turned", torch.tensor([signs for _, signs in symmetries]), persistent=False)
+
+    def forward(self, vectors: Tensor) -> Tensor:
+        """Labels ``(batch, 3)``, symmetric about no motion, of vectors ``(batch, 1, levels, 2 portions)``.
+
+        Raises:
+            MitsonarError: vectors of another size.
+        """
+        self.expect(vectors)
+        first, second = self._filtered(vectors)
+        power = self._windowed(first * first), self._windowed(second * second)
+        mean = (power[0] + power[1]) / 2 + FAINT
+        shared = self._products(first, second) / mean[..., None]
+        gained = (power[0] - power[1]) / mean
+        # backwards in time lags change their sign, and so does what was gained
+        both = [
+            torch.cat([self.shift(s.flatten(2)), self.change(g.flatten(2))], dim=-1)
+            for s, g in ((shared, gained), (shared.flip(-1), -gained))
+        ]
+        told = torch.stack(both, dim=1)[:, :, self.order].flatten(3)  # batch, time, mirror, portions and values
+        answers = self.layers(told) * self.turned
+        return (answers[:, 0] - answers[:, 1]).mean(dim=1) / 2  # type: ignore[no-any-return]
+
+    def _filtered(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations."""
+        batch, _, levels, columns = vectors.shape
+        profiles = vectors[:, 0].transpose(1, 2).reshape(batch * columns, levels)
+        filtered = self.filter(self.level(profiles)[:, None])
+        filtered = functional.pad(filtered, (0, -levels % self.windows))
+        parts = filtered.reshape(batch, self.portions, 2, *filtered.shape[1:])
+        return parts[:, :, 0], parts[:, :, 1]
+
+    def _products(self, first: Tensor, second: Tensor) -> Tensor:
+        """Products at all lags, averaged over windows ``(batch, portions, filters, windows, lags)``.
+
+        Of two lags that differ in sign the farther of both levels is once the second's, once the first's: backwards in time
+        they change places.
+        """
+        levels = first.shape[-1]
+        early, late = (functional.pad(one, (0, self.lags)) for one in (first, second))
+        products = [early[..., lag : lag + levels] * second for lag in range(self.lags, 0, -1)]
+        products += [first * late[..., lag : lag + levels] for lag in range(self.lags + 1)]
+        return torch.stack([self._windowed(product) for product in products], dim=-1)
+
+    def _windowed(self, values: Tensor) -> Tensor:
+        """Means over windows ``(..., windows)``."""
+        return values.reshape(*values.shape[:-1], self.windows, -1).mean(dim=-1)
