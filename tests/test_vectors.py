@@ -102,6 +102,12 @@ def test_words_that_do_not_fit_are_refused(portions: Path, ahead: Path) -> None:
         SonarPairs(portions, halves=True)
 
 
+def test_vectors_alone_lie_in_few_files(portions: Path) -> None:
+    """A shard is as large as what it holds, not as the images that were summed: else writing costs more than rendering."""
+    about = SonarPairs(portions, part="all").store.about
+    assert about["shard_frames"] == 8 * 5  # a scene
+
+
 # ---------------------------------------------------------------- the network
 
 ROWS = ((256, 32), (128, 64), (64, 128), (32, 256), (16, 512), (8, 512), (4, 512), (2, 1024), (1, 1024))

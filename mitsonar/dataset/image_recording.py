@@ -89,7 +89,9 @@ class ImageRecording:
 
     @property
     def ping_bytes(self) -> int:
-        """Pixels and labels of a frame."""
+        """Pixels and labels of a frame; of vectors alone their sums and counts."""
+        if "image" not in self.recipe.kinds:
+            return sum(view.sonar.range_bins * 8 for view in self.recipe.views)
         size = 1 if self.recipe.pixel == "uint8" else 4
         each = sum(len(view.bearing_rad) * view.sonar.range_bins * size for view in self.recipe.views)
         return each + len(self.recipe.labels) * 4 * each // size
