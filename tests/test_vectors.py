@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,16 @@ def test_vectors_alone_lie_in_few_files(portions: Path) -> None:
     """A shard is as large as what it holds, not as the images that were summed: else writing costs more than rendering."""
     about = SonarPairs(portions, part="all").store.about
     assert about["shard_frames"] == 8 * 5  # a scene
+
+
+def test_vectors_are_read_once(portions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And come out of memory as they lie on disk; other processes read for themselves."""
+    pairs = SonarPairs(portions, part="all", views=["c3"])
+    once = pairs[4][0]
+    assert set(pairs._whole) == {"vector_c3", "nonzero_c3"}
+    assert pickle.loads(pickle.dumps(pairs))._whole == {}
+    monkeypatch.setattr("mitsonar.dataset.pairs.KEPT_BYTES", 0)
+    torch.testing.assert_close(SonarPairs(portions, part="all", views=["c3"])[4][0], once, rtol=0, atol=0)
 
 
 # ---------------------------------------------------------------- the network

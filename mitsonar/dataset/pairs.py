@@ -30,6 +30,9 @@ __all__ = ["Samples", "SonarPairs"]
 GROUND = "ground/"
 """Before the names of the ground's geometry in a raw sample."""
 
+KEPT_BYTES = 2**28
+"""Of an array of vectors that is kept in memory once it has been read."""
+
 
 class Samples(Batches):
     """What stored and rendered samples share: how raw frames become inputs and labels.
@@ -201,6 +204,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
         self._grounds: dict[int, dict[str, Any]] = {}
+        self._whole: dict[str, NDArray[Any]] = {}
 
     def __len__(self) -> int:
         return len(self.first)
@@ -227,15 +231,28 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         }
         for name, (kind, view) in array_names(self.recipe).items():
             if view in self.arrange.views and kind == self.stored_kind:
-                sample[view] = self.store.read(name, here)
+                sample[view] = self._read(name, here)
             elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
-                sample[f"nonzero_{view}"] = self.store.read(name, here).astype(np.int32)
+                sample[f"nonzero_{view}"] = self._read(name, here).astype(np.int32)
         if self.ground:
             if index not in self._grounds:  # an epoch later it is the same
                 image = sample[self.arrange.views[0]]
                 self._grounds[index] = self.ground_below(image, self.pose[here], self.store.read("height_m", here))
             sample |= self._grounds[index]
         return sample
+
+    def _read(self, name: str, here: slice) -> NDArray[Any]:
+        """Frames of an array; vectors are small and kept in memory: reading them one by one costs more than learning."""
+        levels = int(np.prod(self.store.recording.stored[name].shape))
+        if self.stored_kind != "vector" or 4 * levels * len(self.sequence) > KEPT_BYTES:
+            return self.store.read(name, here)
+        if name not in self._whole:
+            self._whole[name] = self.store.read(name)
+        return self._whole[name][here]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For other processes, which read for themselves."""
+        return {**vars(self), "_whole": {}}
 
     def sonar_frames(self, index: int, image: NDArray[Any] | None = None) -> SonarFrames:
         """A sample as frames, with noise, for estimators: image, poses, heights (one view).
