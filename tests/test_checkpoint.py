@@ -70,6 +70,8 @@ def test_it_says_what_it_was_trained_on(checkpoint: Checkpoint) -> None:
         "coordinates": "polar",
         "cartesian_rows": 512,
         "ground": False,
+        "range_levels": None,
+        "halves": False,
     }
     assert checkpoint.stands == {"height_m": [2.5, 2.5], "pitch_deg": 35.0, "roll_deg": 0.0}
     assert (checkpoint.model, checkpoint.noise, checkpoint.data) == ("thesis", "low", "tiny")
@@ -229,3 +231,13 @@ def test_weights_and_options_must_fit_the_network(checkpoint: Checkpoint) -> Non
     less = {name: values for name, values in table["weights"].items() if name != "regression.bias"}
     assert "regression.bias" in refusal(packed({**table, "weights": less}))
     assert "no posenet has these options" in refusal(packed({**table, "options": {**table["options"], "width": 1e30}}))
+
+
+def test_files_of_before_vectors_had_words_are_read(checkpoint: Checkpoint) -> None:
+    """Words that came later may be missing; one that is there must be what it should."""
+    words = {key: value for key, value in checkpoint.arrangement.items() if key not in ("range_levels", "halves")}
+    older = Checkpoint.from_bytes(dataclasses.replace(checkpoint, arrangement=words).to_bytes())
+    assert older.arrangement == words
+    wrong = dataclasses.replace(checkpoint, arrangement={**words, "halves": 3})
+    with pytest.raises(MitsonarError, match="arrangement halves is not said"):
+        Checkpoint.from_bytes(wrong.to_bytes())
