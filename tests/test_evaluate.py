@@ -209,7 +209,7 @@ def test_another_sonar_is_refused_unless_forced(checkpoint: Checkpoint, pairs: S
 
 def test_checkpoints_that_two_frames_cannot_serve(checkpoint: Checkpoint) -> None:
     words = checkpoint.arrangement
-    for change in ({"frames": 3}, {"views": ["left", "right"]}, {"kind": "vector"}):
+    for change in ({"frames": 3}, {"views": ["left", "right"]}, {"kind": "vector", "views": ["q1", "q2"]}):
         with pytest.raises(MitsonarError, match=r"two frames of one view.*evaluate"):
             Network(replace(checkpoint, arrangement={**words, **change}))
     with pytest.raises(MitsonarError, match=r"given no geometry: height 2\.5 m, pitch 35 deg are fixed by training"):
