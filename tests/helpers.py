@@ -239,6 +239,16 @@ def tiny_recipe(**changes: Any) -> Any:
     return recipe_from(fields)
 
 
+DOWN: dict[str, Any] = {
+    "sonar__azimuth_fov_deg": 100.0,
+    "sonar__elevation_fov_deg": 100.0,
+    "sonar__range_min": 2.0,
+    "sonar__range_max": 4.0,
+    "mount__pitch_deg": 90.0,
+}
+"""Changes of the tiny recipe: a sonar that looks straight down."""
+
+
 HEARD: dict[str, Any] = {
     "name": "heard",
     "world": {"family": "flat-objects", "size_m": 16.0, "seabed_cells": 96, "rectangles": 20, "ellipses": 20},

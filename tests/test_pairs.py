@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import run_python, tiny_recipe
+from helpers import DOWN, run_python, tiny_recipe
 
 from mitsonar.dataset.generate import make
 from mitsonar.dataset.recipe import Split, load_recipe
@@ -28,14 +28,6 @@ from mitsonar.dataset.pairs import SonarPairs  # noqa: E402
 from mitsonar.dataset.rendered import RenderedPairs  # noqa: E402
 
 HIGH = NOISE_MODELS["high"]
-
-DOWN: dict[str, Any] = {
-    "sonar__azimuth_fov_deg": 100.0,
-    "sonar__elevation_fov_deg": 100.0,
-    "sonar__range_min": 2.0,
-    "sonar__range_max": 4.0,
-    "mount__pitch_deg": 90.0,
-}
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Command, tiny_recipe
+from helpers import DOWN, Command, tiny_recipe
 
 from mitsonar.dataset.generate import make
 from mitsonar.dataset.plan import scenes_of
@@ -30,13 +30,12 @@ from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.training.recipe import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
 
-DOWN: dict[str, Any] = {
-    "sonar__azimuth_fov_deg": 100.0,
-    "sonar__elevation_fov_deg": 100.0,
-    "sonar__range_min": 2.0,
-    "sonar__range_max": 4.0,
-    "mount__pitch_deg": 90.0,
+PORTIONS: dict[str, Any] = {
+    **DOWN,
     "mount__heading_deg": -90.0,
+    "segments": ["c1", "c2", "c3", "c4"],
+    "store": "vectors",
+    "scenes": [{"count": 2, "sequences": 8}],
 }
 
 
@@ -44,8 +43,7 @@ DOWN: dict[str, Any] = {
 def portions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four circular segments of a looking-down sonar, as vectors."""
     url = tmp_path_factory.mktemp("made") / "portions.zarr"
-    recipe = tiny_recipe(**DOWN, segments=["c1", "c2", "c3", "c4"], store="vectors", scenes=[{"count": 2, "sequences": 8}])
-    make(recipe, str(url))
+    make(tiny_recipe(**PORTIONS), str(url))
     return url
 
 
@@ -63,7 +61,7 @@ def ahead(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_range_levels_are_those_of_a_sonar_with_fewer_bins(portions: Path) -> None:
     """Added up when read, against rendered with fewer bins: the same echoes."""
     pairs = SonarPairs(portions, part="all", range_levels=10, layout="channels", views=["c2"])
-    few = tiny_recipe(**{**recipe_words(), "sonar__range_bins": 10})
+    few = tiny_recipe(**PORTIONS, sonar__range_bins=10)
     renderer = SceneRenderer(few, scenes_of(few, few.sequences)[0])
     here = pairs.frame_numbers(3)
     (looks,) = renderer.looks(pairs.pose[here], here.start)
@@ -74,10 +72,6 @@ def test_range_levels_are_those_of_a_sonar_with_fewer_bins(portions: Path) -> No
     # pixels at the maximum are cut off in the fine image, others lie on the border of two bins
     np.testing.assert_allclose(found.sum(axis=1), wanted.sum(axis=1), rtol=0.02)
     assert np.median(np.abs(found - wanted)[wanted > 0] / wanted[wanted > 0]) < 1e-3
-
-
-def recipe_words() -> dict[str, Any]:
-    return {**DOWN, "segments": ["c1", "c2", "c3", "c4"], "store": "vectors", "scenes": [{"count": 2, "sequences": 8}]}
 
 
 def test_halves_are_sums_over_port_and_starboard_beams(ahead: Path) -> None:

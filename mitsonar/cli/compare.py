@@ -59,7 +59,9 @@ def compare(
         bool, typer.Option("--jitter", help="A row with rays that move: is it the sampling's pattern?")
     ] = False,
     prior: Annotated[bool, typer.Option("--prior", help="Rows that know how large motions are, as networks do.")] = False,
-    limit: Annotated[int, typer.Option(min=0, help="Pairs over which the physical limit is computed; 0: none.")] = 10,
+    limit: Annotated[
+        int, typer.Option(min=0, help="Pairs over which the physical limit is computed; 0: none (of images only).")
+    ] = 10,
     reference: Annotated[str | None, typer.Option(help="Method that others are compared with (default: the last).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise, choice of pairs and bootstrap.")] = 0,
     out: Annotated[
@@ -74,6 +76,7 @@ def compare(
         raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'") from None
     from mitsonar.dataset.impulse_samples import ImpulseSamples
     from mitsonar.dataset.recordings import recording_of
+    from mitsonar.dataset.store import DataStore
     from mitsonar.estimation.comparison import VARIATIONS, answers_of, chosen, limits_of, rows_of, with_prior
     from mitsonar.estimation.estimators import estimator_from
     from mitsonar.estimation.impulse_estimators import impulse_estimator_from
@@ -82,7 +85,8 @@ def compare(
     from mitsonar.motion import motions
     from mitsonar.noise import load_noise
 
-    heard = _holds_responses(data)
+    recipe = DataStore.open(data).recipe
+    heard = recipe.channel is not None
     made: Callable[[str], Any] = impulse_estimator_from if heard else estimator_from
     asked_for = estimators or (IMPULSE_METHODS if heard else METHODS)
     methods = {text: made(text) for text in dict.fromkeys(asked_for.split(",")) if text}
@@ -96,14 +100,16 @@ def compare(
     changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if perturb else []
     asked = ["as told", *changed, *(["jitter"] if jitter else [])]
     reader = ImpulseSamples if heard else SonarPairs
-    samples: dict[str, Any] = {name: _pairs(reader, data, part, name, seed) for name in levels}
+    # pairs of images, or as many responses as the recipe has, one sample a sequence
+    asked_of: dict[str, Any] = {"part": part or recipe.split.unseen, "frames": recipe.frames if heard else 2, "seed": seed}
+    samples: dict[str, Any] = {name: reader(data, noise=name, one_a_sequence=True, **asked_of) for name in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
         raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
     numbers = chosen(len(first), pairs, seed)
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
-    poses = first.chosen.pose if heard else first.pose
-    truth = np.array([motions(poses[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
+    pose = first.chosen.pose
+    truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
     resamples = cluster_resamples(first.scene[first.first[numbers]], seed=seed)
     if jitter and first.recipe.instrument.jittered:
         raise MitsonarError("the rays of this data set move already: --jitter is for the thesis's model")
@@ -122,7 +128,7 @@ def compare(
     if networks:
         settings["networks"] = networks
     store = _Kept(out, settings)
-    model_name = recording_of(first.recipe).sonar.model
+    model_name = recording_of(recipe).sonar.model
     report: dict[str, Any] = {"data": data, "model": model_name, **settings, "tables": []}
     with progress_bar("comparing", len(levels) * len(asked) * len(numbers), "pairs") as progress:
         answers = {
@@ -180,27 +186,10 @@ def compare(
         say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}")
 
 
-def _holds_responses(data: str) -> bool:
-    """Whether a data set is of impulse responses."""
-    from mitsonar.dataset.store import DataStore
-
-    return DataStore.open(data).recipe.channel is not None
-
-
-def _pairs(reader: type[Any], data: str, part: str | None, noise: str, seed: int) -> Any:
-    """One sample a sequence of the part that is asked for: pairs of images, or as many responses as the recipe has."""
-    from mitsonar.dataset.store import DataStore
-
-    recipe = DataStore.open(data).recipe
-    part = part or recipe.split.unseen
-    frames = 2 if recipe.channel is None else recipe.frames
-    return reader(data, part=part, frames=frames, noise=noise, seed=seed, one_a_sequence=True)
-
-
 def _digest(pairs: Any) -> str:
     """Of what is compared on: the motions and the recipe."""
-    table = pairs.targets() if hasattr(pairs, "targets") else np.concatenate([pairs.motion.ravel(), pairs.pose.ravel()])
-    content = table.tobytes() + json.dumps(pairs.recipe.model_dump(), default=str).encode()
+    content = pairs.chosen.motion.tobytes() + pairs.chosen.pose.tobytes()
+    content += json.dumps(pairs.recipe.model_dump(), default=str).encode()
     return hashlib.sha256(content).hexdigest()
 
 

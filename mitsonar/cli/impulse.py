@@ -94,9 +94,9 @@ def _instrument(
         key, equals, value = pair.partition("=")
         if not equals:
             raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
-        fields[key] = _listening(sonar, value) if key == "receivers" else value
         if key == "transmitter":
             raise MitsonarError(f"fields of view are set in the scene, or in Python, not by --set: got {pair!r}")
+        fields[key] = _listening(sonar, value) if key == "receivers" else value
     fields |= {} if model is None else {"model": model}
     fields |= {} if seed is None else {"seed": seed}
     return sonar.replace(**fields), standing

@@ -160,7 +160,8 @@ class Arrangement:
         return tuple(map(joined, zip(*parts, strict=True))) if isinstance(parts[0], tuple) else joined(parts)
 
     def noisy(self, frames: dict[str, Any], view: str, numbers: Any, seed: int) -> Any:
-        """Float32 frames of a view, with noise."""
+        """Float32 frames of a view ``(batch, frames, bins, beams)``, with noise; vectors ``(batch, frames, bins)``, and of
+        halves one more axis of 2."""
         values = frames[view]
         xp = array_namespace(values)
         batch, count, *shape = values.shape
@@ -173,14 +174,13 @@ class Arrangement:
         if values.dtype == xp.uint8:
             flat = xp.astype(flat, xp.float32) * xp.asarray(1 / 255, dtype=xp.float32, device=device(flat))
         flat = self.noise.apply(flat, seed=seed, frames=numbers)
-        if self.kind == "vector" and self.halves:
-            middle = flat.shape[-1] // 2
-            both = [xp.sum(flat[..., :middle], axis=-1), xp.sum(flat[..., flat.shape[-1] - middle :], axis=-1)]
-            return xp.reshape(xp.stack(both, axis=-1), (*values.shape[:-1], 2))
-        if self.kind == "vector":
-            flat = xp.sum(flat, axis=-1)
-            return xp.reshape(flat, values.shape[:-1])
-        return xp.reshape(flat, values.shape)
+        if self.kind != "vector":
+            return xp.reshape(flat, values.shape)
+        if not self.halves:
+            return xp.reshape(xp.sum(flat, axis=-1), values.shape[:-1])
+        half = flat.shape[-1] // 2  # of odd beams the middle one is in neither
+        both = [xp.sum(side, axis=-1) for side in (flat[..., :half], flat[..., flat.shape[-1] - half :])]
+        return xp.reshape(xp.stack(both, axis=-1), (*values.shape[:-1], 2))
 
     def _coarser(self, vectors: Any) -> Any:
         """Vectors ``(batch, bins)`` with neighbouring bins added up."""

@@ -2,8 +2,8 @@
 
 Scatterers that nothing is known of make frequencies farther apart than one over the spread of delays (some 100 Hz)
 independent of each other. Parts of a band that do not overlap therefore tell of the motion independently, each a channel
-sonar of its own carrier, and what is computed of each grows with the cube of its taps: n parts cost n times less than a
-third of the whole, and say as much but for what crosses their edges.
+sonar of its own carrier, and what is computed of each grows with the cube of its taps: n parts cost n squared times less
+than the whole, and say as much but for what crosses their edges.
 """
 
 from __future__ import annotations
