@@ -26,6 +26,7 @@ STAGES = (
         "frames",
         "responses",
         "framestore",
+        "viewframes",
         "noise",
         "geometry",
         "height",
@@ -74,7 +75,18 @@ STAGES = (
     ),
     *(
         f"estimation.{name}"
-        for name in ("estimator", "zero", "ground", "ecc", "phase", "flow", "direct", "network", "estimators")
+        for name in (
+            "estimator",
+            "zero",
+            "ground",
+            "ecc",
+            "phase",
+            "flow",
+            "direct",
+            "network",
+            "view_network",
+            "estimators",
+        )
     ),
     *(f"estimation.{name}" for name in ("limit", "impulse", "comparison", "regressors")),
     *(f"estimation.{name}" for name in ("ground_law", "impulse_bands", "impulse_search", "impulse_limit")),
@@ -86,6 +98,7 @@ STAGES = (
             "assessment",
             "source",
             "response_source",
+            "view_source",
             "continuity",
             "odometry",
             "mosaic",
@@ -304,7 +317,7 @@ def test_package_data_names_every_shipped_file() -> None:
     shipped = {path for path in scenes.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
     assert shipped == named
     recipes = set((ROOT / "mitsonar" / "dataset").glob(SETUPTOOLS["package-data"]["mitsonar.dataset"][0]))
-    assert len(recipes) == 29
+    assert len(recipes) == 30
     training = ROOT / "benchmarks" / "recipes"
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.recipes"] for path in training.glob(pattern)}
     assert {path for path in training.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")} == named

@@ -39,7 +39,7 @@ from mitsonar.dataset.pairs import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.training.recipe import TrainingRecipe, load_training_recipe, shipped_training_recipes  # noqa: E402
-from mitsonar.training.reproduce import Effort, reproduce  # noqa: E402
+from mitsonar.training.reproduce import Effort, reproduce, unseen_recipe  # noqa: E402
 
 TABLES = load_tables()
 RECIPES = sorted({row.recipe for name, table in TABLES.items() if name[0] == "3" for row in table.rows})
@@ -48,8 +48,23 @@ RECIPES = sorted({row.recipe for name, table in TABLES.items() if name[0] == "3"
 
 
 def test_every_row_has_a_recipe_and_every_network_of_the_thesis_its_rows() -> None:
-    assert list(TABLES) == ["3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.10", "3.11", "5.2"]
-    assert [len(table.rows) for table in TABLES.values()] == [5, 6, 4, 2, 3, 2, 3, 3, 8, 15]
+    assert list(TABLES) == [
+        "3.1",
+        "3.2",
+        "3.3",
+        "3.4",
+        "3.5",
+        "3.6",
+        "3.7",
+        "3.10",
+        "3.11",
+        "4.12",
+        "4.14",
+        "4.15",
+        "4.5",
+        "5.2",
+    ]
+    assert [len(table.rows) for table in TABLES.values()] == [5, 6, 4, 2, 3, 2, 3, 3, 8, 12, 10, 11, 6, 15]
     assert set(RECIPES) <= set(shipped_training_recipes())
     assert len(RECIPES) == 28
     named = {load_training_recipe(name).network["name"] for name in RECIPES}
@@ -57,8 +72,11 @@ def test_every_row_has_a_recipe_and_every_network_of_the_thesis_its_rows() -> No
     assert tables_with("posenet-normx10") == ["3.2", "3.3", "3.4", "3.6", "3.7"]
     for table in TABLES.values():  # the same network has the same numbers wherever it is printed
         for row in table.rows:
-            others = [rows_named(TABLES[name], [row.recipe])[0] for name in tables_with(row.recipe)]
-            assert all(other.printed == row.printed for other in others)
+            others = [(TABLES[name], rows_named(TABLES[name], [row.name])[0]) for name in tables_with(row.name)]
+            keys = {(str(table.set), str(other.set), table.unseen, str(table.noises)) for table, other in others}
+            assert all(other.printed == row.printed for _, other in others)
+            assert len(keys) == 1, row.name  # trained once and judged once for all of them
+            load_training_recipe(row.recipe, {**table.set, **row.set})
 
 
 def test_the_numbers_are_those_of_the_reference() -> None:
@@ -76,6 +94,11 @@ def test_the_numbers_are_those_of_the_reference() -> None:
         ("3.10", "posenet-hull-high-noise"): "3.20 / 1.75 / .052 | 3.22 / 1.77 / .052",
         ("3.11", "posenet-two-sensors"): "1.42 / 2.17 / .044 | 6.13 / 7.47 / .156",
         ("3.11", "posenet-two-sensors-low-noise"): "2.33 / 3.05 / .070 | 3.34 / 4.37 / .089",
+        ("4.12", "portion-quadrants-vector"): "2.2 / 2.2 / .045",
+        ("4.15", "levels-128"): "1.0 / 1.0 / .025",
+        ("4.5", "height-rocky-image"): "119.1",
+        ("4.5", "height-hull-vector"): "12.0",
+        ("4.5", "height-hull-image-high-noise"): "7.8",
         ("5.2", "impulse-standard"): "5.1 / 4.2",
         ("5.2", "impulse-wideband-19200"): "1.9 / 2.4",
         ("5.2", "impulse-ten-320khz"): "1.53 / 1.27",
@@ -198,6 +221,46 @@ def test_a_table_shows_all_rows_and_the_scale_of_each() -> None:
     table_figure(table, {})
 
 
+def test_a_table_of_heights_says_them_in_cm_and_of_their_interval() -> None:
+    def errors(value: float) -> Score:
+        ends = {"low": (value,), "high": (value,), "zero": (2600.0,)}
+        return Score(pairs=63, scenes=17, rmse=(value,), slope=(1.0,), ms=3.21, **ends)
+
+    halves = {"none": errors(90.0), "high": errors(180.0)}
+    name = "height-rocky-vector"
+    found = {name: Found(recipe=name, validation=halves, unseen=halves, reached=REACHED)}
+    lines = table_lines(table_named("4.5"), found)
+    (line,) = [line for line in lines if line.startswith("| rocky field, vectors") and "height" not in line]
+    assert [cell.strip() for cell in line.strip("|").split("|")] == [
+        *("rocky field, vectors", "12.17 cm (1.35 %)", "9.00 cm (1.00 %)", "9.00 cm (1.00 %)"),
+        *("-", "18.00 cm (2.00 %)", "18.00 cm (2.00 %)"),
+    ]
+    assert not any("always answering no motion" in line for line in lines[:8])
+    figure = table_figure(table_named("4.5"), found)  # percent, since one interval is 26 times the other
+    widths = [bar.get_width() for bar in figure.axes[0].patches]
+    np.testing.assert_allclose(sorted(w for w in widths if np.isfinite(w)), [1, 1, 119.1 / 90, 121.7 / 90, 24 / 7, 24 / 7])
+
+
+def test_a_table_with_times_tells_them_beside_the_thesis_s() -> None:
+    timed = score(5.0).model_copy(update={"ms": 5.72})
+    name = "portion-quadrants-vector"
+    both = {"none": timed, "high": score(7.0)}
+    lines = table_lines(table_named("4.12"), {name: Found(recipe=name, validation=both, unseen=both, reached=REACHED)})
+    assert "thesis, ms | here, ms" in " | ".join(cell.strip() for cell in lines[2].split("|"))
+    (line,) = [line for line in lines if line.startswith("| four quadrants, vectors") and "portion" not in line]
+    assert [cell.strip() for cell in line.split("|")][-3:-1] == ["27", "5.72"]
+    (line,) = [line for line in lines if line.startswith("| whole view, images") and "portion" not in line]
+    assert [cell.strip() for cell in line.split("|")][-3:-1] == ["160", "-"]
+
+
+def test_unseen_scenes_of_a_table_that_says_how_many() -> None:
+    data = load_recipe("looking-down", {"store": "vectors"})
+    other, wanted = unseen_recipe(data, 250, 1000, 2)
+    assert (wanted, other.sequences, other.flight.pings, other.seed) == (1000, 1000, 2, 7919)
+    same, some = unseen_recipe(data, 250, None, 2)
+    assert (some, same.sequences, same.flight.pings) == (100, 250, 5)
+
+
 # ---------------------------------------------------------------- from nothing to a table
 
 TINY: dict[str, Any] = {
@@ -234,6 +297,8 @@ def told(out: Path) -> dict[str, Any]:
     for row in rows:
         for key in ("minutes", "date"):
             row["ours"]["reached"].pop(key)
+        for scores in (row["ours"]["validation"], row["ours"]["unseen"]):
+            assert all(score.pop("ms") > 0 for score in scores.values())
     return {row["recipe"]: row for row in rows}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mitsonar.dataset.plan import scenes_of
 from mitsonar.dataset.recipe import load_recipe
 from mitsonar.dataset.rendering import SceneRenderer
 from mitsonar.errors import MitsonarError
+from mitsonar.noise import load_noise
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")
@@ -26,7 +28,11 @@ pytestmark = [
 
 from mitsonar.dataset.pairs import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.network import Network  # noqa: E402
+from mitsonar.estimation.view_network import ViewNetwork, _doubt_of_profiles  # noqa: E402
+from mitsonar.mapping.view_source import open_views  # noqa: E402
+from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
+from mitsonar.training.evaluation import predictions  # noqa: E402
 from mitsonar.training.recipe import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
 
@@ -276,15 +282,11 @@ SIZES = {
     "portion-quadrants-vector": (512, 8),
     "portion-circular-image": (512, 4000),
     "portion-circular-vector": (512, 8),
-    "portion-circular-vector-high-noise": (512, 8),
     "portion-circular-10m-vector": (512, 8),
-    "portion-circular-10m-vector-high-noise": (512, 8),
     "height-rocky-image": (512, 1000),
     "height-rocky-vector": (512, 1),
     "height-hull-image": (512, 96),
-    "height-hull-image-high-noise": (512, 96),
     "height-hull-vector": (512, 1),
-    "height-hull-vector-high-noise": (512, 1),
     "profilenet-circular-10m": (1024, 8),
     "profilenet-quadrants": (1024, 8),
 }
@@ -305,7 +307,7 @@ def test_recipes_of_the_chapter(name: str) -> None:
     assert inputs.shape == (1, 1, *SIZES[name])
     network = create_network(recipe.network["name"], **options_for(recipe.network["name"], inputs, labels), width=1 / 16)
     assert network.eval()(inputs).shape == labels.shape
-    assert recipe.noise == ("high" if "high-noise" in name else "none")
+    assert recipe.noise == "none"
     if not name.startswith("profilenet"):
         rates = [recipe.optimiser.rate_at(epoch, 1, 24) for epoch in (0, 12, 16, 23)]
         assert rates == [1e-4, 5e-5, 1e-5, 1e-5]
@@ -326,3 +328,70 @@ def test_samples_dealt_out_one_by_one_are_on_both_sides(portions: Path) -> None:
     assert len(validated & learnt) > 0.9 * len(validated)
     apart = [SonarPairs(portions, part=part, split={**split, "by": "sequence"}) for part in ("train", "validation")]
     assert not set(apart[0].sequence[apart[0].first].tolist()) & set(apart[1].sequence[apart[1].first].tolist())
+
+
+# ---------------------------------------------------------------- odometry
+
+
+@pytest.fixture(scope="module")
+def learnt(portions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run of a small network of four segments."""
+    run = tmp_path_factory.mktemp("learnt") / "run"
+    recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "views": ["c2", "c1", "c3", "c4"]}})
+    train(recipe, portions, run)
+    return run
+
+
+@pytest.mark.parametrize("noise", ["none", "high"])
+def test_a_network_of_views_drives_a_path(
+    portions: Path, learnt: Path, tmp_path: Path, mitsonar: Command, noise: str
+) -> None:
+    """Its motions are those that an evaluation of the same frames with the same noise says, and no truth leaks."""
+    done = mitsonar(
+        "odometry", portions, "--estimator", learnt, "--sequence", "3", "--noise", noise, "-o", tmp_path / "path"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "vectors of c2, c1, c3, c4" in done.stdout
+    kept = Checkpoint.load(learnt)
+    samples = SonarPairs(portions, part="all", **kept.arrangement, labels=kept.labels["kind"], noise=noise)
+    mine = [number for number in range(len(samples)) if samples.sequence[samples.first[number]] == 3]
+    wanted, _ = predictions(kept, samples, numbers=mine)
+    source = open_views(str(portions), ViewNetwork(kept).views, "vector", sequence=3).with_noise(load_noise(noise))
+    seen = source.read(np.arange(len(source)))
+    found = [ViewNetwork(kept).estimate(seen.select(slice(k, k + 2))).motion for k in range(len(seen) - 1)]
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
+    assert seen.poses is not None
+    assert not seen.poses[:, [0, 1, 5]].any()
+
+
+def test_a_network_of_views_doubts_what_does_not_belong_together(portions: Path, learnt: Path) -> None:
+    network = pickle.loads(pickle.dumps(ViewNetwork(Checkpoint.load(learnt))))
+    source = open_views(str(portions), network.views, "vector", sequence=1)
+    pair = source.read([0, 1])
+    assert not _doubt_of_profiles(np.tile(np.random.default_rng(1).random((4, 1, 512)), (1, 2, 1)).astype(np.float32))
+    strangers = np.random.default_rng(2).random((4, 2, 512)).astype(np.float32)
+    assert "correlate by" in _doubt_of_profiles(strangers)
+    blank = replace(pair, values={view: np.zeros_like(one) for view, one in pair.values.items()})
+    assert network.estimate(blank).reason == "nothing in the frames to match"
+    high = network.estimate(replace(pair, height_m=pair.height_m * 3, poses=pair.poses * [1, 1, 3, 1, 1, 1]))
+    assert "the sonar stood at" in high.reason
+    with pytest.raises(MitsonarError, match="two pings of c2, c1, c3, c4 are needed: got 3"):
+        network.estimate(source.read([0, 1, 2]))
+    other = {view: one.replace(range_max=2 * one.range_max) for view, one in pair.sonars.items()}
+    with pytest.raises(MitsonarError, match="is of another: window"):
+        network.estimate(replace(pair, sonars=other))
+    with pytest.raises(MitsonarError, match="must have the shape"):
+        replace(pair, values={view: one[:, :-1] for view, one in pair.values.items()})
+
+
+def test_a_network_of_views_needs_a_data_set_that_holds_them(
+    portions: Path, ahead: Path, learnt: Path, tmp_path: Path, mitsonar: Command
+) -> None:
+    done = mitsonar("odometry", ahead, "--estimator", learnt, "-o", tmp_path / "path")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "has no vectors of view 'c2': it holds no vectors" in done.stderr
+    frames = SonarPairs(ahead, part="all", layout="channels").sonar_frames(7)
+    with pytest.raises(MitsonarError, match="is given vectors of c2, c1, c3, c4: use `mitsonar odometry`"):
+        ViewNetwork(Checkpoint.load(learnt)).estimate(frames)
+    with pytest.raises(MitsonarError, match="has no sequence 99"):
+        open_views(str(portions), ["c1"], "vector", sequence=99)

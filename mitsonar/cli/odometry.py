@@ -83,8 +83,13 @@ def odometry(
         from mitsonar.estimation.estimators import estimator_from
 
         estimator = estimator or "direct"
-        source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
         method = estimator_from(estimator)
+        if hasattr(method, "views"):
+            if any(option is not None for option in (view, height, pitch_deg)):
+                raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")
+            source = _views(frames, method, sequence, noise, seed)
+        else:
+            source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
@@ -122,6 +127,14 @@ def _responses(where: str, estimator: str, noise: str, seed: int, height: float 
     from mitsonar.mapping.response_source import open_responses
 
     return open_responses(where).told(noise, seed, height), impulse_estimator_from(estimator)
+
+
+def _views(where: str, method: Any, sequence: int | None, noise: str, seed: int) -> Source:
+    """The views that a network reads."""
+    from mitsonar.mapping.view_source import open_views
+    from mitsonar.noise import load_noise
+
+    return open_views(where, method.views, method.kind, sequence=sequence).with_noise(load_noise(noise), seed)
 
 
 def frames_from(

@@ -75,14 +75,14 @@ def reproduce(
 
 def _list() -> None:
     """All tables with their rows."""
-    from mitsonar.training.tables import NOISES, errors_said, load_tables
+    from mitsonar.training.tables import NOISES, load_tables
 
     say(f"RMSE in the thesis, sideways mm / forward mm / yaw deg: {', '.join(NOISES.values())}")
     for table in load_tables().values():
         say(f"\n{table.name}  {table.title}")
         for row in table.rows:
-            errors = (errors_said(printed) for printed in row.printed.values())
-            say(f"    {row.recipe:32} {'   '.join(errors)}   {row.approach}")
+            errors = (row.said(printed) for printed in row.printed.values())
+            say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")
 
 
 class _Console:

@@ -224,11 +224,12 @@ def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
 
 
 def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
-    """A run of Almanza-Medina, 2.3, over the pattern: poses of the vehicle ``(frames, 6)``.
+    """A run of Almanza-Medina, 2.3, over the pattern, or of 4.4.4: poses of the vehicle ``(frames, 6)``.
 
     ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250
     over 5 m to starboard. ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward. ``turn``: 300 frames over 120 deg on
-    the spot, the T ahead half-way.
+    the spot, the T ahead half-way. ``sideways_50``, ``sideways_54``: so many steps from the middle of a scene, almost all to
+    starboard, once back again near the end (figures 4.16 and 4.17, which print no numbers: these are ours).
     """
     x, y = -2.5, -4.85
     match name:
@@ -240,6 +241,13 @@ def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
             place, heading = np.concatenate(legs), np.zeros(sum(counts))
         case "diagonal":
             place, heading = np.linspace((x, y), (x + 5, y + 2.3), 300), np.zeros(300)
+        case "sideways_50" | "sideways_54":
+            step = np.arange(int(name[-2:]))
+            back = (step >= len(step) - 14) & (step < len(step) - 6)
+            sideways = np.where(back, -8.0, 15.0 + 3 * np.sin(step / 5))
+            forward = np.where(back, -9.0, 5 * np.cos(step / (7 if len(step) == 50 else 4)))
+            place = np.concatenate([np.zeros((1, 2)), np.cumsum(np.column_stack([sideways, forward]) / 1e3, axis=0)])
+            heading = np.zeros(len(place))
         case _:
             place, heading = np.tile([0.0, -4.2], (300, 1)), np.radians(np.linspace(-60, 60, 300))
     rest = np.column_stack([np.full(len(place), height_m), np.zeros((len(place), 2)), heading])

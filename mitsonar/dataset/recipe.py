@@ -104,7 +104,7 @@ _Angle = Annotated[float, Field(gt=0, le=180)]
 class Flight(_Part):
     """How the vehicle moves: sequences of pings at a constant rate, with jumps between, or named runs."""
 
-    kind: Literal["random", "runs"] = Field("random", description="random sequences, or the runs of chapter 2")
+    kind: Literal["random", "runs"] = Field("random", description="random sequences, or the runs of chapters 2 and 4")
     height_m: Interval | float = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
     pings: int = Field(5, ge=1, le=10**6, description="pings of a sequence")
     sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
@@ -114,7 +114,7 @@ class Flight(_Part):
     footprint_fov_deg: tuple[_Angle, _Angle] | None = Field(
         None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
     )
-    runs: list[Literal["legs", "diagonal", "turn"]] = Field(
+    runs: list[Literal["legs", "diagonal", "turn", "sideways_50", "sideways_54"]] = Field(
         default=["legs", "diagonal", "turn"], min_length=1, description="runs of each scene"
     )
 

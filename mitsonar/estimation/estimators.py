@@ -76,12 +76,14 @@ def _trained(path: str | Path) -> Callable[..., Estimator]:
     """
     try:
         from mitsonar.estimation.network import Network
+        from mitsonar.estimation.view_network import ViewNetwork, reads_views
         from mitsonar.networks.checkpoint import Checkpoint
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "torch":
             raise
         raise MitsonarError("a network computes with torch: pip install 'mitsonar[learn]'") from None
-    return partial(Network, Checkpoint.load(path))
+    checkpoint = Checkpoint.load(path)
+    return partial(ViewNetwork if reads_views(checkpoint) else Network, checkpoint)
 
 
 def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[str, Any]:

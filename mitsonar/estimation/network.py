@@ -28,10 +28,13 @@ from mitsonar.networks.create import called
 from mitsonar.networks.look import Ground, Look
 from mitsonar.noise import NoiseModel
 from mitsonar.sonar import Sonar
+from mitsonar.viewframes import ViewFrames
 
 __all__ = ["Instrument", "Network", "answer_of", "inputs_of", "one_thread"]
 
 Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
+Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Ranges of the bins and bearings of the beams."""
 
 BEYOND = 1.2
 """Answers beyond the motions of training by this factor are not believed."""
@@ -129,16 +132,21 @@ class Network:
         pitch_rad: float | None = None,
         relief_m: float | None = None,
     ) -> None:
+        self._check_input(checkpoint)
+        if not checkpoint.arrangement["ground"] and any(value is not None for value in (height_m, pitch_rad, relief_m)):
+            raise MitsonarError(f"this {checkpoint.network} is given no geometry: {checkpoint.fixed} are fixed by training")
+        self.force, self.height_m, self.pitch_rad, self.relief_m = force, height_m, pitch_rad, relief_m
+        self._take(checkpoint)
+
+    def _check_input(self, checkpoint: Checkpoint) -> None:
+        """Whether the network reads what an estimator has."""
         words = checkpoint.arrangement
         if words["frames"] != 2 or len(words["views"]) != 1:
             raise MitsonarError(
                 f"an estimator has two frames of one view: this {checkpoint.network} is given {words['frames']} frames of "
-                f"{', '.join(words['views'])} as {words['kind']}s; use `mitsonar evaluate`, or another checkpoint"
+                f"{', '.join(words['views'])} as {words['kind']}s; use `mitsonar odometry` on a data set that holds them, "
+                "`mitsonar evaluate`, or another checkpoint"
             )
-        if not words["ground"] and any(value is not None for value in (height_m, pitch_rad, relief_m)):
-            raise MitsonarError(f"this {checkpoint.network} is given no geometry: {checkpoint.fixed} are fixed by training")
-        self.force, self.height_m, self.pitch_rad, self.relief_m = force, height_m, pitch_rad, relief_m
-        self._take(checkpoint)
 
     def _take(self, checkpoint: Checkpoint) -> None:
         """What computes is no field: files and comparisons of options need the digest only."""
@@ -207,23 +215,27 @@ class Network:
         return answer_of(self._network, (inputs, ground) if ground else inputs)
 
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
-        """From the frames to the network's input; kept, since it is that of the frames before."""
-        key = frames.range_m.tobytes() + frames.bearing_rad.tobytes()
+        """From the frames to the network's input."""
+        (view,) = self._checkpoint.arrangement["views"]
+        return self._arranged({view: (frames.range_m, frames.bearing_rad)})
+
+    def _arranged(self, axes: dict[str, Axes]) -> Arrangement:
+        """From frames of these views to the network's input; kept, since it is that of the frames before."""
+        key = b"".join(axis.tobytes() for both in axes.values() for axis in both)
         if self._last is None or self._last[0] != key:
             words = self._checkpoint.arrangement
-            (view,) = words["views"]
             maps = {}
             if words["coordinates"] != "polar":
-                maps[view] = cartesian_map(frames.range_m, frames.bearing_rad, words["cartesian_rows"])
-            beams = {view: len(frames.bearing_rad)}
-            made = Arrangement((view,), words["kind"], words["layout"], words["coordinates"], NoiseModel(), beams, maps)
+                maps = {view: cartesian_map(*both, words["cartesian_rows"]) for view, both in axes.items()}
+            beams = {view: len(bearing_rad) for view, (_, bearing_rad) in axes.items()}
+            made = Arrangement(tuple(axes), words["kind"], words["layout"], words["coordinates"], NoiseModel(), beams, maps)
             made = replace(made, range_levels=words.get("range_levels"), halves=words.get("halves", False))
             self._last = key, made
         return self._last[1]
 
     # ---------------------------------------------------------------- doubts
 
-    def _doubt_of_standing(self, frames: SonarFrames) -> str:
+    def _doubt_of_standing(self, frames: SonarFrames | ViewFrames) -> str:
         """Whether the sonar stood as in training, as far as the frames tell; networks that are given it need not."""
         if self._checkpoint.arrangement["ground"]:
             return ""

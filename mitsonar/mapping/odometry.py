@@ -37,6 +37,7 @@ from mitsonar.mapping.paths import (
 )
 from mitsonar.mapping.response_source import ResponseSource
 from mitsonar.mapping.source import FrameSource
+from mitsonar.mapping.view_source import ViewSource
 from mitsonar.metrics import AXES, in_units, motion_errors
 from mitsonar.motion import Pose, Trajectory, motions
 
@@ -49,9 +50,10 @@ Row = tuple[str, float, str]
 
 Smoothing = Literal["none", "spline", "kalman"]
 
-Source = FrameSource | ResponseSource
+Source = FrameSource | ResponseSource | ViewSource
 Method = Estimator | ImpulseEstimator
-"""Frames with an estimator of frames, or pings with one of impulse responses."""
+"""Frames with an estimator of frames (views of a data set with a network that reads them), or pings with one of impulse
+responses."""
 
 PAIRS_A_BATCH = 8
 """What a worker is given at a time, and what a kill may cost."""

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,10 @@ from mitsonar.mapping.assessment import associated
 from mitsonar.motion import Trajectory
 from mitsonar.noise import NoiseModel
 
-__all__ = ["FrameSource", "open_frames"]
+if TYPE_CHECKING:
+    from mitsonar.dataset.store import DataStore
+
+__all__ = ["FrameSource", "open_frames", "sequence_in"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -298,13 +301,7 @@ def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSourc
     name = next(iter(stored)) if view is None else view
     if name not in stored:
         raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
-    sequences = store.read("sequence")
-    lengths = np.bincount(sequences)
-    number = int(lengths.argmax()) if sequence is None else sequence
-    if not (0 <= number < len(lengths) and lengths[number]):
-        raise MitsonarError(f"{url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
-    first = int(np.argmax(sequences == number))
-    here = slice(first, first + int(lengths[number]))
+    here, number, said = sequence_in(store, sequence)
     image = store.array(stored[name])
     like = SonarFrames(
         image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
@@ -314,17 +311,32 @@ def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSourc
         sonar=views[name].sonar,
         level_scale=float(store.about["level_scale"]),
     )
-    said = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
     return FrameSource._of(
         like,
         store.read("time_s", here),
         store.read("pose", here),
         store.read("height_m", here),
-        lambda index: _picked(image, index + first),
+        lambda index: _picked(image, index + here.start),
         f"{url}, sequence {number}",
-        first_number=first,
+        first_number=here.start,
         note=said + (f", view {name}" if len(stored) > 1 else ""),
     )
+
+
+def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
+    """The frames of a data set's sequence, its number, and which it is, in words; default: the longest, the first of these.
+
+    Raises:
+        MitsonarError: no such sequence.
+    """
+    sequences = store.read("sequence")
+    lengths = np.bincount(sequences)
+    number = int(lengths.argmax()) if sequence is None else sequence
+    if not (0 <= number < len(lengths) and lengths[number]):
+        raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
+    first = int(np.argmax(sequences == number))
+    said = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
+    return slice(first, first + int(lengths[number])), number, said
 
 
 def _picked(image: Any, index: Index) -> NDArray[Any]:

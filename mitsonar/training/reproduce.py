@@ -39,7 +39,7 @@ from mitsonar.training.tables import (
     tables_with,
 )
 
-__all__ = ["Effort", "Watch", "reproduce"]
+__all__ = ["Effort", "Watch", "reproduce", "unseen_recipe"]
 
 ABOUT = "reproduce.json"
 """What the folder was begun with."""
@@ -81,13 +81,13 @@ class Effort:
         if self.batch is not None and self.batch < 1:
             raise MitsonarError(f"a batch has 1 sample or more: got {self.batch}")
 
-    def recipe(self, name: str) -> TrainingRecipe:
-        """The training recipe of that name, changed as this says.
+    def recipe(self, name: str, own: dict[str, Any] | None = None) -> TrainingRecipe:
+        """The training recipe of that name, changed as this says, and then as a table and its row do.
 
         Raises:
             MitsonarError: keys that it has not, values outside their limits.
         """
-        recipe = load_training_recipe(name, self.changes)
+        recipe = load_training_recipe(name, {**self.changes, **(own or {})})
         if self.batch is None or self.batch == recipe.batch:
             return recipe
         rate = recipe.optimiser.rate * math.sqrt(self.batch / recipe.batch)
@@ -156,7 +156,7 @@ def reproduce(
         table: its number.
         out: the folder.
         effort: what is spent on each row.
-        rows: names of recipes; default: all of the table.
+        rows: their names; default: all of the table.
         workers: processes that render.
         accelerator: Lightning's word.
         devices: Lightning's word.
@@ -168,8 +168,8 @@ def reproduce(
     Raises:
         MitsonarError: unknown names; a folder that holds other things, or was begun with other numbers or recipes.
     """
-    asked = rows_named(table_named(table), rows)
-    recipes = {row.recipe: effort.recipe(row.recipe) for row in asked}
+    known = table_named(table)
+    recipes = {row.name: effort.recipe(row.recipe, {**known.set, **row.set}) for row in rows_named(known, rows)}
     data = {name: load_recipe(recipe.data, recipe.data_changes) for name, recipe in recipes.items()}
     crew = Crew(workers, accelerator, devices, watch or Nobody())
     with Place(out).locked():
@@ -277,13 +277,11 @@ class Bench:
     def work(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
         """Data, training and evaluation of one row; each stays on disk when it is done, and is not done again."""
         sequences = max(1, round(self.effort.scale * data.sequences))
-        few, most = UNSEEN_SEQUENCES
-        fresh = min(data.sequences, max(few, min(most, sequences // 20)))
-        named = {"name": f"{data.name}-unseen", "seed": (data.seed + UNSEEN_SEED) % 2**31}
-        other = recipe_from({**data.model_dump(mode="json"), **named})
+        table = table_named(tables_with(name)[0])
+        other, fresh = unseen_recipe(data, sequences, table.unseen, recipe.input.frames)
         seen, unseen = self._made(data, sequences, crew), self._made(other, fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
-        noises = list(table_named(tables_with(name)[0]).noises)
+        noises = list(table.noises)
         scores = [
             _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_teller(crew.watch, f"{name}, {said}")))
             for url, part, said in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
@@ -338,7 +336,7 @@ class Bench:
         lines = [f"`mitsonar reproduce`, mitsonar {version('mitsonar')}: {self.effort.sentence()}."]
         for table in tables:
             lines += ["", *table_lines(table, found)]
-            figure = table_figure(table, found, title=f"Table {table.name}, {table.title}; {self.effort.sentence()}")
+            figure = table_figure(table, found, title=f"{table.kind} {table.name}, {table.title}; {self.effort.sentence()}")
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=80)
             write_whole(self.folder / f"table-{table.name}.png", buffer.getvalue())
@@ -346,6 +344,25 @@ class Bench:
         write_whole(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
         write_json(self.folder / "table.json", report)
         return report
+
+
+def unseen_recipe(data: Recipe, learnt: int, wanted: int | None, frames: int) -> tuple[Recipe, int]:
+    """The recipe of unseen scenes, and how many of its sequences are made.
+
+    Args:
+        data: that training learns from.
+        learnt: sequences of it.
+        wanted: sequences, of no more frames than a sample has; None: part of the training's.
+        frames: of a sample.
+    """
+    fields = data.model_dump(mode="json") | {"name": f"{data.name}-unseen", "seed": (data.seed + UNSEEN_SEED) % 2**31}
+    if wanted is None:
+        few, most = UNSEEN_SEQUENCES
+        return recipe_from(fields), min(data.sequences, max(few, min(most, learnt // 20)))
+    many = -(-wanted // data.sequences)
+    fields["flight"] |= {"pings": frames}
+    fields["scenes"] = [group | {"sequences": many * group["sequences"]} for group in fields["scenes"]]
+    return recipe_from(fields), wanted
 
 
 def _teller(watch: Watch, what: str) -> Callable[[int], Told]:
@@ -363,7 +380,7 @@ def _scores(report: dict[str, Any]) -> dict[str, Score]:
             scenes=report["scenes"],
             low=row["rmse_low"],
             high=row["rmse_high"],
-            **{key: row[key] for key in ("rmse", "slope", "zero")},
+            **{key: row[key] for key in ("rmse", "slope", "zero", "ms")},
         )
     return scores
 

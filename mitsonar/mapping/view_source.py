@@ -1,0 +1,133 @@
+"""Several views of a data set's sequence, or their vectors, read some pings at a time."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.mapping.source import sequence_in
+from mitsonar.motion import Trajectory
+from mitsonar.noise import NoiseModel
+from mitsonar.viewframes import ViewFrames
+
+if TYPE_CHECKING:
+    from mitsonar.dataset.store import DataStore
+
+__all__ = ["ViewSource", "open_views"]
+
+
+@dataclass(frozen=True)
+class ViewSource:
+    """The pings of one sequence.
+
+    Attributes:
+        name: what errors call it.
+        store: of the data set.
+        views: that are read, in this order.
+        kind: ``image`` or ``vector``.
+        first: number of the sequence's first frame in the store.
+        time_s: of the pings ``(n,)``.
+        poses: of the sonar ``(n, 6)``: the truth.
+        height_m: over the ground ``(n,)``.
+        noise: that is added when pings are read, and its seed: the same as that of samples of the data set.
+        seed: see noise.
+        note: which sequence this is.
+    """
+
+    name: str
+    store: DataStore
+    views: tuple[str, ...]
+    kind: str
+    first: int
+    time_s: NDArray[np.float64]
+    poses: NDArray[np.float64]
+    height_m: NDArray[np.float64]
+    noise: NoiseModel | None = None
+    seed: int = 0
+    note: str = ""
+    told_height_m: float | None = None
+    pitch_rad: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
+        """The same pings with noise of a seed, a function of it and each frame's number."""
+        return self if noise.is_none else replace(self, noise=noise, seed=seed)
+
+    @property
+    def true(self) -> Trajectory:
+        """Where the sonar was."""
+        return Trajectory(self.poses, self.time_s)
+
+    def check_times(self) -> None:
+        """Pings of a sequence follow each other."""
+
+    def read(self, index: ArrayLike) -> ViewFrames:
+        """Pings of these numbers ``(n,)``, as estimators may see them: with place and heading 0, so that no truth can leak.
+
+        Raises:
+            MitsonarError: arrays that cannot be read.
+        """
+        from mitsonar.dataset.arrangement import arrangement_of
+        from mitsonar.dataset.image_recording import array_names
+
+        chosen = np.asarray(index, dtype=np.intp)
+        here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
+        kept = chosen - chosen[0]
+        values, known = {}, {view.name: view for view in self.store.recipe.views}
+        made = arrangement_of(self.store.recipe, views=self.views, kind=self.kind, noise=self.noise or "none")
+        for place, view in enumerate(self.views):
+            frames = {
+                (view if kind == self.kind else f"nonzero_{view}"): self.store.read(name, here)[kept][None]
+                for name, (kind, of) in array_names(self.store.recipe).items()
+                if of == view and (kind == self.kind or (kind == "nonzero" and self.kind == "vector"))
+            }
+            numbers = (self.first + chosen.astype(np.int64))[None]
+            values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + place))[0]
+        return ViewFrames(
+            kind=self.kind,
+            values=values,
+            sonars={view: known[view].sonar for view in self.views},
+            bearing_rad={view: known[view].bearing_rad for view in self.views},
+            time_s=self.time_s[chosen],
+            poses=self.poses[chosen] * [0, 0, 1, 1, 1, 0],
+            height_m=self.height_m[chosen],
+        )
+
+    def digest(self) -> str:
+        """SHA-256 of what is known of all pings, and of the first and the last of them."""
+        told = hashlib.sha256(self.store.recipe.model_dump_json().encode())
+        for values in (self.time_s, self.poses, self.height_m):
+            told.update(np.ascontiguousarray(values, dtype=float).tobytes())
+        told.update(repr((self.views, self.kind, self.noise, self.seed, self.first)).encode())
+        for number in (0, len(self) - 1):
+            told.update(self.read([number]).profiles().tobytes())
+        return told.hexdigest()
+
+
+def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | None = None) -> ViewSource:
+    """Views of a data set's sequence; default: the longest, the first of these.
+
+    Raises:
+        MitsonarError: no data set, or one without such views, kind or sequence.
+    """
+    from mitsonar.dataset.image_recording import array_names
+    from mitsonar.dataset.store import DataStore  # half a second that other sources do without
+
+    store = DataStore.open(url)
+    there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
+    lacking = [view for view in views if view not in there]
+    if lacking:
+        had = nearest_names(lacking[0], sorted(there)) if there else f"it holds no {kind}s"
+        raise MitsonarError(f"{url} has no {kind}s of view {lacking[0]!r}: {had}")
+    here, number, note = sequence_in(store, sequence)
+    time_s, poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
+    name, said = f"{url}, sequence {number}", f"{note}, {kind}s of {', '.join(views)}"
+    return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, height_m, note=said)
