@@ -83,11 +83,14 @@ STAGES = (
             "phase",
             "flow",
             "direct",
+            "trained",
             "network",
             "view_network",
+            "nearest",
             "estimators",
         )
     ),
+    *(f"estimation.{name}" for name in ("floor", "height", "height_network", "heights")),
     *(f"estimation.{name}" for name in ("limit", "impulse", "comparison", "regressors")),
     *(f"estimation.{name}" for name in ("ground_law", "impulse_bands", "impulse_search", "impulse_limit")),
     *(f"estimation.{name}" for name in ("impulse_correlation", "impulse_likelihood", "impulse_estimators")),
@@ -96,6 +99,7 @@ STAGES = (
         for name in (
             "paths",
             "assessment",
+            "heights",
             "source",
             "response_source",
             "view_source",

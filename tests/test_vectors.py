@@ -378,7 +378,7 @@ def test_a_network_of_views_doubts_what_does_not_belong_together(portions: Path,
     with pytest.raises(MitsonarError, match="two pings of c2, c1, c3, c4 are needed: got 3"):
         network.estimate(source.read([0, 1, 2]))
     other = {view: one.replace(range_max=2 * one.range_max) for view, one in pair.sonars.items()}
-    with pytest.raises(MitsonarError, match="is of another: window"):
+    with pytest.raises(MitsonarError, match="the frames are of didson300: window"):
         network.estimate(replace(pair, sonars=other))
     with pytest.raises(MitsonarError, match="must have the shape"):
         replace(pair, values={view: one[:, :-1] for view, one in pair.values.items()})

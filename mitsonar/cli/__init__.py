@@ -15,6 +15,7 @@ def main() -> None:
         doctor,
         evaluate,
         export,
+        height,
         image,
         impulse,
         limit,
@@ -43,6 +44,7 @@ def main() -> None:
     app.command()(doctor.doctor)
     app.command()(compare.compare)
     app.command()(limit.limit)
+    app.command()(height.height)
     app.command()(odometry.odometry)
     app.command()(mosaic.mosaic)
     app.command()(train.train)

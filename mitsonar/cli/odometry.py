@@ -15,8 +15,9 @@ from mitsonar.errors import MitsonarError
 if TYPE_CHECKING:
     from mitsonar.mapping.odometry import Method, Source
     from mitsonar.mapping.source import FrameSource
+    from mitsonar.mapping.view_source import ViewSource
 
-__all__ = ["Frames", "frames_from", "odometry"]
+__all__ = ["Frames", "frames_from", "odometry", "views_from"]
 
 Frames = Annotated[
     str, typer.Argument(metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, or a data set.")
@@ -37,8 +38,9 @@ def odometry(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, corrnet, or a network's checkpoint; NAME:key=value:key=value; of impulse "
-            "responses: zero, correlation, likelihood."
+            help="zero, ecc, flow, phase, direct, corrnet, or a network's checkpoint; NAME:key=value:key=value; several "
+            "checkpoints with commas: the one trained nearest to the height; of impulse responses: zero, correlation, "
+            "likelihood."
         ),
     ] = None,
     smooth: Annotated[
@@ -48,6 +50,9 @@ def odometry(
     every: Annotated[int, typer.Option(help="Use every so many frames only.")] = 1,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX} (default: the true one, or 0).")] = None,
     height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
+    height_by: Annotated[
+        str | None, typer.Option(help="Measure it in each frame: direct, or a checkpoint that was trained on heights.")
+    ] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
     view: Annotated[str | None, typer.Option(help="Of a data set (default: the first).")] = None,
@@ -75,8 +80,10 @@ def odometry(
     source: Source
     method: Method
     if holds_responses(frames):
-        if any(option is not None for option in (sequence, view, pitch_deg)):
-            raise MitsonarError("--sequence, --view and --pitch-deg belong to frames; impulse responses have none of them")
+        if any(option is not None for option in (sequence, view, pitch_deg, height_by)):
+            raise MitsonarError(
+                "--sequence, --view, --height-by and --pitch-deg belong to frames; impulse responses have none of them"
+            )
         estimator = estimator or "likelihood"
         source, method = _responses(frames, estimator, noise, seed, height)
     else:
@@ -84,12 +91,18 @@ def odometry(
 
         estimator = estimator or "direct"
         method = estimator_from(estimator)
-        if hasattr(method, "views"):
+        views, kind = getattr(method, "views", None), getattr(method, "kind", "image")
+        if views is not None:
             if any(option is not None for option in (view, height, pitch_deg)):
                 raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")
-            source = _views(frames, method, sequence, noise, seed)
+            seen: FrameSource | ViewSource = views_from(frames, views, kind, sequence, noise, seed)
         else:
-            source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+            seen = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+        if height_by is not None:
+            from mitsonar.estimation.heights import height_estimator_from
+
+            seen = seen.with_heights_by(height_estimator_from(height_by))
+        source = seen
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
@@ -129,12 +142,16 @@ def _responses(where: str, estimator: str, noise: str, seed: int, height: float 
     return open_responses(where).told(noise, seed, height), impulse_estimator_from(estimator)
 
 
-def _views(where: str, method: Any, sequence: int | None, noise: str, seed: int) -> Source:
-    """The views that a network reads."""
+def views_from(where: str, views: tuple[str, ...], kind: str, sequence: int | None, noise: str, seed: int) -> ViewSource:
+    """The views of a data set that a network reads.
+
+    Raises:
+        MitsonarError: none there.
+    """
     from mitsonar.mapping.view_source import open_views
     from mitsonar.noise import load_noise
 
-    return open_views(where, method.views, method.kind, sequence=sequence).with_noise(load_noise(noise), seed)
+    return open_views(where, views, kind, sequence=sequence).with_noise(load_noise(noise), seed)
 
 
 def frames_from(

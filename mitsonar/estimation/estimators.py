@@ -48,11 +48,14 @@ def create_estimator(name: str, **options: Any) -> Estimator:
 
 def estimator_from(text: str) -> Estimator:
     """What the command line says: ``NAME``, a checkpoint or the folder of a training run, or either with options,
-    ``NAME:key=value:key=value``; angles as ``..._deg``.
+    ``NAME:key=value:key=value``; angles as ``..._deg``. Several checkpoints with commas between them: the one trained
+    nearest to the height of the frames answers.
 
     Raises:
         MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
     """
+    if "," in text and not Path(text).exists():
+        return _nearest([part.strip() for part in text.split(",") if part.strip()])
     name, *words = text.split(":")
     if name in NAMES:
         return create_estimator(name, **options_from(name, words, _maker(name)))
@@ -61,6 +64,22 @@ def estimator_from(text: str) -> Estimator:
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
     made = _trained(name)
     return made(**options_from(name, words, made))
+
+
+def _nearest(texts: list[str]) -> Estimator:
+    """Of several checkpoints.
+
+    Raises:
+        MitsonarError: none of them, or estimators that are no networks.
+    """
+    made = [estimator_from(text) for text in texts]
+    plain = [text for text, one in zip(texts, made, strict=True) if not hasattr(one, "heights")]
+    if plain or len(made) < 2:
+        said = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
+        raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {said}")
+    from mitsonar.estimation.nearest import Nearest
+
+    return Nearest(made)
 
 
 def _maker(name: str) -> Callable[..., Estimator]:

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, unbelieved
-from mitsonar.estimation.network import Instrument, Network, answer_of, one_thread
+from mitsonar.estimation.trained import Instrument, Trained, answer_of, one_thread
 from mitsonar.motion import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.viewframes import ViewFrames
@@ -37,30 +37,25 @@ def reads_views(checkpoint: Checkpoint) -> bool:
 
 
 @dataclass(init=False, eq=False)
-class ViewNetwork(Network):
+class ViewNetwork(Trained):
     """A trained network that reads several views or their vectors.
 
     Args:
         checkpoint: of it; it must take two frames.
         force: go on with another sonar than that of training.
 
-    Attributes:
-        views: names of those that it reads.
-        kind: ``image`` or ``vector``.
-
     Raises:
         MitsonarError: a checkpoint that needs something else than two frames, or that does not fit its network.
     """
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
-        super().__init__(checkpoint, force=force)
-
-    def _check_input(self, checkpoint: Checkpoint) -> None:
         if checkpoint.arrangement["frames"] != 2:
             raise MitsonarError(
                 f"an estimator has two frames: this {checkpoint.network} is given {checkpoint.arrangement['frames']}; use "
                 "`mitsonar evaluate`, or another checkpoint"
             )
+        self.force = force
+        self._take(checkpoint)
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -106,13 +101,8 @@ class ViewNetwork(Network):
             )
         if len(frames) != 2 or any(view not in frames.values for view in self.views):
             raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")
-        for view, trained in self._trained.items():
-            unlike = "" if self.force else trained.unlike(Instrument.of(frames.sonars[view]))
-            if unlike:
-                raise MitsonarError(
-                    f"this {self._checkpoint.network} was trained on the sonar {trained.name}, view {view} is of another: "
-                    f"{unlike}; train on that sonar, or force it with RUN:force=1"
-                )
+        for view in self.views:
+            self._check_instrument(view, Instrument.of(frames.sonars[view]))
 
     def _input(self, frames: ViewFrames) -> Any:
         """What the network reads, a batch of one."""

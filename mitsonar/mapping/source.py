@@ -16,13 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.frames import LABELS, PER_FRAME, SonarFrames
 from mitsonar.mapping.assessment import associated
+from mitsonar.mapping.heights import measured
 from mitsonar.motion import Trajectory
 from mitsonar.noise import NoiseModel
 
 if TYPE_CHECKING:
     from mitsonar.dataset.store import DataStore
+    from mitsonar.estimation.height import HeightEstimator
 
-__all__ = ["FrameSource", "open_frames", "sequence_in"]
+__all__ = ["FrameSource", "is_data_set", "open_frames", "sequence_in"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -53,6 +55,7 @@ class FrameSource:
         seed: see noise.
         first_number: see noise.
         note: which frames these are, where that is not plain from what was asked for.
+        altimeter: what measures the height of each frame that is read, in place of what is told.
     """
 
     name: str
@@ -67,6 +70,7 @@ class FrameSource:
     seed: int = 0
     first_number: int = 0
     note: str = ""
+    altimeter: HeightEstimator | None = None
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -95,6 +99,18 @@ class FrameSource:
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
         """The same frames with noise of a seed, a function of it and each frame's number."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
+
+    def with_heights_by(self, estimator: HeightEstimator) -> Self:
+        """The same frames; each tells the height that an estimator finds in it, whatever else was told.
+
+        Raises:
+            MitsonarError: an estimator that reads views, which frames are not.
+        """
+        if estimator.views is not None:
+            raise MitsonarError(
+                f"heights are told from {estimator.kind}s of {', '.join(estimator.views)}: got single images"
+            )
+        return replace(self, altimeter=estimator)
 
     def with_geometry(self, height_m: float | None = None, pitch_rad: float | None = None) -> Self:
         """The same frames with a height [m] and a pitch [rad] where they lack them.
@@ -163,13 +179,14 @@ class FrameSource:
             image = self.noise.apply(
                 image.astype(np.float32) * scale, seed=self.seed, frames=chosen.astype(np.int64) + self.first_number
             )
-        return replace(
+        frames = replace(
             self.like,
             image=image,
             time_s=self.time_s[chosen],
             poses=self._standing(chosen),
             height_m=None if self.height_m is None else self.height_m[chosen],
         )
+        return frames if self.altimeter is None else measured(frames, self.altimeter)[0]
 
     def _standing(self, chosen: Index) -> Array | None:
         """Poses without place and heading ``(n, 6)``."""
@@ -217,6 +234,7 @@ class FrameSource:
         for values in (self.like.range_m, self.like.bearing_rad, self.time_s, self.poses, self.height_m):
             told.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
         told.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
+        told.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
         if len(self):
             some = np.unique(np.linspace(0, len(self) - 1, 3).astype(np.intp))
             told.update(np.ascontiguousarray(self.read(some).image).tobytes())
@@ -235,7 +253,7 @@ def open_frames(where: str | Path, *, sequence: int | None = None, view: str | N
         MitsonarError: nothing there, or not frames; a sequence or view that is not there.
     """
     path = Path(where)
-    if "://" in str(where) or _is_data_set(path):
+    if is_data_set(where):
         return _of_data_set(str(where), sequence, view)
     if sequence is not None or view is not None:
         raise MitsonarError(f"{where} is no data set: sequence and view choose among those of a data set; leave them out")
@@ -247,8 +265,11 @@ def open_frames(where: str | Path, *, sequence: int | None = None, view: str | N
     return _of_zarr(path, str(where)) if path.is_dir() else FrameSource.of(SonarFrames.load(path), str(where))
 
 
-def _is_data_set(path: Path) -> bool:
-    """Whether a folder is a data set; frames of a long run are Zarr too, but have other attributes."""
+def is_data_set(where: str | Path) -> bool:
+    """Whether a data set lies there; frames of a long run are Zarr too, but have other attributes. URLs are data sets'."""
+    path = Path(where)
+    if "://" in str(where):
+        return True
     if not (path / "zarr.json").is_file():
         return False
     try:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.mapping.heights import measured
 from mitsonar.mapping.source import sequence_in
 from mitsonar.motion import Trajectory
 from mitsonar.noise import NoiseModel
@@ -18,6 +19,7 @@ from mitsonar.viewframes import ViewFrames
 
 if TYPE_CHECKING:
     from mitsonar.dataset.store import DataStore
+    from mitsonar.estimation.height import HeightEstimator
 
 __all__ = ["ViewSource", "open_views"]
 
@@ -38,6 +40,7 @@ class ViewSource:
         noise: that is added when pings are read, and its seed: the same as that of samples of the data set.
         seed: see noise.
         note: which sequence this is.
+        altimeter: what measures the height of each ping that is read, in place of what is told.
     """
 
     name: str
@@ -53,6 +56,7 @@ class ViewSource:
     note: str = ""
     told_height_m: float | None = None
     pitch_rad: float | None = None
+    altimeter: HeightEstimator | None = None
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -60,6 +64,10 @@ class ViewSource:
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
         """The same pings with noise of a seed, a function of it and each frame's number."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
+
+    def with_heights_by(self, estimator: HeightEstimator) -> Self:
+        """The same pings; each tells the height that an estimator finds in its views, whatever else was told."""
+        return replace(self, altimeter=estimator)
 
     @property
     def true(self) -> Trajectory:
@@ -75,27 +83,36 @@ class ViewSource:
         Raises:
             MitsonarError: arrays that cannot be read.
         """
+        chosen = np.asarray(index, dtype=np.intp)
+        frames = self._read(chosen, self.views, self.kind)
+        if self.altimeter is None:
+            return frames
+        views, kind = self.altimeter.views or self.views, self.altimeter.kind if self.altimeter.views else self.kind
+        found: ViewFrames = measured(frames, self.altimeter, self._read(chosen, views, kind))[0]
+        return found
+
+    def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
+        """Pings as they are stored, with noise."""
         from mitsonar.dataset.arrangement import arrangement_of
         from mitsonar.dataset.image_recording import array_names
 
-        chosen = np.asarray(index, dtype=np.intp)
         here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
         kept = chosen - chosen[0]
         values, known = {}, {view.name: view for view in self.store.recipe.views}
-        made = arrangement_of(self.store.recipe, views=self.views, kind=self.kind, noise=self.noise or "none")
-        for place, view in enumerate(self.views):
+        made = arrangement_of(self.store.recipe, views=views, kind=kind, noise=self.noise or "none")
+        for place, view in enumerate(views):
             frames = {
-                (view if kind == self.kind else f"nonzero_{view}"): self.store.read(name, here)[kept][None]
-                for name, (kind, of) in array_names(self.store.recipe).items()
-                if of == view and (kind == self.kind or (kind == "nonzero" and self.kind == "vector"))
+                (view if stored == kind else f"nonzero_{view}"): self.store.read(name, here)[kept][None]
+                for name, (stored, of) in array_names(self.store.recipe).items()
+                if of == view and (stored == kind or (stored == "nonzero" and kind == "vector"))
             }
             numbers = (self.first + chosen.astype(np.int64))[None]
             values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + place))[0]
         return ViewFrames(
-            kind=self.kind,
+            kind=kind,
             values=values,
-            sonars={view: known[view].sonar for view in self.views},
-            bearing_rad={view: known[view].bearing_rad for view in self.views},
+            sonars={view: known[view].sonar for view in views},
+            bearing_rad={view: known[view].bearing_rad for view in views},
             time_s=self.time_s[chosen],
             poses=self.poses[chosen] * [0, 0, 1, 1, 1, 0],
             height_m=self.height_m[chosen],
@@ -106,7 +123,7 @@ class ViewSource:
         told = hashlib.sha256(self.store.recipe.model_dump_json().encode())
         for values in (self.time_s, self.poses, self.height_m):
             told.update(np.ascontiguousarray(values, dtype=float).tobytes())
-        told.update(repr((self.views, self.kind, self.noise, self.seed, self.first)).encode())
+        told.update(repr((self.views, self.kind, self.noise, self.seed, self.first, self.altimeter)).encode())
         for number in (0, len(self) - 1):
             told.update(self.read([number]).profiles().tobytes())
         return told.hexdigest()

@@ -21,7 +21,7 @@ from mitsonar.dataset.recordings import recording_of
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.comparison import Answers, chosen, rows_of
-from mitsonar.estimation.network import ANGLE_OFF_DEG, HEIGHT_OFF, Instrument, answer_of, inputs_of, one_thread
+from mitsonar.estimation.trained import ANGLE_OFF_DEG, HEIGHT_OFF, Instrument, answer_of, inputs_of, one_thread
 from mitsonar.metrics import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
 

@@ -1,0 +1,190 @@
+"""Height estimators: one frame in, the height over the ground out; the direct one, from first return and fall-off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.floor import FloorProfile
+from mitsonar.frames import SonarFrames
+from mitsonar.simulation.segments import SEGMENTS, Segment
+from mitsonar.sonar import Sonar
+from mitsonar.viewframes import ViewFrames
+
+__all__ = ["Above", "DirectHeight", "HeightEstimate", "HeightEstimator"]
+
+Above = SonarFrames | ViewFrames
+"""One frame, or one ping of several views."""
+
+CANDIDATES = 400
+"""Heights that are tried first, at equal ratios."""
+
+AROUND = (0.75, 1.2)
+"""Heights over what is seen lie between these parts of the first guess,"""
+
+PARTS = 40
+"""and are resolved into so many."""
+
+LOWEST = 0.75
+"""Part of the ground's echo that comes from above the floor: tops and flanks of what stands on it. On rocky fields it errs
+least against the true height, from 2.5 and from 10 m."""
+
+SPREAD = 0.1
+"""Quantiles this far to either side tell how sure that is."""
+
+FINEST = 0.004
+"""Least standard deviation, as part of the height."""
+
+LEAST = 0.5
+"""Correlation of a profile with that of the ground as found, below which it is not believed."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HeightEstimate:
+    """What an estimator says of one frame.
+
+    Attributes:
+        height_m: of the sonar over the ground; nan where nothing can be said.
+        std_m: how sure that is; nan where unknown.
+        believe: False where it should not be used.
+        reason: why not.
+    """
+
+    height_m: float
+    std_m: float
+    believe: bool = True
+    reason: str = ""
+
+
+class HeightEstimator(Protocol):
+    """From one frame to the height.
+
+    Attributes:
+        inputs: what it needs beside the frame.
+    """
+
+    inputs: str
+
+    @property
+    def views(self) -> tuple[str, ...] | None:
+        """Whose frames it reads; None: those of a single image."""
+
+    @property
+    def kind(self) -> str:
+        """``image`` or ``vector``, of views."""
+
+    def height(self, frame: Above) -> HeightEstimate:
+        """The height of one frame.
+
+        Raises:
+            MitsonarError: not one frame, or one without what the estimator needs.
+        """
+
+
+@dataclass
+class DirectHeight:
+    """The height at which level ground has the frame's range profile: where the first echo comes from, and how levels fall
+    off behind it. What stands on the ground answers as if the sonar were lower: the profile is resolved into ground at many
+    heights (non-negative least squares, with an even background for noise), and the floor is their upper quartile.
+
+    It looks at the sum over beams, so that a frame and its vector tell the same.
+
+    Attributes:
+        pitch_rad: of the sonar; None: as the frames say.
+        views: see :class:`HeightEstimator`.
+    """
+
+    pitch_rad: float | None = None
+    views: tuple[str, ...] | None = None
+    kind: str = "vector"
+    inputs: str = field(default="pitch", init=False)
+
+    def __post_init__(self) -> None:
+        self._floors: dict[tuple[str, tuple[str, ...], float, float], FloorProfile] = {}
+
+    def height(self, frame: Above) -> HeightEstimate:
+        """The height over the floor.
+
+        Raises:
+            MitsonarError: not one frame; neither a pitch that was given nor poses; a sonar that sees no ground.
+        """
+        profile, sonar = _profile_of(frame)
+        if not np.isfinite(profile).all():
+            raise MitsonarError("the frame holds nan or inf: set pixels without echo to 0")
+        if not np.ptp(profile) > 0:
+            return HeightEstimate(np.nan, np.nan, False, "nothing in the frame to tell a height from")
+        floor = self._floor_of(frame, sonar)
+        edges = np.linspace(sonar.range_min, sonar.range_max, len(profile) + 1)
+        guess = _nearest_alike(profile, floor, edges)
+        if guess is None:
+            return HeightEstimate(np.nan, np.nan, False, "the window shows no ground")
+        heights = guess * np.geomspace(*AROUND, PARTS)
+        ground = floor.at(heights, edges).T
+        scale = profile.max()
+        part, _ = nnls(np.column_stack([ground, np.full(len(profile), 1 / len(profile))]), profile / scale)
+        if not part[:-1].sum() > 0:
+            return HeightEstimate(np.nan, np.nan, False, "the levels along range are not those of ground")
+        share = np.cumsum(part[:-1]) / part[:-1].sum()
+        low, height, high = np.interp([LOWEST - SPREAD, LOWEST, LOWEST + SPREAD], share, heights)
+        alike = float(np.corrcoef(ground @ part[:-1], profile)[0, 1])
+        std = float(max((high - low) / 2, FINEST * height))
+        if not alike >= LEAST:
+            return HeightEstimate(float(height), std, False, f"levels along range are those of ground by {alike:.2f} only")
+        return HeightEstimate(float(height), std)
+
+    def _floor_of(self, frame: Above, sonar: Sonar) -> FloorProfile:
+        """Level ground as this sonar sees it, kept for the frames that follow."""
+        pose = None if frame.poses is None else frame.poses[0]
+        pitch = self.pitch_rad if self.pitch_rad is not None else (None if pose is None else float(pose[3]))
+        if pitch is None or not np.isfinite(pitch):
+            raise MitsonarError("the height needs the pitch: the frames lack poses; give pitch_deg")
+        roll = 0.0 if pose is None or not np.isfinite(pose[4]) else float(pose[4])
+        views = tuple(frame.values) if isinstance(frame, ViewFrames) else ()
+        key = (sonar.model_dump_json(), views, round(pitch, 4), round(roll, 4))
+        if key not in self._floors:
+            self._floors[key] = FloorProfile(sonar, pitch, roll, _weight_of(sonar, views))
+        return self._floors[key]
+
+
+def _profile_of(frame: Above) -> tuple[Array, Sonar]:
+    """Levels along range, summed over beams and views, and the sonar."""
+    if len(frame) != 1:
+        raise MitsonarError(f"a height is that of one frame: got {len(frame)}")
+    if isinstance(frame, ViewFrames):
+        return frame.profiles().sum(axis=(0, 1), dtype=float), next(iter(frame.sonars.values()))
+    if frame.level != "linear":
+        raise MitsonarError(f"heights are told from linear images: got {frame.level}; convert them first")
+    half = (frame.range_m[-1] - frame.range_m[0]) / max(1, len(frame.range_m) - 1) / 2
+    window = {"range_min": frame.range_m[0] - half, "range_max": frame.range_m[-1] + half}
+    beams = {"beams": len(frame.bearing_rad), "range_bins": len(frame.range_m)}
+    return frame.image[0].sum(axis=1, dtype=float), frame.sonar.replace(**window, **beams)
+
+
+def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
+    """How often each ray is in the sum of the views."""
+    known = [view for view in views if view in SEGMENTS]
+    if not known:
+        return None
+    rays = np.sum([Segment(sonar, view).member for view in known], axis=0, dtype=float)
+    shape = (sonar.rays_per_beam, sonar.beams, -1)
+    return np.asarray(rays.reshape(shape).sum(axis=2))
+
+
+def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float | None:
+    """The height at which level ground correlates best with a profile; None where no height shows ground in the window."""
+    heights = np.geomspace(max(edges[0], edges[-1] / 1e3) / floor.farthest, edges[-1] / floor.nearest, CANDIDATES)
+    ground = floor.at(heights, edges)
+    ground -= ground.mean(axis=1, keepdims=True)
+    size = np.linalg.norm(ground, axis=1)
+    lit = size > 0
+    if not lit.any():
+        return None
+    alike = (ground[lit] / size[lit, None]) @ (profile - profile.mean())
+    return float(heights[lit][int(alike.argmax())])

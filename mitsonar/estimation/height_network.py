@@ -1,0 +1,104 @@
+"""The height estimator that a checkpoint is: a network of one frame, or one vector (Almanza-Medina, 4.5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.height import Above, HeightEstimate
+from mitsonar.estimation.trained import Instrument, Trained, answer_of, one_thread
+from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.viewframes import ViewFrames
+
+__all__ = ["HeightNetwork"]
+
+BEYOND = 0.1
+"""Answers beyond the heights of training by this part of their interval are not believed."""
+
+
+@dataclass(init=False, eq=False)
+class HeightNetwork(Trained):
+    """A trained network that tells heights.
+
+    Args:
+        checkpoint: of it; it must take one frame.
+        force: go on with another sonar than that of training.
+
+    Raises:
+        MitsonarError: a checkpoint of motions.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
+        if checkpoint.arrangement["frames"] != 1:
+            raise MitsonarError(
+                f"this {checkpoint.network} tells motions of {checkpoint.arrangement['frames']} frames, not heights: give "
+                "one that was trained with input.frames: 1, or direct"
+            )
+        self.force = force
+        self._take(checkpoint)
+
+    @property
+    def views(self) -> tuple[str, ...] | None:
+        """Names of the views that it reads; None: a single image."""
+        words = self._checkpoint.arrangement
+        single = len(words["views"]) == 1 and "image" in words["views"][0]
+        return None if single else tuple(words["views"])
+
+    @property
+    def kind(self) -> str:
+        """``image`` or ``vector``."""
+        return str(self._checkpoint.arrangement["kind"])
+
+    def height(self, frame: Above) -> HeightEstimate:
+        """The height that the network says; its standard deviation is that of validation.
+
+        Raises:
+            MitsonarError: not one frame, other views or another sonar than those of training.
+        """
+        if len(frame) != 1:
+            raise MitsonarError(f"a height is that of one frame: got {len(frame)}")
+        with torch.inference_mode(), one_thread():
+            targets, _ = self._checkpoint.decode(answer_of(self._network, self._input(frame)))
+        height, coder = float(targets[0, 0]), self._checkpoint.coder
+        if not np.isfinite(height):
+            return HeightEstimate(np.nan, np.nan, False, "the network's answer is not finite")
+        low, high = float(coder.low[0]), float(coder.high[0])
+        known = [found["rmse"][0] / 1e3 for found in self._checkpoint.metrics.values() if found.get("rmse")]
+        std = float(np.sqrt(np.mean(np.square(known)))) if known else np.nan
+        if not low - BEYOND * (high - low) <= height <= high + BEYOND * (high - low):
+            return HeightEstimate(
+                height, std, False, f"{height:.2f} m is beyond the heights of training, {low:g}..{high:g} m"
+            )
+        return HeightEstimate(height, std)
+
+    def _input(self, frame: Above) -> Any:
+        """What the network reads, a batch of one."""
+        names = self._checkpoint.arrangement["views"]
+        if isinstance(frame, ViewFrames):
+            self._check(frame, names)
+            axes = {view: (frame.sonars[view].range_m, frame.bearing_rad[view]) for view in names}
+            values = {view: torch.from_numpy(np.asarray(frame.values[view])[None]) for view in names}
+            if frame.kind == "vector":  # noise has been drawn before
+                values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
+        elif len(names) == 1:
+            self._check_instrument(names[0], Instrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
+            axes = {names[0]: (frame.range_m, frame.bearing_rad)}
+            values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
+        else:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} is given {', '.join(names)}: use a data set that holds them"
+            )
+        return self._arranged(axes)(values, torch.arange(1)[None], 0)
+
+    def _check(self, frame: ViewFrames, names: list[str]) -> None:
+        lacking = [view for view in names if view not in frame.values]
+        if lacking:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} is given {', '.join(names)}: got {', '.join(frame.values)}"
+            )
+        for view in names:
+            self._check_instrument(view, Instrument.of(frame.sonars[view]))

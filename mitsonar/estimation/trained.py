@@ -1,0 +1,202 @@
+"""What all estimators that a checkpoint makes have in common: the network, its sonar, and doubts that need no images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from mitsonar.dataset.arrangement import Arrangement
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import INPUTS
+from mitsonar.frames import SonarFrames
+from mitsonar.geometry import cartesian_map
+from mitsonar.metrics import AXES, in_units
+from mitsonar.motion import Motion
+from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.create import called
+from mitsonar.noise import NoiseModel
+from mitsonar.sonar import Sonar
+from mitsonar.viewframes import ViewFrames
+
+__all__ = ["ANGLE_OFF_DEG", "BEYOND", "HEIGHT_OFF", "Instrument", "Trained", "answer_of", "inputs_of", "one_thread"]
+
+Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Ranges of the bins and bearings of the beams."""
+
+BEYOND = 1.2
+"""Answers beyond the motions of training by this factor are not believed."""
+
+HEIGHT_OFF, ANGLE_OFF_DEG = 0.1, 2.0
+"""How far height, as part of it, and pitch and roll may be from those that training has fixed."""
+
+WINDOW_OFF = 0.02
+"""How far window and field of view may be from those of training, as part of them."""
+
+
+class Instrument(NamedTuple):
+    """The numbers of a sonar that a network knows from training."""
+
+    name: str
+    bins: int
+    beams: int
+    window_m: tuple[float, float]
+    azimuth_fov_deg: float
+    elevation_fov_deg: float
+    bearing: str
+
+    @classmethod
+    def of(cls, sonar: Sonar) -> Instrument:
+        """As the sonar says."""
+        return cls.in_frames(sonar, sonar.range_m, sonar.bearing_rad)
+
+    @classmethod
+    def in_frames(cls, sonar: Sonar, range_m: NDArray[np.float64], bearing_rad: NDArray[np.float64]) -> Instrument:
+        """Of a sonar whose frames have these bins and beams."""
+        half = (range_m[-1] - range_m[0]) / max(1, len(range_m) - 1) / 2
+        span = (bearing_rad[-1] - bearing_rad[0]) * len(bearing_rad) / max(1, len(bearing_rad) - 1)
+        window = (float(range_m[0] - half), float(range_m[-1] + half))
+        size = (len(range_m), len(bearing_rad))
+        return cls(sonar.name, *size, window, math.degrees(span), sonar.elevation_fov_deg, sonar.bearing)
+
+    def unlike(self, other: Instrument) -> str:
+        """The numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
+        found = []
+        for what in ("bins", "beams", "bearing"):
+            if getattr(self, what) != getattr(other, what):
+                found.append(f"{what} {getattr(other, what)}, not {getattr(self, what)}")
+        for what in ("azimuth_fov_deg", "elevation_fov_deg"):
+            mine, its = getattr(self, what), getattr(other, what)
+            if abs(its - mine) > WINDOW_OFF * mine:
+                found.append(f"{what} {its:.4g}, not {mine:.4g}")
+        ends = zip(self.window_m, other.window_m, strict=True)
+        if any(abs(its - mine) > WINDOW_OFF * self.window_m[1] for mine, its in ends):
+            mine, its = (f"{near:.3g}..{far:.3g} m" for near, far in (self.window_m, other.window_m))
+            found.append(f"window {its}, not {mine}")
+        return "; ".join(found)
+
+
+@dataclass(init=False, eq=False)
+class Trained:
+    """A network with its weights.
+
+    Attributes:
+        digest: of the network.
+        force: go on with another sonar than that of training.
+        inputs: what it is given beside the images.
+    """
+
+    digest: str
+    force: bool
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Lowest and highest of training [m]."""
+        low, high = self._checkpoint.stands["height_m"]
+        return float(low), float(high)
+
+    def _take(self, checkpoint: Checkpoint) -> None:
+        """What computes is no field: files and comparisons of options need the digest only."""
+        self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
+        self._checkpoint, self._network = checkpoint, checkpoint.build()
+        self._trained = {view: Instrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
+        self._last: tuple[bytes, Arrangement] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For other processes: torch would share its tensors through file descriptors."""
+        return {**asdict(self), "content": self._checkpoint.to_bytes()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        content = state.pop("content")
+        vars(self).update(state)
+        self._take(Checkpoint.from_bytes(content))
+
+    def _check_instrument(self, view: str, has: Instrument) -> None:
+        """Refuse another sonar than that of training, unless it is forced."""
+        unlike = self._trained[view].unlike(has) if view in self._trained and not self.force else ""
+        if unlike:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} was trained on the sonar {self._trained[view].name}, the frames are of "
+                f"{has.name}: {unlike}; train on that sonar, use corrnet or direct, or force it with RUN:force=1"
+            )
+
+    def _arranged(self, axes: dict[str, Axes]) -> Arrangement:
+        """From frames of these views to the network's input; kept, since it is that of the frames before."""
+        key = b"".join(axis.tobytes() for both in axes.values() for axis in both)
+        if self._last is None or self._last[0] != key:
+            words = self._checkpoint.arrangement
+            maps = {}
+            if words["coordinates"] != "polar":
+                maps = {view: cartesian_map(*both, words["cartesian_rows"]) for view, both in axes.items()}
+            beams = {view: len(bearing_rad) for view, (_, bearing_rad) in axes.items()}
+            made = Arrangement(tuple(axes), words["kind"], words["layout"], words["coordinates"], NoiseModel(), beams, maps)
+            made = replace(made, range_levels=words.get("range_levels"), halves=words.get("halves", False))
+            self._last = key, made
+        return self._last[1]
+
+    # ---------------------------------------------------------------- doubts
+
+    def _doubt_of_standing(self, frames: SonarFrames | ViewFrames) -> str:
+        """Whether the sonar stood as in training, as far as the frames tell; networks that are given it need not."""
+        if self._checkpoint.arrangement["ground"]:
+            return ""
+        stands = self._checkpoint.stands
+        low, high = stands["height_m"]
+        heights = [np.nanmean(frames.height_m)] if frames.height_m is not None and np.isfinite(frames.height_m).any() else []
+        if heights and frames.poses is not None:  # over z = 0: straight below there may be a rock
+            heights.append(frames.poses[:, 2].mean())
+        if heights and not any(low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF) for height in heights):
+            return f"the sonar stood at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
+        if frames.poses is not None:
+            for name, column in (("pitch", 3), ("roll", 4)):
+                angle = math.degrees(frames.poses[:, column].mean())
+                if abs(angle - stands[f"{name}_deg"]) > ANGLE_OFF_DEG:
+                    return f"the sonar had a {name} of {angle:.1f} deg: {self._checkpoint.fixed} are fixed by training"
+        return ""
+
+    def _doubt_of_size(self, motion: Motion) -> str:
+        """Whether the answer is of the size that training had."""
+        coder = self._checkpoint.coder
+        middle, half = (coder.low + coder.high) / 2, (coder.high - coder.low) / 2
+        beyond = np.abs(np.array(motion) - middle) > BEYOND * half
+        if not beyond.any():
+            return ""
+        axis = int(beyond.argmax())
+        value, low, high = in_units(np.array([motion, coder.low, coder.high]))[:, axis]
+        name, unit, _ = AXES[axis]
+        return f"{name} {value:.3g} {unit} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
+
+
+def inputs_of(checkpoint: Checkpoint) -> str:
+    """What a network is given beside the images, for tables."""
+    return INPUTS if checkpoint.arrangement["ground"] else f"nothing; {checkpoint.fixed} fixed by training"
+
+
+def answer_of(network: nn.Module, inputs: Any) -> Any:
+    """What a network answers; several inputs come as a tuple.
+
+    Raises:
+        MitsonarError: inputs of a size that it cannot take.
+    """
+    try:
+        return called(network, inputs)
+    except RuntimeError as error:
+        raise MitsonarError(f"the network cannot take these frames: {error}") from None
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch computes with one thread: a pair is too small for more, and pairs are for the processes to share."""
+    had = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(had)
