@@ -1,12 +1,17 @@
-"""Chapter 4: vectors of portions of a looking-down view, networks that read them, and what their validation has seen.
+"""Chapter 4: vectors of portions of a looking-down view, networks that read them, heights, and paths.
 
-    python benchmarks/bench_segments.py leak --out bench/segments [--width 0.5] [--minutes 20]
-    python benchmarks/bench_segments.py ours --out bench/segments [--sequences 5000] [--minutes 20]
+    python benchmarks/bench_segments.py leak --out bench/segments [--width 0.35] [--minutes 20]
+    python benchmarks/bench_segments.py ours --out bench/segments [--sequences 5000] [--minutes 20] [--rows NAME,NAME]
+    python benchmarks/bench_segments.py heights --out bench/segments
+    python benchmarks/bench_segments.py paths --out bench/segments [--rows RUN,RUN]
+    python benchmarks/bench_segments.py halves --out bench/segments --frames lamprey2_first30.npz
 
-`leak`: PoseNetVec on 1,000 pairs of circular segments from 10 m, by the chapter's schedule, its pairs dealt out one by one
-as the thesis shuffles them (`split: {by: sample}`), and by sequence; each validated on its own 5 % and on pairs of scenes
-that nobody learnt from. `ours`: ProfileNet and PoseNetVec on the same pairs of other scenes, at 1024 to 64 range levels,
-with milliseconds an estimate. What is in OUT is kept, so that a run that was broken off goes on.
+The chapter's figures and its table are made by `mitsonar reproduce 4.12`, 4.14, 4.15 and 4.5. Here: `leak`, PoseNetVec on
+1,000 pairs of circular segments from 10 m, its pairs dealt out one by one as the thesis shuffles them, and by sequence; each
+validated on its own 5 % and on pairs of scenes that nobody learnt from. `ours`, ProfileNet on many pairs of other scenes,
+in both models, with and without noise, with rays that move anew in each ping, and where two pings share no rays. `heights`,
+the direct way over rocks and hulls. `paths`, the two of 4.4.4. `halves`, networks of two halves of simulated hulls (4.4.5),
+and what they say of real frames. What is in OUT is kept, so that a run that was broken off goes on.
 """
 
 from __future__ import annotations
@@ -14,55 +19,93 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from bench_impulse import cpu
 
 from mitsonar import load_recipe
 from mitsonar.dataset.generate import make
+from mitsonar.dataset.store import DataStore
+from mitsonar.estimation.estimators import estimator_from
+from mitsonar.estimation.height import DirectHeight
+from mitsonar.estimation.view_network import ViewNetwork
+from mitsonar.frames import SonarFrames
+from mitsonar.mapping.heights import measured
+from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.results import run_odometry
+from mitsonar.mapping.view_source import open_views
+from mitsonar.metrics import in_units
+from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.noise import load_noise
 from mitsonar.training.evaluation import evaluate
 from mitsonar.training.recipe import load_training_recipe
 from mitsonar.training.run import train
 
-SEGMENTS = ["c1", "c2", "c3", "c4"]
+QUADRANTS, CONES = ["q1", "q2", "q3", "q4"], ["c1", "c2", "c3", "c4"]
 
 HEAD = (
-    "| network | levels | split | pairs to learn from | validated on | RMSE sideways / forward mm / yaw deg | high noise | "
-    "answering zero | ms |\n|---|---|---|---|---|---|---|---|---|"
+    "| row | split | pairs to learn from | validated on | RMSE sideways / forward mm / yaw deg | 95 % interval | slopes | "
+    "high noise | answering zero | ms |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["leak", "ours"])
+    parser.add_argument("what", choices=list(PARTS))
     parser.add_argument("--out", type=Path, default=Path("bench/segments"))
     parser.add_argument("--sequences", type=int, default=5000, help="that `ours` learns from, five pings each")
+    parser.add_argument("--physical", type=int, default=1200, help="the same of the physical model")
     parser.add_argument("--unseen", type=int, default=1000, help="pairs that all are judged by")
     parser.add_argument("--width", type=float, default=1.0, help="of PoseNetVec")
     parser.add_argument("--minutes", type=float, default=None, help="of each training at most")
+    parser.add_argument("--epochs", type=float, default=12, help="of ours")
+    parser.add_argument("--rows", help="of ours: names with commas; of paths: folders of runs")
+    parser.add_argument("--frames", type=Path, help="lamprey2_first30.npz of a real DIDSON at rest, for halves")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--levels", type=int, nargs="*", default=[1024, 512, 256, 128, 64])
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
-    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {asked.threads} threads\n{HEAD}", flush=True)
-    {"leak": leak, "ours": ours}[asked.what](asked)
+    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {asked.threads} threads", flush=True)
+    PARTS[asked.what](asked)
+
+
+# ---------------------------------------------------------------- data
 
 
 def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -> Path:
-    """Vectors of circular segments from 10 m up at 1024 levels, made or gone on with."""
-    words = {"store": "vectors", "segments": SEGMENTS, "name": name, "sonar.range_bins": 1024, **changes}
+    """Vectors from 10 m up at 1024 levels, made or gone on with."""
+    words = {"store": "vectors", "segments": QUADRANTS + CONES, "name": name, "sonar.range_bins": 1024, **changes}
     path = asked.out / f"{name}.zarr"
     make(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=asked.workers)
     return path
 
 
-def unseen(asked: argparse.Namespace) -> Path:
+def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: Any) -> Path:
     """Pairs, each of a sequence of its own, over other scenes."""
-    scenes = [{"count": -(-asked.unseen // 50), "sequences": 50}]
-    return data(asked, "unseen", asked.unseen, **{"seed": 7919, "scenes": scenes, "flight.pings": 2})
+    count = pairs or asked.unseen
+    scenes = [{"count": -(-count // 50), "sequences": 50}]
+    return data(asked, name, count, **{"seed": 7919, "scenes": scenes, "flight.pings": 2, **changes})
+
+
+def many(asked: argparse.Namespace) -> Path:
+    """What ours learns from in the thesis's model: 20,000 pairs."""
+    return data(asked, "many10", asked.sequences, scenes=[{"count": -(-asked.sequences // 125), "sequences": 125}])
+
+
+def physical(asked: argparse.Namespace) -> Path:
+    """And in the physical one."""
+    scenes = [{"count": -(-asked.physical // 75), "sequences": 75}]
+    return data(asked, "phys10", asked.physical, scenes=scenes, **PHYSICAL)
+
+
+PHYSICAL = {"sonar.model": "physical", "segments": CONES + QUADRANTS}
+
+
+# ---------------------------------------------------------------- trainings
 
 
 def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged: dict[str, tuple[Path, str]]) -> None:
@@ -77,12 +120,14 @@ def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged:
         report = json.loads(kept.read_text())
         mine = [table["rows"][0] for table in report["tables"]]
         said = [" / ".join(f"{v:.3g}" for v in one["rmse"]) for one in mine]
-        zero = " / ".join(f"{v:.3g}" for v in mine[0]["zero"])
+        ends = zip(mine[0]["rmse_low"], mine[0]["rmse_high"], strict=True)
+        interval = " / ".join(f"{low:.2g}..{high:.2g}" for low, high in ends)
+        zero, slopes = (" / ".join(f"{v:.3g}" for v in mine[0][key]) for key in ("zero", "slope"))
         split = recipe.split if isinstance(recipe.split, str) else recipe.split["by"]
-        levels, pairs = checkpoint.options["size"][0], json.loads((run / "run.json").read_text())["epoch_samples"]
+        pairs = json.loads((run / "run.json").read_text())["epoch_samples"]
         where_said = f"{what} ({report['pairs']} pairs)"
         print(
-            f"| {checkpoint.network} | {levels} | {split} | {pairs:,} | {where_said} | {said[0]} | {said[1]} | {zero} | "
+            f"| {name} | {split} | {pairs:,} | {where_said} | {said[0]} | {interval} | {slopes} | {said[1]} | {zero} | "
             f"{mine[0]['ms']:.2g} |",
             flush=True,
         )
@@ -90,27 +135,164 @@ def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged:
 
 def leak(asked: argparse.Namespace) -> None:
     """The chapter's way to validate, and another."""
-    learnt = data(asked, "thousand", 249)
+    print(HEAD)
+    learnt = data(asked, "thousand10", 250, segments=["whole", "starboard", *QUADRANTS, *CONES])
+    judged_by = unseen(asked, segments=["whole", "starboard", *QUADRANTS, *CONES])
     for by in ("sample", "sequence"):
         split = {"by": by, "train": 0.95, "validation": 0.05}
         words = {"split": split, "network.width": asked.width, "input.range_levels": 512, "validate.every_minutes": 2}
         recipe = load_training_recipe("portion-circular-10m-vector", words)
-        judged = {"validation": (learnt, "validation"), "unseen scenes": (unseen(asked), "all")}
+        judged = {"validation": (learnt, "validation"), "unseen scenes": (judged_by, "all")}
         row(asked, f"leak-{by}", recipe, learnt, judged)
 
 
-def ours(asked: argparse.Namespace) -> None:
-    """ProfileNet beside PoseNetVec."""
-    scenes = [{"count": -(-asked.sequences // 80), "sequences": 80}]
-    learnt = data(asked, "many", asked.sequences, scenes=scenes)
-    judged = {"unseen scenes": (unseen(asked), "all")}
-    for levels in asked.levels:
-        words = {"input.range_levels": levels, "network.lags": int(np.clip(levels // 128, 2, 8))}
-        row(asked, f"profilenet-{levels}", load_training_recipe("profilenet-circular-10m", words), learnt, judged)
-    for levels in (512, 128):
-        words = {"input.range_levels": levels, "split": "scene", "network.width": asked.width}
-        row(asked, f"posenetvec-{levels}", load_training_recipe("portion-circular-10m-vector", words), learnt, judged)
+class Ours(NamedTuple):
+    """A row of ours: what it reads, at how many levels, and what it learns from."""
 
+    views: list[str]
+    levels: int
+    noise: Any = "none"
+    model: str = "thesis"
+
+
+OURS = {
+    "circular-512": Ours(CONES, 512),
+    "circular-1024": Ours(CONES, 1024),
+    "circular-256": Ours(CONES, 256),
+    "quadrants-512": Ours(QUADRANTS, 512),
+    "circular-512-noise": Ours(CONES, 512, ["none", "high"]),
+    "quadrants-512-noise": Ours(QUADRANTS, 512, ["none", "high"]),
+    "circular-512-physical": Ours(CONES, 512, "none", "physical"),
+    "quadrants-512-physical": Ours(QUADRANTS, 512, "none", "physical"),
+    "circular-512-physical-noise": Ours(CONES, 512, ["none", "high"], "physical"),
+}
+
+
+def ours(asked: argparse.Namespace) -> None:
+    """ProfileNet on many pairs."""
+    print(HEAD)
+    everything = ["whole", "starboard", *QUADRANTS, *CONES]
+    for name in asked.rows.split(",") if asked.rows else OURS:
+        made = OURS[name]
+        words = {
+            "input.views": made.views,
+            "input.range_levels": made.levels,
+            "network.lags": int(np.clip(made.levels // 128, 2, 8)),
+            "noise": made.noise,
+            "epochs": asked.epochs,
+            "split": {"by": "scene", "train": 0.95, "validation": 0.05},
+        }
+        if made.model == "physical":
+            learnt, judged = physical(asked), {"unseen scenes": (unseen(asked, "unseenp10", 500, **PHYSICAL), "all")}
+        else:
+            learnt = many(asked)
+            moving = unseen(asked, "jitter10", 500, **{"sonar.jitter": True})
+            judged = {"unseen scenes": (unseen(asked, segments=everything), "all"), "rays that move": (moving, "all")}
+        row(asked, f"ours-{name}", load_training_recipe("profilenet-circular-10m", words), learnt, judged)
+
+
+# ---------------------------------------------------------------- heights
+
+
+def heights(asked: argparse.Namespace) -> None:
+    """The direct way, on frames of the chapter's height data sets and on those of `ours`."""
+    print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | believed | ms |\n" + 9 * "|---" + "|")
+    for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
+        path = asked.out / f"{recipe}.zarr"
+        make(load_recipe(recipe, {"store": "vectors"}), str(path), workers=asked.workers)
+        for noise in ("none", "high"):
+            print(height_row(path, recipe, noise, interval), flush=True)
+
+
+def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
+    """A line of the direct way on every fifth frame."""
+    store = DataStore.open(str(path))
+    first = open_views(str(path), [store.recipe.views[0].name], "vector", sequence=0).with_noise(load_noise(noise), 1)
+    time_s, poses, height_m = (store.read(array) for array in ("time_s", "pose", "height_m"))
+    whole = replace(first, time_s=time_s, poses=poses, height_m=height_m)  # all sequences in one
+    said, spent = [], []
+    for number in range(0, len(poses), 5):
+        frame = whole.read([number])
+        begun = time.process_time()
+        said.append(measured(frame, DirectHeight())[1][0])
+        spent.append(1e3 * (time.process_time() - begun))
+    believed = np.array([one.believe for one in said])
+    error = 100 * (np.array([one.height_m for one in said]) - poses[::5, 2])[believed]
+    rmse = np.sqrt((error**2).mean())
+    return (
+        f"| {name} | {noise} | {len(said)} | {rmse:.2f} | {rmse / interval_m:.2f} % | {np.median(np.abs(error)):.2f} | "
+        f"{error.mean():+.2f} | {100 * believed.mean():.0f} % | {np.median(spent):.0f} |"
+    )
+
+
+# ---------------------------------------------------------------- paths
+
+
+def paths(asked: argparse.Namespace) -> None:
+    """The two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
+    path = asked.out / "runs10.zarr"
+    make(load_recipe("looking-down-runs", {"sonar.range_bins": 1024}), str(path), workers=asked.workers)
+    print(
+        "| network | path | pairs | believed | RMSE sideways / forward mm / yaw deg | end off, mm (of path) |\n"
+        + 6 * "|---"
+        + "|"
+    )
+    for run in asked.rows.split(","):
+        network = ViewNetwork(Checkpoint.load(run))
+        for number, name in enumerate(("sideways_50", "sideways_54") * 2):
+            source = open_views(str(path), network.views, network.kind, sequence=number)
+            out = asked.out / "paths" / f"{Path(run).name}-{number}"
+            found = run_odometry(source, run, network, out, overwrite=True)
+            held = odometry(source, network)
+            said = dict((label, value) for label, value, _ in found.rows())
+            rmse = " / ".join(f"{value:.3g}" for label, value in said.items() if label.startswith("motion error RMSE"))
+            off = np.linalg.norm(held.path.poses[-1][:2] - source.poses[-1, :2])
+            length = np.linalg.norm(np.diff(source.poses[:, :2], axis=0), axis=1).sum()
+            print(
+                f"| {Path(run).name} | {name}, scene {number // 2} | {len(found.estimates)} | {int(found.believed.sum())} | "
+                f"{rmse} | {1e3 * off:.0f} ({100 * off / length:.1f} %) |",
+                flush=True,
+            )
+
+
+# ---------------------------------------------------------------- halves
+
+
+def halves(asked: argparse.Namespace) -> None:
+    """Two halves of a forward-looking sonar, learnt on simulated hulls with the chapter's noise (4.4.5)."""
+    print(HEAD)
+    learnt = asked.out / "hulls.zarr"
+    make(load_recipe("ship-hull"), str(learnt), sequences=300, workers=asked.workers)
+    other = asked.out / "hulls-unseen.zarr"
+    make(load_recipe("ship-hull", {"seed": 7919, "name": "hulls-unseen"}), str(other), sequences=100, workers=asked.workers)
+    noise = "0.04,0.02,0.04"
+    words = {"input": {"kind": "vector", "halves": True}, "noise": noise, "data": "ship-hull", "data_changes": {}}
+    for name, recipe in (
+        ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**words, "network.width": asked.width})),
+        ("halves-profilenet", load_training_recipe("profilenet-quadrants", {**words, "batch": 16, "epochs": 60})),
+    ):
+        row(asked, name, recipe, learnt, {"unseen scenes": (other, "all")})
+        if asked.frames is not None:
+            network = estimator_from(f"{asked.out / 'runs' / name}:force=1")
+            frames = lamprey(asked.frames)
+            pairs = [network.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
+            told = in_units(np.array([one.motion for one in pairs]))
+            believed = sum(one.believe for one in pairs)
+            mean, spread = (" / ".join(f"{v:.3g}" for v in fold(told, axis=0)) for fold in (np.mean, np.std))
+            print(f"{name}, {len(pairs)} pairs of a DIDSON at rest: mean {mean}, spread {spread}, {believed} believed")
+
+
+def lamprey(path: Path) -> SonarFrames:
+    """The recording lamprey2 of a DIDSON at rest as beams and bins, as if its window were that of the simulated one."""
+    fans = np.load(path)["frames"].astype(np.float32)
+    sonar = load_recipe("ship-hull").instrument
+    radius, bearing = np.meshgrid(np.linspace(37, 809.5, sonar.range_bins), sonar.bearing_rad, indexing="ij")
+    across, down = (axis.astype(np.float32) for axis in (199.1 + radius * np.sin(bearing), 810.1 - radius * np.cos(bearing)))
+    image = np.stack([cv2.remap(fan, across, down, cv2.INTER_LINEAR) for fan in fans]) / 255
+    return SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(len(image)) / 10.0, sonar)
+
+
+PARTS = {"leak": leak, "ours": ours, "heights": heights, "paths": paths, "halves": halves}
 
 if __name__ == "__main__":
     main()

@@ -11,6 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from helpers import Command
+
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
@@ -34,8 +36,9 @@ def run(command: list[str], folder: Path) -> str:
     return done.stdout
 
 
-def test_commands_and_python_blocks_run_in_order(tmp_path: Path) -> None:
-    """In a folder that holds the scenes, as a checkout does; blocks may use what commands have made."""
+def test_commands_and_python_blocks_run_in_order(tmp_path: Path, mitsonar: Command) -> None:
+    """In a folder that holds the scenes, as a checkout does; blocks may use what commands have made. Commands share a
+    process, which saves twenty starts."""
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     assert len(COMMANDS) >= 12
     assert FOR_TORCH
@@ -47,7 +50,8 @@ def test_commands_and_python_blocks_run_in_order(tmp_path: Path) -> None:
         fewer = ["--frames", "2"] if "--trajectory" in command and "out/run" not in command else []
         fewer += ["--pairs", FEW[command[1]]] if command[1] in FEW else []
         fewer += ["--sequences", "2"] if "impulse-standard" in command else []
-        run(["-m", *command, *fewer], tmp_path)
+        done = mitsonar(*command[1:], *fewer, cwd=tmp_path)
+        assert done.returncode == 0, (command, done.stderr)
     for code in [*PYTHON, *(FOR_TORCH if has_torch else [])]:
         assert run(["-c", code.replace("in range(2)", "in range(1)")], tmp_path)  # one epoch
 

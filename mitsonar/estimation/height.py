@@ -13,6 +13,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.floor import FloorProfile
 from mitsonar.frames import SonarFrames
 from mitsonar.simulation.segments import SEGMENTS, Segment
+from mitsonar.simulation.views import Whole
 from mitsonar.sonar import Sonar
 from mitsonar.viewframes import ViewFrames
 
@@ -168,11 +169,19 @@ def _profile_of(frame: Above) -> tuple[Array, Sonar]:
 
 
 def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
-    """How often each ray is in the sum of the views."""
-    known = [view for view in views if view in SEGMENTS]
-    if not known:
+    """How often each ray is in the sum of the views; None where all are alike.
+
+    Raises:
+        MitsonarError: receivers of a bistatic sonar, whose ranges are others.
+    """
+    if views in ((), (Whole.name,)):
         return None
-    rays = np.sum([Segment(sonar, view).member for view in known], axis=0, dtype=float)
+    others = [view for view in views if view not in SEGMENTS]
+    if others:
+        raise MitsonarError(
+            f"heights are told directly from a sonar's image or portions of its view: {others[0]} is a receiver apart from it"
+        )
+    rays = np.sum([Segment(sonar, view).member for view in views], axis=0, dtype=float)
     shape = (sonar.rays_per_beam, sonar.beams, -1)
     return np.asarray(rays.reshape(shape).sum(axis=2))
 

@@ -12,6 +12,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.height import Above, HeightEstimate
 from mitsonar.estimation.trained import Instrument, Trained, answer_of, one_thread
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.simulation.views import Whole
 from mitsonar.viewframes import ViewFrames
 
 __all__ = ["HeightNetwork"]
@@ -44,9 +45,8 @@ class HeightNetwork(Trained):
     @property
     def views(self) -> tuple[str, ...] | None:
         """Names of the views that it reads; None: a single image."""
-        words = self._checkpoint.arrangement
-        single = len(words["views"]) == 1 and "image" in words["views"][0]
-        return None if single else tuple(words["views"])
+        views = tuple(self._checkpoint.arrangement["views"])
+        return None if views == (Whole.name,) else views
 
     @property
     def kind(self) -> str:
