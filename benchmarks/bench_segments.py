@@ -35,7 +35,6 @@ from mitsonar.estimation.height import DirectHeight
 from mitsonar.estimation.view_network import ViewNetwork
 from mitsonar.frames import SonarFrames
 from mitsonar.mapping.heights import measured
-from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.results import run_odometry
 from mitsonar.mapping.view_source import open_views
 from mitsonar.metrics import in_units
@@ -195,7 +194,7 @@ def ours(asked: argparse.Namespace) -> None:
 
 
 def heights(asked: argparse.Namespace) -> None:
-    """The direct way, on frames of the chapter's height data sets and on those of `ours`."""
+    """The direct way, on frames of the chapter's height data sets."""
     print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | believed | ms |\n" + 9 * "|---" + "|")
     for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
         path = asked.out / f"{recipe}.zarr"
@@ -230,6 +229,8 @@ def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
 
 def paths(asked: argparse.Namespace) -> None:
     """The two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
+    if not asked.rows:
+        raise SystemExit("paths needs --rows: folders of trained networks of c1..c4 from 10 m, with commas between them")
     path = asked.out / "runs10.zarr"
     make(load_recipe("looking-down-runs", {"sonar.range_bins": 1024}), str(path), workers=asked.workers)
     print(
@@ -243,10 +244,9 @@ def paths(asked: argparse.Namespace) -> None:
             source = open_views(str(path), network.views, network.kind, sequence=number)
             out = asked.out / "paths" / f"{Path(run).name}-{number}"
             found = run_odometry(source, run, network, out, overwrite=True)
-            held = odometry(source, network)
             said = dict((label, value) for label, value, _ in found.rows())
             rmse = " / ".join(f"{value:.3g}" for label, value in said.items() if label.startswith("motion error RMSE"))
-            off = np.linalg.norm(held.path.poses[-1][:2] - source.poses[-1, :2])
+            off = np.linalg.norm(found.path.poses[-1][:2] - source.poses[-1, :2])
             length = np.linalg.norm(np.diff(source.poses[:, :2], axis=0), axis=1).sum()
             print(
                 f"| {Path(run).name} | {name}, scene {number // 2} | {len(found.estimates)} | {int(found.believed.sum())} | "

@@ -15,12 +15,16 @@ from helpers import DOWN, Command, floor, floor_levels, refused, scene, tiny_rec
 from mitsonar.dataset.generate import make
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.floor import FloorProfile
 from mitsonar.estimation.height import DirectHeight
 from mitsonar.estimation.heights import height_estimator_from
 from mitsonar.frames import SonarFrames
 from mitsonar.mapping.heights import measured
+from mitsonar.mapping.odometry import estimate_motions
 from mitsonar.mapping.source import FrameSource
+from mitsonar.mapping.view_source import open_views
+from mitsonar.motion import Motion
 from mitsonar.noise import NOISE_MODELS
 from mitsonar.presets import load_sonar
 from mitsonar.simulation.imaging import Simulator
@@ -175,7 +179,54 @@ def test_measured_heights_hide_the_true_ones() -> None:
     empty = replace(pings, image=np.where(np.arange(3)[:, None, None] == 1, 0, pings.image))
     found, said = measured(empty, DirectHeight())
     assert [one.believe for one in said] == [True, False, True]
-    assert found.height_m[1] == np.median(found.height_m[[0, 2]])
+    np.testing.assert_array_equal(np.isfinite(found.height_m), [True, False, True])
+
+
+def test_frames_that_tell_no_height_are_bridged() -> None:
+    """Two that hold nothing, among others: these two are not believed, and the rest goes on."""
+    sonar = sonar_ahead("thesis").replace(range_min=1.8)
+    poses = np.tile([0, 0, 2.5, np.radians(35), 0, 0], (6, 1))
+    poses[:, 1] += 0.005 * np.arange(6)
+    pings = Simulator(scene(floor=floor()), sonar).render(poses)
+    lost = replace(pings, image=np.where(np.isin(np.arange(6), [3, 4])[:, None, None], 0, pings.image))
+    source = FrameSource.of(lost).with_heights_by(DirectHeight())
+    said = estimate_motions(source, Told(), np.arange(6))
+    assert [one.believe for one in said] == [True, True, True, False, True]
+    assert said[3].reason == "no height was found in the frames"
+
+
+class Told:
+    """An estimator that needs a height, and says nothing else."""
+
+    inputs = "height"
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        assert frames.height_m is not None
+        assert np.isfinite(frames.height_m).any()
+        return Estimate(Motion(0.0, 0.0, 0.0))
+
+
+def test_portions_as_images_know_their_rays(tmp_path: Path, mitsonar: Command) -> None:
+    """An image of a cone, read as that of the whole view, would tell 3 % too much."""
+    url = tmp_path / "cones.zarr"
+    changes = {"segments": ["c1", "whole"], "store": "both", "scenes": [{"count": 1, "sequences": 2}]}
+    make(tiny_recipe(**{**LOW, **changes}), str(url))
+    store = DataStore.open(str(url))
+    true = store.read("pose")[0, 2]
+    for view in ("c1", "whole"):
+        done = mitsonar("height", url, "--view", view, "--sequence", 0, "-o", tmp_path / f"{view}.csv")
+        assert done.returncode == 0, done.stderr
+        assert f"images of {view}" in done.stdout
+        rows = list(csv.DictReader((tmp_path / f"{view}.csv").open()))
+        assert abs(float(rows[0]["height_m"]) - true) < 0.1 * true
+    vectors = open_views(str(url), ["c1"], "vector", sequence=0).read([0])
+    images = open_views(str(url), ["c1"], "image", sequence=0).read([0])
+    both = [DirectHeight().height(one).height_m for one in (vectors, images)]
+    assert abs(both[0] - both[1]) < 0.01 * true
+    with pytest.raises(MitsonarError, match="has no vectors of view 'q1'"):
+        open_views(str(url), ["c1"], "vector").with_heights_by(DirectHeight(views=("q1",)))
+    words = ("--height-by", "direct", "--height", "2.5", "-o", tmp_path / "path")
+    refused(mitsonar("odometry", url, "--view", "whole", *words), "give one of them")
 
 
 class TestNetworks:
@@ -201,7 +252,6 @@ class TestNetworks:
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:
         from mitsonar.dataset.pairs import SonarPairs
         from mitsonar.estimation.height_network import HeightNetwork
-        from mitsonar.mapping.view_source import open_views
         from mitsonar.training.evaluation import predictions
 
         words = {"kind": "vector", "frames": 1, "views": ["whole", "c2"]}
@@ -218,8 +268,18 @@ class TestNetworks:
         done = mitsonar("height", heights, "--by", tmp_path / "run", "--sequence", 2)
         assert done.returncode == 0, done.stderr
         assert "vectors of whole, c2" in done.stdout
-        far = HeightNetwork(replace(kept, labels={**kept.labels, "low": [50.0], "high": [60.0]}))
-        assert not far.height(source.read([0])).believe or 49 < far.height(source.read([0])).height_m < 61
+        for answer, believed in ((0.5, True), (1.05, True), (1.2, False), (-0.2, False)):
+            far = HeightNetwork(kept)
+            far._network = lambda inputs, place=answer: self.torch.tensor([[20.0 * place - 10.0]])
+            said = far.height(source.read([0]))
+            assert said.believe is believed
+            assert ("beyond the heights of training" in said.reason) is not believed
+        level = source.read([0])
+        assert level.poses is not None
+        tilted = replace(level, poses=level.poses - [0, 0, 0, 0.2, 0, 0])
+        assert "had a pitch of 78.5 deg" in estimator.height(tilted).reason
+        blank = replace(level, values={view: 0 * one for view, one in level.values.items()})
+        assert "nothing in the frame" in estimator.height(blank).reason
         motions = self.trained(heights, tmp_path / "motions", input={"kind": "vector", "views": ["c1"]})
         with pytest.raises(MitsonarError, match="tells motions of 2 frames, not heights"):
             HeightNetwork(motions)
@@ -228,7 +288,6 @@ class TestNetworks:
         self, heights: Path, tmp_path: Path, mitsonar: Command
     ) -> None:
         from mitsonar.estimation.estimators import estimator_from
-        from mitsonar.mapping.view_source import open_views
 
         runs = []
         for name, seed in (("low", 0), ("high", 1)):
@@ -243,7 +302,7 @@ class TestNetworks:
         assert pair.height_m is not None
         assert both.estimate(pair).motion == both.chosen(pair.height_m.mean()).estimate(pair).motion
         assert both.networks[0].estimate(pair).motion != both.networks[1].estimate(pair).motion
-        with pytest.raises(MitsonarError, match="give --height or --height-by"):
+        with pytest.raises(MitsonarError, match="measure it with --height-by direct"):
             both.estimate(replace(pair, height_m=None))
         with pytest.raises(MitsonarError, match="zero was not trained at a height"):
             estimator_from(f"zero,{runs[0]}")

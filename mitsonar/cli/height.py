@@ -33,7 +33,7 @@ def height(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="CSV file to write, a line a frame.")] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
-    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first; of vectors: whole, or all).")] = None,
+    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first; of portions: whole, or all).")] = None,
     noise: Annotated[str, typer.Option(help="Added: none, low, high, m,s,g or a YAML file.")] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
@@ -49,11 +49,13 @@ def height(
         raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or --overwrite")
     estimator = height_estimator_from(by)
     source: FrameSource | ViewSource
-    views = estimator.views or _stored_vectors(frames, view)
-    if views is not None:
+    portions = _portions(frames, view) if estimator.views is None else (estimator.views, estimator.kind)
+    if estimator.views is not None and view is not None:
+        raise MitsonarError(f"--view is not for {by}, which reads {', '.join(estimator.views)}: leave it out")
+    if portions is not None:
         if pitch_deg is not None:
             raise MitsonarError("--pitch-deg is for frames without poses: a data set tells them")
-        source = views_from(frames, views, estimator.kind, sequence, noise, seed)
+        source = views_from(frames, *portions, sequence, noise, seed)
     else:
         source = frames_from(frames, sequence, view, noise, seed, None, pitch_deg)
     if source.note:
@@ -72,19 +74,20 @@ def height(
     say(f"{len(said):,} heights by {by} ({estimator.inputs})" + (f", in {out}" if out is not None else ""))
 
 
-def _stored_vectors(where: str, view: str | None) -> tuple[str, ...] | None:
-    """Views of a data set that holds vectors and no images; None elsewhere."""
+def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | None:
+    """Views and their kind, of a data set that holds vectors alone, or portions of a view; None elsewhere."""
     from mitsonar.dataset.image_recording import array_names
     from mitsonar.dataset.store import DataStore
     from mitsonar.mapping.source import is_data_set
 
     if not is_data_set(where):
         return None
-    stored = list(array_names(DataStore.open(where).recipe).values())
-    if any(kind == "image" for kind, _ in stored):
+    recipe = DataStore.open(where).recipe
+    kind = "image" if "image" in recipe.kinds else "vector"
+    if kind == "image" and not recipe.segments:
         return None
-    names = tuple(name for kind, name in stored if kind == "vector")
-    return (view,) if view is not None else ("whole",) if "whole" in names else names
+    names = tuple(name for stored, name in array_names(recipe).values() if stored == kind)
+    return (view,) if view is not None else ("whole",) if "whole" in names else names, kind
 
 
 def _csv(time_s: np.ndarray, said: list[HeightEstimate], true: np.ndarray | None) -> str:

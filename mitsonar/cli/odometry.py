@@ -97,6 +97,8 @@ def odometry(
                 raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")
             seen: FrameSource | ViewSource = views_from(frames, views, kind, sequence, noise, seed)
         else:
+            if height is not None and height_by is not None:
+                raise MitsonarError("--height tells the height and --height-by measures it: give one of them")
             seen = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
         if height_by is not None:
             from mitsonar.estimation.heights import height_estimator_from

@@ -33,7 +33,8 @@ def reproduce(
         int | None, typer.Option(help="Pairs of a step (default: the recipe's); the rate grows with the square root.")
     ] = None,
     change: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE of all recipes: precision=bf16-mixed.")
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE of all recipes whose row has no value of its own: precision=bf16-mixed."),
     ] = None,
     workers: Annotated[int | None, typer.Option(help="Processes that render (default: this machine's cores).")] = None,
     accelerator: Annotated[str, typer.Option(help="Lightning's: auto, cpu, gpu ...")] = "auto",
@@ -81,7 +82,7 @@ def _list() -> None:
     for table in load_tables().values():
         say(f"\n{table.name}  {table.title}")
         for row in table.rows:
-            errors = (row.said(printed) for printed in row.printed.values())
+            errors = [row.said(row.printed.get(noise)) for noise in table.noises] if row.printed else []
             say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")
 
 

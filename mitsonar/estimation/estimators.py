@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.estimation.direct import Direct
@@ -18,7 +18,18 @@ from mitsonar.estimation.phase import Phase
 from mitsonar.estimation.zero import Zero
 from mitsonar.networks.shipped import SHIPPED, shipped_path
 
-__all__ = ["ESTIMATORS", "NAMES", "create_estimator", "estimator_from", "options_from"]
+if TYPE_CHECKING:
+    from mitsonar.networks.checkpoint import Checkpoint
+
+__all__ = [
+    "ESTIMATORS",
+    "NAMES",
+    "checkpoint_at",
+    "create_estimator",
+    "estimator_from",
+    "names_checkpoint",
+    "options_from",
+]
 
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {
     "zero": Zero,
@@ -59,7 +70,7 @@ def estimator_from(text: str) -> Estimator:
     name, *words = text.split(":")
     if name in NAMES:
         return create_estimator(name, **options_from(name, words, _maker(name)))
-    if "/" not in name and "." not in name and not Path(name).is_dir():
+    if not names_checkpoint(name):
         names = nearest_names(name, NAMES)
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
     made = _trained(name)
@@ -93,16 +104,31 @@ def _trained(path: str | Path) -> Callable[..., Estimator]:
     Raises:
         MitsonarError: no torch, no such checkpoint or one that cannot be used.
     """
+    checkpoint = checkpoint_at(path)
+    from mitsonar.estimation.network import Network
+    from mitsonar.estimation.view_network import ViewNetwork, reads_views
+
+    return partial(ViewNetwork if reads_views(checkpoint) else Network, checkpoint)
+
+
+def names_checkpoint(name: str) -> bool:
+    """Whether a word of the command line is a path, and no name."""
+    return "/" in name or "." in name or Path(name).is_dir()
+
+
+def checkpoint_at(path: str | Path) -> Checkpoint:
+    """A checkpoint.
+
+    Raises:
+        MitsonarError: no torch, no such checkpoint or one that cannot be used.
+    """
     try:
-        from mitsonar.estimation.network import Network
-        from mitsonar.estimation.view_network import ViewNetwork, reads_views
         from mitsonar.networks.checkpoint import Checkpoint
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "torch":
             raise
         raise MitsonarError("a network computes with torch: pip install 'mitsonar[learn]'") from None
-    checkpoint = Checkpoint.load(path)
-    return partial(ViewNetwork if reads_views(checkpoint) else Network, checkpoint)
+    return Checkpoint.load(path)
 
 
 def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from mitsonar.simulation.views import Whole
 from mitsonar.sonar import Sonar
 from mitsonar.viewframes import ViewFrames
 
-__all__ = ["Above", "DirectHeight", "HeightEstimate", "HeightEstimator"]
+__all__ = ["Above", "DirectHeight", "HeightEstimate", "HeightEstimator", "doubt_of_profile", "profile_of"]
 
 Above = SonarFrames | ViewFrames
 """One frame, or one ping of several views."""
@@ -37,6 +37,9 @@ least against the true height, from 2.5 and from 10 m."""
 
 SPREAD = 0.1
 """Quantiles this far to either side tell how sure that is."""
+
+KEPT = 16
+"""Attitudes, to a milliradian, whose profiles of level ground are kept."""
 
 FINEST = 0.004
 """Least standard deviation, as part of the height."""
@@ -116,11 +119,10 @@ class DirectHeight:
         Raises:
             MitsonarError: not one frame; neither a pitch that was given nor poses; a sonar that sees no ground.
         """
-        profile, sonar = _profile_of(frame)
-        if not np.isfinite(profile).all():
-            raise MitsonarError("the frame holds nan or inf: set pixels without echo to 0")
-        if not np.ptp(profile) > 0:
-            return HeightEstimate(np.nan, np.nan, False, "nothing in the frame to tell a height from")
+        profile, sonar = profile_of(frame)
+        doubt = doubt_of_profile(profile)
+        if doubt:
+            return HeightEstimate(np.nan, np.nan, False, doubt)
         floor = self._floor_of(frame, sonar)
         edges = np.linspace(sonar.range_min, sonar.range_max, len(profile) + 1)
         guess = _nearest_alike(profile, floor, edges)
@@ -148,24 +150,43 @@ class DirectHeight:
             raise MitsonarError("the height needs the pitch: the frames lack poses; give pitch_deg")
         roll = 0.0 if pose is None or not np.isfinite(pose[4]) else float(pose[4])
         views = tuple(frame.values) if isinstance(frame, ViewFrames) else ()
-        key = (sonar.model_dump_json(), views, round(pitch, 4), round(roll, 4))
+        pitch, roll = round(pitch, 3), round(roll, 3)
+        key = (sonar.model_dump_json(), views, pitch, roll)
         if key not in self._floors:
+            if len(self._floors) >= KEPT:
+                self._floors.clear()
             self._floors[key] = FloorProfile(sonar, pitch, roll, _weight_of(sonar, views))
         return self._floors[key]
 
 
-def _profile_of(frame: Above) -> tuple[Array, Sonar]:
-    """Levels along range, summed over beams and views, and the sonar."""
+def profile_of(frame: Above) -> tuple[Array, Sonar]:
+    """Levels along range, summed over beams and views, and the sonar.
+
+    Raises:
+        MitsonarError: not one frame, levels that are not linear or not finite.
+    """
     if len(frame) != 1:
         raise MitsonarError(f"a height is that of one frame: got {len(frame)}")
     if isinstance(frame, ViewFrames):
-        return frame.profiles().sum(axis=(0, 1), dtype=float), next(iter(frame.sonars.values()))
+        return _finite(frame.profiles().sum(axis=(0, 1), dtype=float)), next(iter(frame.sonars.values()))
     if frame.level != "linear":
         raise MitsonarError(f"heights are told from linear images: got {frame.level}; convert them first")
+    profile = frame.image[0].sum(axis=1, dtype=float)
     half = (frame.range_m[-1] - frame.range_m[0]) / max(1, len(frame.range_m) - 1) / 2
-    window = {"range_min": frame.range_m[0] - half, "range_max": frame.range_m[-1] + half}
+    window = {"range_min": max(0.0, float(frame.range_m[0] - half)), "range_max": float(frame.range_m[-1] + half)}
     beams = {"beams": len(frame.bearing_rad), "range_bins": len(frame.range_m)}
-    return frame.image[0].sum(axis=1, dtype=float), frame.sonar.replace(**window, **beams)
+    return _finite(profile), frame.sonar.replace(**window, **beams)
+
+
+def _finite(profile: Array) -> Array:
+    if not np.isfinite(profile).all():
+        raise MitsonarError("the frame holds nan or inf: set pixels without echo to 0")
+    return profile
+
+
+def doubt_of_profile(profile: Array) -> str:
+    """Whether there is anything in it."""
+    return "" if np.ptp(profile) > 0 else "nothing in the frame to tell a height from"
 
 
 def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
@@ -179,7 +200,7 @@ def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
     others = [view for view in views if view not in SEGMENTS]
     if others:
         raise MitsonarError(
-            f"heights are told directly from a sonar's image or portions of its view: {others[0]} is a receiver apart from it"
+            f"heights are told directly from a sonar's own image or portions of its view: got the receiver {others[0]}"
         )
     rays = np.sum([Segment(sonar, view).member for view in views], axis=0, dtype=float)
     shape = (sonar.rays_per_beam, sonar.beams, -1)

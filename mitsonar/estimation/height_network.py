@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.height import Above, HeightEstimate
+from mitsonar.estimation.height import Above, HeightEstimate, doubt_of_profile, profile_of
 from mitsonar.estimation.trained import Instrument, Trained, answer_of, one_thread
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.simulation.views import Whole
@@ -32,6 +32,8 @@ class HeightNetwork(Trained):
     Raises:
         MitsonarError: a checkpoint of motions.
     """
+
+    instead: ClassVar[str] = "direct"
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 1:
@@ -59,16 +61,18 @@ class HeightNetwork(Trained):
         Raises:
             MitsonarError: not one frame, other views or another sonar than those of training.
         """
-        if len(frame) != 1:
-            raise MitsonarError(f"a height is that of one frame: got {len(frame)}")
+        profile, _ = profile_of(frame)
+        doubt = doubt_of_profile(profile) or self._doubt_of_attitude(frame)
+        if doubt:
+            return HeightEstimate(np.nan, np.nan, False, doubt)
         with torch.inference_mode(), one_thread():
             targets, _ = self._checkpoint.decode(answer_of(self._network, self._input(frame)))
         height, coder = float(targets[0, 0]), self._checkpoint.coder
         if not np.isfinite(height):
             return HeightEstimate(np.nan, np.nan, False, "the network's answer is not finite")
         low, high = float(coder.low[0]), float(coder.high[0])
-        known = [found["rmse"][0] / 1e3 for found in self._checkpoint.metrics.values() if found.get("rmse")]
-        std = float(np.sqrt(np.mean(np.square(known)))) if known else np.nan
+        rmse = self._checkpoint.rmse
+        std = np.nan if rmse is None else float(rmse[0]) / 1e3
         if not low - BEYOND * (high - low) <= height <= high + BEYOND * (high - low):
             return HeightEstimate(
                 height, std, False, f"{height:.2f} m is beyond the heights of training, {low:g}..{high:g} m"

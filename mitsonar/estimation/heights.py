@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimators import options_from
+from mitsonar.estimation.estimators import checkpoint_at, names_checkpoint, options_from
 from mitsonar.estimation.height import DirectHeight, HeightEstimator
 
 __all__ = ["height_estimator_from"]
@@ -20,14 +20,10 @@ def height_estimator_from(text: str) -> HeightEstimator:
     name, *words = text.split(":")
     if name == "direct":
         return DirectHeight(**options_from(name, words, DirectHeight))
-    if "/" not in name and "." not in name:
+    if not names_checkpoint(name):
         raise MitsonarError(f"heights are told by direct, or by the checkpoint or folder of a training: got {name!r}")
-    try:
-        from mitsonar.estimation.height_network import HeightNetwork
-        from mitsonar.networks.checkpoint import Checkpoint
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "torch":
-            raise
-        raise MitsonarError("a network computes with torch: pip install 'mitsonar[learn]'") from None
-    made = partial(HeightNetwork, Checkpoint.load(name))
+    checkpoint = checkpoint_at(name)
+    from mitsonar.estimation.height_network import HeightNetwork
+
+    made = partial(HeightNetwork, checkpoint)
     return made(**options_from(name, words, made))

@@ -53,7 +53,9 @@ class Nearest:
         """
         known = None if frames.height_m is None else frames.height_m[np.isfinite(frames.height_m)]
         if known is None or not len(known):
-            raise MitsonarError("the height chooses the network, and the frames lack it: give --height or --height-by")
+            raise MitsonarError(
+                "the height chooses the network, and the frames tell none: measure it with --height-by direct"
+            )
         height = float(known.mean())
         estimate: Estimate = self.chosen(height).estimate(frames)
         return estimate

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -95,6 +95,8 @@ class Trained:
 
     digest: str
     force: bool
+    instead: ClassVar[str] = "corrnet or direct"
+    """What serves other sonars."""
 
     @property
     def heights(self) -> tuple[float, float]:
@@ -124,7 +126,7 @@ class Trained:
         if unlike:
             raise MitsonarError(
                 f"this {self._checkpoint.network} was trained on the sonar {self._trained[view].name}, the frames are of "
-                f"{has.name}: {unlike}; train on that sonar, use corrnet or direct, or force it with RUN:force=1"
+                f"{has.name}: {unlike}; train on that sonar, use {self.instead}, or force it with RUN:force=1"
             )
 
     def _arranged(self, axes: dict[str, Axes]) -> Arrangement:
@@ -154,6 +156,11 @@ class Trained:
             heights.append(frames.poses[:, 2].mean())
         if heights and not any(low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF) for height in heights):
             return f"the sonar stood at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
+        return self._doubt_of_attitude(frames)
+
+    def _doubt_of_attitude(self, frames: SonarFrames | ViewFrames) -> str:
+        """Whether pitch and roll were those of training, as far as the frames tell."""
+        stands = self._checkpoint.stands
         if frames.poses is not None:
             for name, column in (("pitch", 3), ("roll", 4)):
                 angle = math.degrees(frames.poses[:, column].mean())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from mitsonar.estimation.estimator import Estimate, unbelieved
 from mitsonar.estimation.trained import Instrument, Trained, answer_of, one_thread
 from mitsonar.motion import Motion
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.simulation.segments import SEGMENTS
 from mitsonar.viewframes import ViewFrames
 
 __all__ = ["ViewNetwork", "reads_views"]
@@ -31,9 +32,10 @@ FEW = 256
 
 
 def reads_views(checkpoint: Checkpoint) -> bool:
-    """Whether a network is given several views, or vectors as a data set stores them."""
+    """Whether a network is given several views, a portion of one, or vectors as a data set stores them."""
     words = checkpoint.arrangement
-    return len(words["views"]) > 1 or (words["kind"] == "vector" and not words.get("halves", False))
+    vectors = words["kind"] == "vector" and not words.get("halves", False)
+    return vectors or len(words["views"]) > 1 or words["views"][0] in SEGMENTS
 
 
 @dataclass(init=False, eq=False)
@@ -47,6 +49,8 @@ class ViewNetwork(Trained):
     Raises:
         MitsonarError: a checkpoint that needs something else than two frames, or that does not fit its network.
     """
+
+    instead: ClassVar[str] = "a network of that sonar's views"
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 2:

@@ -13,15 +13,14 @@ if TYPE_CHECKING:
     from mitsonar.frames import SonarFrames
     from mitsonar.viewframes import ViewFrames
 
-__all__ = ["measured"]
+__all__ = ["measured", "without_height"]
 
 
 def measured(
     frames: SonarFrames | ViewFrames, by: HeightEstimator, like: SonarFrames | ViewFrames | None = None
 ) -> tuple[Any, list[HeightEstimate]]:
-    """Frames that tell the heights that an estimator finds in them, and nothing else of their height; and what it said.
-
-    Where it is not believed, the median of the others stands, or nan where there are none.
+    """Frames that tell the heights that an estimator finds in them, nan where it is not believed, and nothing else of their
+    height; and what it said.
 
     Args:
         frames: whose heights are replaced.
@@ -34,9 +33,15 @@ def measured(
     seen = frames if like is None else like
     said = [by.height(seen.select(slice(k, k + 1))) for k in range(len(seen))]
     heights = np.array([one.height_m if one.believe else np.nan for one in said])
-    known = heights[np.isfinite(heights)]
-    heights = np.where(np.isfinite(heights), heights, np.median(known) if len(known) else np.nan)
     return replace(frames, height_m=heights, poses=_at(frames.poses, heights)), said
+
+
+def without_height(frames: Any) -> bool:
+    """Whether heights were measured in these frames, and none was found."""
+    told, poses = getattr(frames, "height_m", None), frames.poses
+    if told is None or np.isfinite(told).any():
+        return False
+    return poses is None or not np.isfinite(poses[:, 2]).any()
 
 
 def _at(poses: NDArray[np.float64] | None, heights: NDArray[np.float64]) -> NDArray[np.float64] | None:

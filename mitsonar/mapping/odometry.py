@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.estimation.estimator import Estimate, Estimator
+from mitsonar.estimation.estimator import Estimate, Estimator, unbelieved
 from mitsonar.estimation.impulse import ImpulseEstimator
 from mitsonar.frames import SonarFrames
 from mitsonar.mapping.assessment import assess, path_length
 from mitsonar.mapping.continuity import continued
+from mitsonar.mapping.heights import without_height
 from mitsonar.mapping.paths import (
     MotionSeries,
     fit_scale,
@@ -369,7 +370,8 @@ def _made_beside(
 
 def _estimates(estimator: Any, frames: Any) -> list[Estimate]:
     """Of consecutive frames or pings."""
-    return [estimator.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
+    pairs = [frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)]
+    return [unbelieved("no height was found in the frames") if without_height(p) else estimator.estimate(p) for p in pairs]
 
 
 @contextmanager

@@ -108,7 +108,8 @@ class FrameSource:
         """
         if estimator.views is not None:
             raise MitsonarError(
-                f"heights are told from {estimator.kind}s of {', '.join(estimator.views)}: got single images"
+                f"{self.name}: heights are told from {estimator.kind}s of {', '.join(estimator.views)}, the frames are "
+                "images of one view: give direct, or a network that was trained on such images"
             )
         return replace(self, altimeter=estimator)
 

@@ -66,7 +66,13 @@ class ViewSource:
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
 
     def with_heights_by(self, estimator: HeightEstimator) -> Self:
-        """The same pings; each tells the height that an estimator finds in its views, whatever else was told."""
+        """The same pings; each tells the height that an estimator finds in its views, whatever else was told.
+
+        Raises:
+            MitsonarError: the data set lacks what it reads.
+        """
+        if estimator.views is not None:
+            _check_there(self.store, estimator.views, estimator.kind)
         return replace(self, altimeter=estimator)
 
     @property
@@ -135,16 +141,26 @@ def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | Non
     Raises:
         MitsonarError: no data set, or one without such views, kind or sequence.
     """
-    from mitsonar.dataset.image_recording import array_names
     from mitsonar.dataset.store import DataStore  # half a second that other sources do without
 
     store = DataStore.open(url)
-    there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
-    lacking = [view for view in views if view not in there]
-    if lacking:
-        had = nearest_names(lacking[0], sorted(there)) if there else f"it holds no {kind}s"
-        raise MitsonarError(f"{url} has no {kind}s of view {lacking[0]!r}: {had}")
+    _check_there(store, views, kind)
     here, number, note = sequence_in(store, sequence)
     time_s, poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
     name, said = f"{url}, sequence {number}", f"{note}, {kind}s of {', '.join(views)}"
     return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, height_m, note=said)
+
+
+def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
+    """Whether a data set holds these views.
+
+    Raises:
+        MitsonarError: it does not.
+    """
+    from mitsonar.dataset.image_recording import array_names
+
+    there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
+    lacking = [view for view in views if view not in there]
+    if lacking:
+        had = nearest_names(lacking[0], sorted(there)) if there else f"it holds no {kind}s"
+        raise MitsonarError(f"{store.place.url} has no {kind}s of view {lacking[0]!r}: {had}")

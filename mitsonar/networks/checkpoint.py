@@ -178,14 +178,20 @@ class Checkpoint:
 
     @property
     def covariance(self) -> NDArray[np.float64] | None:
-        """Of a motion [m, m, rad] ``(3, 3)``, for networks that do not say it: by the errors in validation, at the noise of
-        training where that was validated, else over all levels. None where they are not known."""
+        """Of a motion [m, m, rad] ``(3, 3)``, for networks that do not say it, by :attr:`rmse`; None where that is not
+        known."""
+        rmse = self.rmse
+        return None if rmse is None or len(rmse) != len(AXES) else np.diag((rmse / [axis.scale for axis in AXES]) ** 2)
+
+    @property
+    def rmse(self) -> NDArray[np.float64] | None:
+        """Errors in validation [mm, mm, deg], or of heights [mm]: at the noise of training where that was validated, else
+        over all levels. None where they are not known."""
         known = {level: found.get("rmse") for level, found in self.metrics.items() if isinstance(found, dict)}
         chosen = [known[self.noise]] if self.noise in known else list(known.values())
-        if not chosen or not all(_are_numbers(rmse, len(AXES)) for rmse in chosen):
+        if not chosen or not all(_are_numbers(rmse, len(self.labels["names"])) for rmse in chosen):
             return None
-        errors = np.array(chosen) / [axis.scale for axis in AXES]
-        return np.diag((errors**2).mean(axis=0))
+        return np.asarray(np.sqrt((np.array(chosen, dtype=float) ** 2).mean(axis=0)))
 
     def decode(self, answer: Tensor | MotionLaw) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Targets ``(batch, n)`` [m, rad] of what the network answers; covariances ``(batch, n, n)``, if it says them."""

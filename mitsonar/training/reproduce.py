@@ -62,7 +62,7 @@ class Effort:
         scale: part of the recipe's sequences that are made, 0..1.
         minutes: of training at most; None: until the recipe's epochs are done.
         batch: samples of a step instead of the recipe's; Adam's rate grows with its square root. None: the recipe's.
-        changes: keys of the training recipes to change, dots between the levels.
+        changes: keys of the training recipes to change, dots between the levels; those that a table or row sets itself stay.
 
     Raises:
         MitsonarError: values outside these limits.
@@ -104,7 +104,8 @@ class Effort:
         if self.batch is not None:
             said.append(f"batches of {self.batch}, the rate scaled by the square root")
         if self.changes:
-            said.append("recipes changed: " + ", ".join(f"{key} {json.dumps(value)}" for key, value in self.changes.items()))
+            keys = ", ".join(f"{key} {json.dumps(value)}" for key, value in self.changes.items())
+            said.append(f"recipes changed, where a row has no value of its own: {keys}")
         return "; ".join(said)
 
 
@@ -279,6 +280,8 @@ class Bench:
         sequences = max(1, round(self.effort.scale * data.sequences))
         table = table_named(tables_with(name)[0])
         other, fresh = unseen_recipe(data, sequences, table.unseen, recipe.input.frames)
+        if table.unseen is not None:
+            fresh = max(min(fresh, UNSEEN_SEQUENCES[0]), round(self.effort.scale * fresh))
         seen, unseen = self._made(data, sequences, crew), self._made(other, fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
         noises = list(table.noises)
