@@ -57,11 +57,11 @@ def main() -> None:
     parser.add_argument("what", choices=list(PARTS))
     parser.add_argument("--out", type=Path, default=Path("bench/segments"))
     parser.add_argument("--sequences", type=int, default=5000, help="that `ours` learns from, five pings each")
-    parser.add_argument("--physical", type=int, default=1200, help="the same of the physical model")
+    parser.add_argument("--physical", type=int, default=600, help="the same of the physical model")
     parser.add_argument("--unseen", type=int, default=1000, help="pairs that all are judged by")
     parser.add_argument("--width", type=float, default=1.0, help="of PoseNetVec")
     parser.add_argument("--minutes", type=float, default=None, help="of each training at most")
-    parser.add_argument("--epochs", type=float, default=12, help="of ours")
+    parser.add_argument("--epochs", type=float, default=8, help="of ours")
     parser.add_argument("--rows", help="of ours: names with commas; of paths: folders of runs")
     parser.add_argument("--frames", type=Path, help="lamprey2_first30.npz of a real DIDSON at rest, for halves")
     parser.add_argument("--threads", type=int, default=2)
@@ -182,10 +182,10 @@ def ours(asked: argparse.Namespace) -> None:
             "split": {"by": "scene", "train": 0.95, "validation": 0.05},
         }
         if made.model == "physical":
-            learnt, judged = physical(asked), {"unseen scenes": (unseen(asked, "unseenp10", 500, **PHYSICAL), "all")}
+            learnt, judged = physical(asked), {"unseen scenes": (unseen(asked, "unseenp10", 300, **PHYSICAL), "all")}
         else:
             learnt = many(asked)
-            moving = unseen(asked, "jitter10", 500, **{"sonar.jitter": True})
+            moving = unseen(asked, "jitter10", 300, **{"sonar.jitter": True})
             judged = {"unseen scenes": (unseen(asked, segments=everything), "all"), "rays that move": (moving, "all")}
         row(asked, f"ours-{name}", load_training_recipe("profilenet-circular-10m", words), learnt, judged)
 
