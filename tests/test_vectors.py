@@ -169,6 +169,7 @@ def test_what_a_profile_net_says_turns_with_the_world() -> None:
         torch.testing.assert_close(told(pair[:, :, order]), plain * torch.tensor(signs), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(told(pair.flip(-1)), -plain, rtol=1e-4, atol=1e-6)  # backwards in time
     torch.testing.assert_close(told(pair[..., :1].repeat(1, 1, 1, 2)), torch.zeros(2, 3), rtol=0, atol=1e-6)
+    torch.testing.assert_close(told(0.1 * pair), plain, rtol=1e-3, atol=1e-5)  # another gain
 
 
 def test_a_profile_net_learns_shifts_of_a_part_of_a_level() -> None:

@@ -19,8 +19,11 @@ from mitsonar.networks.blocks import Network, Size
 
 __all__ = ["ProfileNet"]
 
-FAINT = 1e-2
-"""Variance of a level below which it does not count, in squares of a pixel's maximum."""
+FAINT = 1e-4
+"""Variance of a level below which it does not count, in squares of the mean of all levels."""
+
+QUIET = 1e-2
+"""Power of filtered profiles below which products do not count, in variances of a level."""
 
 SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] = {
     # quadrants from fore-starboard clockwise: as they are, mirrored sideways, fore and aft, both
@@ -113,7 +116,7 @@ class ProfileNet(Network):
         self.expect(vectors)
         first, second = self._filtered(vectors)
         power = self._windowed(first * first), self._windowed(second * second)
-        mean = (power[0] + power[1]) / 2 + FAINT
+        mean = (power[0] + power[1]) / 2 + QUIET
         shared = self._products(first, second) / mean[..., None]
         gained = (power[0] - power[1]) / mean
         # backwards in time lags change their sign, and so does what was gained
@@ -126,8 +129,10 @@ class ProfileNet(Network):
         return (answers[:, 0] - answers[:, 1]).mean(dim=1) / 2  # type: ignore[no-any-return]
 
     def _filtered(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations."""
+        """Profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations. All are divided
+        by their mean before: a sonar's gain says nothing."""
         batch, _, levels, columns = vectors.shape
+        vectors = vectors / vectors.mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-12)
         profiles = vectors[:, 0].transpose(1, 2).reshape(batch * columns, levels)
         filtered = self.filter(self.level(profiles)[:, None])
         filtered = functional.pad(filtered, (0, -levels % self.windows))
