@@ -129,8 +129,8 @@ class ProfileNet(Network):
         return (answers[:, 0] - answers[:, 1]).mean(dim=1) / 2  # type: ignore[no-any-return]
 
     def _filtered(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations. All are divided
-        by their mean before: a sonar's gain says nothing."""
+        """Profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations. All are
+        divided by their mean before: a sonar's gain says nothing."""
         batch, _, levels, columns = vectors.shape
         vectors = vectors / vectors.mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-12)
         profiles = vectors[:, 0].transpose(1, 2).reshape(batch * columns, levels)
