@@ -16,6 +16,7 @@ from helpers import Command, refused
 from matplotlib.figure import Figure
 
 from mitsonar.dataset.recipe import load_recipe
+from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.metrics import in_units
 from mitsonar.training.tables import (
@@ -306,6 +307,7 @@ def test_a_table_from_nothing(whole: Path) -> None:
     rows = told(whole)
     assert set(rows) == set(ROWS)
     assert len(list((whole / "data").iterdir())) == 2  # one for both rows, one of unseen scenes
+    assert len({DataStore.open(str(path)).about["gain"] for path in (whole / "data").iterdir()}) == 1  # of one sonar
     for name, row in rows.items():
         ours = row["ours"]
         reached = {key: ours["reached"][key] for key in ("training_pairs", "pairs_seen", "batch", "rate", "threads")}
@@ -322,7 +324,8 @@ def test_a_table_from_nothing(whole: Path) -> None:
         assert kept.options["width"] == 1 / 16
         assert kept.recipe["loss"]["penalty"] == (100 if name == "posenet-penalty" else 0)
     text = (whole / "table.md").read_text()
-    assert "scale 1 of the recipes' data; all epochs; recipes changed: network.width 0.0625" in text
+    said = "scale 1 of the recipes' data; all epochs; recipes changed, where a row has no value of its own: network.width 0.0625"
+    assert said in text
     assert "not trained yet" not in text
     assert (whole / "table-3.6.png").stat().st_size > 10_000
 

@@ -172,6 +172,9 @@ class Recipe(_Part):
     segments: list[str] = Field(default_factory=list, description="portions of a looking-down sonar's field of view")
     store: Literal["images", "vectors", "both"] = Field("images", description="images, vectors (sums over beams), or both")
     pixel: Literal["uint8", "float32"] = Field("uint8", description="type of stored pixels")
+    gain: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="of the pixels, as of another data set; null: set on the first frames"
+    )
     labels: list[Literal["elevation_rad", "shape_id", "object_id", "shadow"]] = Field(
         default_factory=list, description="per-pixel truth to store"
     )
@@ -227,7 +230,15 @@ class Recipe(_Part):
             MitsonarError: a key of the instrument that cannot be, or keys that only images have.
         """
         self.channel_sonar  # noqa: B018
-        plain = {"mount": Mount(), "receivers": [], "segments": [], "labels": [], "store": "images", "pixel": "uint8"}
+        plain = {
+            "mount": Mount(),
+            "receivers": [],
+            "segments": [],
+            "labels": [],
+            "store": "images",
+            "pixel": "uint8",
+            "gain": None,
+        }
         other = [name for name, value in plain.items() if getattr(self, name) != value]
         other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []
         if other:

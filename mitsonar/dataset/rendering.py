@@ -94,11 +94,14 @@ def loaded_world(recipe: Recipe, scene: Scene) -> Any:
 def calibrate(recipe: Recipe) -> float:
     """The gain of a data set: the 99.9th percentile of all pixels of the first 20 frames of its first scene becomes 0.9.
 
-    The frames are those of the recipe, however few of them are made.
+    The frames are those of the recipe, however few of them are made. A recipe may also say the gain: that of another data
+    set, since a sonar has one.
 
     Raises:
         MitsonarError: these frames are empty.
     """
+    if recipe.gain is not None:
+        return recipe.gain
     scene = scenes_of(recipe, recipe.sequences)[0]
     poses = []
     for sequence in sequences_of(recipe, scene):

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from mitsonar.dataset.generate import make
 from mitsonar.dataset.place import Place
 from mitsonar.dataset.recipe import Recipe, load_recipe, recipe_from
+from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError, complaint
 from mitsonar.files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
@@ -282,7 +283,9 @@ class Bench:
         other, fresh = unseen_recipe(data, sequences, table.unseen, recipe.input.frames)
         if table.unseen is not None:
             fresh = max(min(fresh, UNSEEN_SEQUENCES[0]), round(self.effort.scale * fresh))
-        seen, unseen = self._made(data, sequences, crew), self._made(other, fresh, crew)
+        seen = self._made(data, sequences, crew)
+        gain = DataStore.open(seen).about.get("gain")  # one sonar, whatever it looks at
+        unseen = self._made(other if gain is None else other.model_copy(update={"gain": gain}), fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
         noises = list(table.noises)
         scores = [
