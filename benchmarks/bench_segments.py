@@ -208,7 +208,7 @@ def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
     store = DataStore.open(str(path))
     first = open_views(str(path), [store.recipe.views[0].name], "vector", sequence=0).with_noise(load_noise(noise), 1)
     time_s, poses, height_m = (store.read(array) for array in ("time_s", "pose", "height_m"))
-    whole = replace(first, time_s=time_s, poses=poses, height_m=height_m)  # all sequences in one
+    whole = replace(first, time_s=time_s, poses=poses, sonar_poses=poses, height_m=height_m)  # all sequences in one
     said, spent = [], []
     for number in range(0, len(poses), 5):
         frame = whole.read([number])

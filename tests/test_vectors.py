@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from mitsonar.dataset.plan import scenes_of
 from mitsonar.dataset.recipe import load_recipe
 from mitsonar.dataset.rendering import SceneRenderer
 from mitsonar.errors import MitsonarError
+from mitsonar.motion import motions
 from mitsonar.noise import load_noise
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
@@ -363,6 +365,12 @@ def test_a_network_of_views_drives_a_path(
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-7)
     assert seen.poses is not None
     assert not seen.poses[:, [0, 1, 5]].any()
+    # the path is the vehicle's, whose motion is learnt: the sonar on it looks 90 deg to port
+    truth = [samples.target(number) for number in mine]
+    np.testing.assert_allclose(motions(source.poses), truth, atol=1e-9)
+    told = json.loads((tmp_path / "path" / "table.json").read_text())["rows"]
+    (rmse,) = [one["value"] for one in told if one["name"] == "motion error RMSE, sideways"]
+    assert rmse == pytest.approx(1e3 * np.sqrt(((wanted - truth)[:, 0] ** 2).mean()), rel=1e-3)
 
 
 def test_a_network_of_views_doubts_what_does_not_belong_together(portions: Path, learnt: Path) -> None:

@@ -66,7 +66,7 @@ def height(
             here = np.arange(first, min(first + AT_ONCE, len(source)))
             said += measured(source.read(here), estimator)[1]
             progress(len(here))
-    true = None if source.true is None else source.true.poses[:, 2]
+    true = None if source.sonar_poses is None else source.sonar_poses[:, 2]
     if out is not None:
         write_whole(out, _csv(source.time_s, said, true).encode())
     for line in _lines(said, true):

@@ -143,6 +143,11 @@ class FrameSource:
         )
 
     @property
+    def sonar_poses(self) -> Array | None:
+        """Of the sonar ``(frames, 6)``, where known."""
+        return self.poses
+
+    @property
     def true(self) -> Trajectory | None:
         """Where the sonar was, where that is known."""
         return None if self.poses is None else Trajectory(self.poses, self.time_s)

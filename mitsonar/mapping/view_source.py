@@ -35,7 +35,8 @@ class ViewSource:
         kind: ``image`` or ``vector``.
         first: number of the sequence's first frame in the store.
         time_s: of the pings ``(n,)``.
-        poses: of the sonar ``(n, 6)``: the truth.
+        poses: of the vehicle, whose motion networks of data sets tell ``(n, 6)``: the truth.
+        sonar_poses: of the sonar on it ``(n, 6)``.
         height_m: over the ground ``(n,)``.
         noise: that is added when pings are read, and its seed: the same as that of samples of the data set.
         seed: see noise.
@@ -50,6 +51,7 @@ class ViewSource:
     first: int
     time_s: NDArray[np.float64]
     poses: NDArray[np.float64]
+    sonar_poses: NDArray[np.float64]
     height_m: NDArray[np.float64]
     noise: NoiseModel | None = None
     seed: int = 0
@@ -77,7 +79,7 @@ class ViewSource:
 
     @property
     def true(self) -> Trajectory:
-        """Where the sonar was."""
+        """Where the vehicle was."""
         return Trajectory(self.poses, self.time_s)
 
     def check_times(self) -> None:
@@ -120,14 +122,14 @@ class ViewSource:
             sonars={view: known[view].sonar for view in views},
             bearing_rad={view: known[view].bearing_rad for view in views},
             time_s=self.time_s[chosen],
-            poses=self.poses[chosen] * [0, 0, 1, 1, 1, 0],
+            poses=self.sonar_poses[chosen] * [0, 0, 1, 1, 1, 0],
             height_m=self.height_m[chosen],
         )
 
     def digest(self) -> str:
         """SHA-256 of what is known of all pings, and of the first and the last of them."""
         told = hashlib.sha256(self.store.recipe.model_dump_json().encode())
-        for values in (self.time_s, self.poses, self.height_m):
+        for values in (self.time_s, self.poses, self.sonar_poses, self.height_m):
             told.update(np.ascontiguousarray(values, dtype=float).tobytes())
         told.update(repr((self.views, self.kind, self.noise, self.seed, self.first, self.altimeter)).encode())
         for number in (0, len(self) - 1):
@@ -146,9 +148,10 @@ def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | Non
     store = DataStore.open(url)
     _check_there(store, views, kind)
     here, number, note = sequence_in(store, sequence)
-    time_s, poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
+    time_s, sonar_poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
+    poses = store.read("vehicle_pose", here) if "vehicle_pose" in store.group else sonar_poses
     name, said = f"{url}, sequence {number}", f"{note}, {kind}s of {', '.join(views)}"
-    return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, height_m, note=said)
+    return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, sonar_poses, height_m, note=said)
 
 
 def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
