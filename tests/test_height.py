@@ -222,7 +222,7 @@ def test_portions_as_images_know_their_rays(tmp_path: Path, mitsonar: Command) -
     vectors = open_views(str(url), ["c1"], "vector", sequence=0).read([0])
     images = open_views(str(url), ["c1"], "image", sequence=0).read([0])
     both = [DirectHeight().height(one).height_m for one in (vectors, images)]
-    assert abs(both[0] - both[1]) < 0.01 * true
+    assert abs(both[0] - both[1]) < 0.02 * true  # pixels are rounded
     with pytest.raises(MitsonarError, match="has no vectors of view 'q1'"):
         open_views(str(url), ["c1"], "vector").with_heights_by(DirectHeight(views=("q1",)))
     words = ("--height-by", "direct", "--height", "2.5", "-o", tmp_path / "path")

@@ -25,15 +25,13 @@ Above = SonarFrames | ViewFrames
 CANDIDATES = 400
 """Heights that are tried first, at equal ratios."""
 
-AROUND = (0.75, 1.2)
-"""Heights over what is seen lie between these parts of the first guess,"""
-
 PARTS = 40
-"""and are resolved into so many."""
+"""Heights between such ends into which a profile is resolved."""
 
-LOWEST = 0.75
-"""Part of the ground's echo that comes from above the floor: tops and flanks of what stands on it. On rocky fields it errs
-least against the true height, from 2.5 and from 10 m."""
+PASSES = (((0.75, 1.2), 0.75), ((0.75, 1.1), 0.7))
+"""Ends of these heights, as parts of the height found before, and the part of the ground's echo that comes from above the
+floor: tops and flanks of what stands on it. Noise spreads parts to all heights, so that the second pass has a lower end
+above. On rocky fields from 1 to 10 m and hulls, without noise and with much, these err least."""
 
 SPREAD = 0.1
 """Quantiles this far to either side tell how sure that is."""
@@ -41,7 +39,7 @@ SPREAD = 0.1
 KEPT = 16
 """Attitudes, to a milliradian, whose profiles of level ground are kept."""
 
-FINEST = 0.004
+FINEST = 0.01
 """Least standard deviation, as part of the height."""
 
 LEAST = 0.5
@@ -128,15 +126,16 @@ class DirectHeight:
         guess = _nearest_alike(profile, floor, edges)
         if guess is None:
             return HeightEstimate(np.nan, np.nan, False, "the window shows no ground")
-        heights = guess * np.geomspace(*AROUND, PARTS)
-        ground = floor.at(heights, edges).T
-        scale = profile.max()
-        part, _ = nnls(np.column_stack([ground, np.full(len(profile), 1 / len(profile))]), profile / scale)
-        if not part[:-1].sum() > 0:
-            return HeightEstimate(np.nan, np.nan, False, "the levels along range are not those of ground")
-        share = np.cumsum(part[:-1]) / part[:-1].sum()
-        low, height, high = np.interp([LOWEST - SPREAD, LOWEST, LOWEST + SPREAD], share, heights)
-        alike = float(np.corrcoef(ground @ part[:-1], profile)[0, 1])
+        height = guess
+        for around, lowest in PASSES:
+            heights = height * np.geomspace(*around, PARTS)
+            ground = floor.at(heights, edges).T
+            part = _resolved(ground, profile)
+            if not part.any():
+                return HeightEstimate(np.nan, np.nan, False, "the levels along range are not those of ground")
+            share = np.cumsum(part) / part.sum()
+            low, height, high = np.interp([lowest - SPREAD, lowest, lowest + SPREAD], share, heights)
+        alike = float(np.corrcoef(ground @ part, profile)[0, 1])
         std = float(max((high - low) / 2, FINEST * height))
         if not alike >= LEAST:
             return HeightEstimate(float(height), std, False, f"levels along range are those of ground by {alike:.2f} only")
@@ -205,6 +204,12 @@ def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
     rays = np.sum([Segment(sonar, view).member for view in views], axis=0, dtype=float)
     shape = (sonar.rays_per_beam, sonar.beams, -1)
     return np.asarray(rays.reshape(shape).sum(axis=2))
+
+
+def _resolved(ground: Array, profile: Array) -> Array:
+    """How much of a profile is ground at each height ``(heights,)``, beside an even background."""
+    even = np.full((len(profile), 1), 1 / len(profile))
+    return np.asarray(nnls(np.hstack([ground, even]), profile / profile.max())[0][:-1])
 
 
 def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float | None:
