@@ -94,7 +94,7 @@ class HeightEstimator(Protocol):
 class DirectHeight:
     """The height at which level ground has the frame's range profile: where the first echo comes from, and how levels fall
     off behind it. What stands on the ground answers as if the sonar were lower: the profile is resolved into ground at many
-    heights (non-negative least squares, with an even background for noise), and the floor is their upper quartile.
+    heights (non-negative least squares, with an even background for noise), and the floor lies above most of them.
 
     It looks at the sum over beams, so that a frame and its vector tell the same.
 
