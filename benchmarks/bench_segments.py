@@ -264,12 +264,14 @@ def halves(asked: argparse.Namespace) -> None:
     learnt = asked.out / "hulls.zarr"
     make(load_recipe("ship-hull"), str(learnt), sequences=300, workers=asked.workers)
     other = asked.out / "hulls-unseen.zarr"
-    make(load_recipe("ship-hull", {"seed": 7919, "name": "hulls-unseen"}), str(other), sequences=100, workers=asked.workers)
+    gain = DataStore.open(str(learnt)).about["gain"]  # one sonar
+    words = {"seed": 7919, "name": "hulls-unseen", "gain": gain}
+    make(load_recipe("ship-hull", words), str(other), sequences=100, workers=asked.workers)
     noise = "0.04,0.02,0.04"
-    words = {"input": {"kind": "vector", "halves": True}, "noise": noise, "data": "ship-hull", "data_changes": {}}
+    given = {"input": {"kind": "vector", "halves": True}, "noise": noise, "data": "ship-hull", "data_changes": {}}
     for name, recipe in (
-        ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**words, "network.width": asked.width})),
-        ("halves-profilenet", load_training_recipe("profilenet-quadrants", {**words, "batch": 16, "epochs": 60})),
+        ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**given, "network.width": asked.width})),
+        ("halves-profilenet", load_training_recipe("profilenet-quadrants", {**given, "batch": 16, "epochs": 60})),
     ):
         row(asked, name, recipe, learnt, {"unseen scenes": (other, "all")})
         if asked.frames is not None:
