@@ -90,7 +90,11 @@ def odometry(
         from mitsonar.estimation.estimators import estimator_from
 
         estimator = estimator or "direct"
-        method = estimator_from(estimator)
+        try:
+            method = estimator_from(estimator)
+        except MitsonarError:
+            frames_from(frames, sequence, view, noise, seed, height, pitch_deg)  # what is wrong with them is said first
+            raise
         views, kind = getattr(method, "views", None), getattr(method, "kind", "image")
         if views is not None:
             if any(option is not None for option in (view, height, pitch_deg)):
