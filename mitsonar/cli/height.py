@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say
+from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry import Frames, frames_from, views_from
 from mitsonar.errors import MitsonarError
 from mitsonar.files import write_whole
@@ -71,7 +71,11 @@ def height(
         write_whole(out, _csv(source.time_s, said, true).encode())
     for line in _lines(said, true):
         say(line)
-    say(f"{len(said):,} heights by {by} ({estimator.inputs})" + (f", in {out}" if out is not None else ""))
+    lost = sum(not one.believe for one in said)
+    given = estimator.inputs if pitch_deg is None else f"pitch {pitch_deg:g} deg as told, which the frames cannot check"
+    say(f"{len(said):,} frames by {by} ({given}), {lost:,} not believed" + (f", in {out}" if out is not None else ""))
+    if lost == len(said):
+        warn("no height was found: check the pitch, and that the window shows ground; frames need echoes that fall off")
 
 
 def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | None:

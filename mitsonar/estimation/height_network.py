@@ -50,11 +50,6 @@ class HeightNetwork(Trained):
         views = tuple(self._checkpoint.arrangement["views"])
         return None if views == (Whole.name,) else views
 
-    @property
-    def kind(self) -> str:
-        """``image`` or ``vector``."""
-        return str(self._checkpoint.arrangement["kind"])
-
     def height(self, frame: Above) -> HeightEstimate:
         """The height that the network says; its standard deviation is that of validation.
 
@@ -81,28 +76,13 @@ class HeightNetwork(Trained):
 
     def _input(self, frame: Above) -> Any:
         """What the network reads, a batch of one."""
-        names = self._checkpoint.arrangement["views"]
         if isinstance(frame, ViewFrames):
-            self._check(frame, names)
-            axes = {view: (frame.sonars[view].range_m, frame.bearing_rad[view]) for view in names}
-            values = {view: torch.from_numpy(np.asarray(frame.values[view])[None]) for view in names}
-            if frame.kind == "vector":  # noise has been drawn before
-                values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
-        elif len(names) == 1:
-            self._check_instrument(names[0], Instrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
-            axes = {names[0]: (frame.range_m, frame.bearing_rad)}
-            values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
-        else:
+            return self._input_of_views(frame)
+        names = self._checkpoint.arrangement["views"]
+        if len(names) > 1:
             raise MitsonarError(
                 f"this {self._checkpoint.network} is given {', '.join(names)}: use a data set that holds them"
             )
-        return self._arranged(axes)(values, torch.arange(1)[None], 0)
-
-    def _check(self, frame: ViewFrames, names: list[str]) -> None:
-        lacking = [view for view in names if view not in frame.values]
-        if lacking:
-            raise MitsonarError(
-                f"this {self._checkpoint.network} is given {', '.join(names)}: got {', '.join(frame.values)}"
-            )
-        for view in names:
-            self._check_instrument(view, Instrument.of(frame.sonars[view]))
+        self._check_instrument(names[0], Instrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
+        values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
+        return self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})(values, torch.arange(1)[None], 0)

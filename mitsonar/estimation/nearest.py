@@ -35,15 +35,11 @@ class Nearest:
     inputs: str = field(default="height, which chooses the network", init=False)
 
     def __post_init__(self) -> None:
-        reads = {(type(one), self._views(one), getattr(one, "kind", "image")) for one in self.networks}
+        reads = {(type(one), getattr(one, "views", None), one.kind) for one in self.networks}
         if len(reads) != 1 or not all(isinstance(one, Network | ViewNetwork) for one in self.networks):
             said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
             raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
         ((_, self.views, self.kind),) = reads
-
-    @staticmethod
-    def _views(network: Any) -> tuple[str, ...] | None:
-        return getattr(network, "views", None)
 
     def estimate(self, frames: Any) -> Estimate:
         """What the chosen network says.

@@ -120,6 +120,32 @@ class Trained:
         vars(self).update(state)
         self._take(Checkpoint.from_bytes(content))
 
+    @property
+    def kind(self) -> str:
+        """``image`` or ``vector``, that it reads."""
+        return str(self._checkpoint.arrangement["kind"])
+
+    def _input_of_views(self, frames: ViewFrames) -> Any:
+        """What the network reads of the pings of its views, a batch of one.
+
+        Raises:
+            MitsonarError: views that are not there, or of another sonar than that of training.
+        """
+        names = self._checkpoint.arrangement["views"]
+        lacking = [view for view in names if view not in frames.values]
+        if lacking:
+            raise MitsonarError(
+                f"this {self._checkpoint.network} is given {', '.join(names)}: got {', '.join(frames.values)}; read them "
+                "from a data set that holds them"
+            )
+        for view in names:
+            self._check_instrument(view, Instrument.of(frames.sonars[view]))
+        values = {view: torch.from_numpy(np.asarray(frames.values[view])[None]) for view in names}
+        if frames.kind == "vector":  # noise has been drawn before
+            values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
+        axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
+        return self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+
     def _check_instrument(self, view: str, has: Instrument) -> None:
         """Refuse another sonar than that of training, unless it is forced."""
         unlike = self._trained[view].unlike(has) if view in self._trained and not self.force else ""

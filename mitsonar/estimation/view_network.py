@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, unbelieved
-from mitsonar.estimation.trained import Instrument, Trained, answer_of, one_thread
+from mitsonar.estimation.trained import Trained, answer_of, one_thread
 from mitsonar.motion import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.simulation.segments import SEGMENTS
@@ -66,11 +66,6 @@ class ViewNetwork(Trained):
         """Names of the views that it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
-    @property
-    def kind(self) -> str:
-        """``image`` or ``vector``."""
-        return str(self._checkpoint.arrangement["kind"])
-
     def estimate(self, frames: Any) -> Estimate:
         """The motion between two pings, its covariance by validation, and whether to believe it.
 
@@ -81,13 +76,14 @@ class ViewNetwork(Trained):
             MitsonarError: not two pings of these views, another sonar than that of training.
         """
         self._check_views(frames)
+        inputs = self._input_of_views(frames)
         profiles = frames.profiles()
         if not np.isfinite(profiles).all():
             raise MitsonarError("the frames hold nan or inf: set pixels without echo to 0")
         if (np.ptp(profiles, axis=2) == 0).any():
             return unbelieved("nothing in the frames to match")
         with torch.inference_mode(), one_thread():
-            targets, covariances = self._checkpoint.decode(answer_of(self._network, self._input(frames)))
+            targets, covariances = self._checkpoint.decode(answer_of(self._network, inputs))
         if not np.isfinite(targets).all():
             return unbelieved("the network's answer is not finite")
         motion = Motion(*targets[0].tolist())
@@ -96,7 +92,7 @@ class ViewNetwork(Trained):
         return Estimate(motion, covariance, not reason, reason)
 
     def _check_views(self, frames: Any) -> None:
-        """Two pings of the views of training."""
+        """Two pings of views that it reads."""
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
             raise MitsonarError(
@@ -105,16 +101,6 @@ class ViewNetwork(Trained):
             )
         if len(frames) != 2 or any(view not in frames.values for view in self.views):
             raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")
-        for view in self.views:
-            self._check_instrument(view, Instrument.of(frames.sonars[view]))
-
-    def _input(self, frames: ViewFrames) -> Any:
-        """What the network reads, a batch of one."""
-        made = self._arranged({view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in self.views})
-        values = {view: torch.from_numpy(frames.values[view][None]) for view in made.views}
-        if made.kind == "vector" and frames.kind == "vector":  # noise has been drawn before
-            values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
-        return made(values, torch.arange(2)[None], 0)
 
 
 def _doubt_of_profiles(profiles: NDArray[np.float32]) -> str:

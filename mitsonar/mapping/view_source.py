@@ -96,7 +96,8 @@ class ViewSource:
         if self.altimeter is None:
             return frames
         views, kind = self.altimeter.views or self.views, self.altimeter.kind if self.altimeter.views else self.kind
-        found: ViewFrames = measured(frames, self.altimeter, self._read(chosen, views, kind))[0]
+        same = (views, kind) == (self.views, self.kind)
+        found: ViewFrames = measured(frames, self.altimeter, frames if same else self._read(chosen, views, kind))[0]
         return found
 
     def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
