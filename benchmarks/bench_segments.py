@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--unseen", type=int, default=1000, help="pairs that all are judged by")
     parser.add_argument("--width", type=float, default=1.0, help="of PoseNetVec")
     parser.add_argument("--minutes", type=float, default=None, help="of each training at most")
-    parser.add_argument("--epochs", type=float, default=8, help="of ours")
+    parser.add_argument("--epochs", type=float, default=8, help="of ours; of fewer pairs more")
     parser.add_argument("--rows", help="of ours: names with commas; of paths: folders of runs")
     parser.add_argument("--frames", type=Path, help="lamprey2_first30.npz of a real DIDSON at rest, for halves")
     parser.add_argument("--threads", type=int, default=2)
@@ -146,24 +146,28 @@ def leak(asked: argparse.Namespace) -> None:
 
 
 class Ours(NamedTuple):
-    """A row of ours: what it reads, at how many levels, and what it learns from."""
+    """A row of ours: what it reads, at how many levels, what it learns from, and how often."""
 
     views: list[str]
-    levels: int
+    levels: int = 1024
     noise: Any = "none"
     model: str = "thesis"
+    epochs: float = 8
 
+
+BOTH = ["none", "high"]
 
 OURS = {
+    "quadrants-1024": Ours(QUADRANTS),
+    "circular-1024": Ours(CONES),
+    "quadrants-1024-noise": Ours(QUADRANTS, noise=BOTH),
+    "circular-1024-noise": Ours(CONES, noise=BOTH),
+    "quadrants-1024-physical": Ours(QUADRANTS, model="physical", epochs=40),
+    "circular-1024-physical": Ours(CONES, model="physical", epochs=40),
+    "quadrants-1024-physical-noise": Ours(QUADRANTS, noise=BOTH, model="physical", epochs=40),
     "circular-512": Ours(CONES, 512),
-    "circular-1024": Ours(CONES, 1024),
-    "circular-256": Ours(CONES, 256),
     "quadrants-512": Ours(QUADRANTS, 512),
-    "circular-512-noise": Ours(CONES, 512, ["none", "high"]),
-    "quadrants-512-noise": Ours(QUADRANTS, 512, ["none", "high"]),
-    "circular-512-physical": Ours(CONES, 512, "none", "physical"),
-    "quadrants-512-physical": Ours(QUADRANTS, 512, "none", "physical"),
-    "circular-512-physical-noise": Ours(CONES, 512, ["none", "high"], "physical"),
+    "circular-256": Ours(CONES, 256),
 }
 
 
@@ -176,9 +180,9 @@ def ours(asked: argparse.Namespace) -> None:
         words = {
             "input.views": made.views,
             "input.range_levels": made.levels,
-            "network.lags": int(np.clip(made.levels // 128, 2, 8)),
+            "network.lags": int(np.clip(made.levels // 128, 2, 6)),
             "noise": made.noise,
-            "epochs": asked.epochs,
+            "epochs": asked.epochs * made.epochs / 8,
             "split": {"by": "scene", "train": 0.95, "validation": 0.05},
         }
         if made.model == "physical":

@@ -15,7 +15,7 @@ import pytest
 from helpers import Command, refused
 from matplotlib.figure import Figure
 
-from mitsonar.dataset.recipe import load_recipe
+from mitsonar.dataset.recipe import Recipe, load_recipe
 from mitsonar.dataset.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.metrics import in_units
@@ -260,6 +260,19 @@ def test_unseen_scenes_of_a_table_that_says_how_many() -> None:
     assert (wanted, other.sequences, other.flight.pings, other.seed) == (1000, 1000, 2, 7919)
     same, some = unseen_recipe(data, 250, None, 2)
     assert (some, same.sequences, same.flight.pings) == (100, 250, 5)
+
+
+def test_rows_of_one_kind_learn_from_one_data_set() -> None:
+    """Images of all portions from one trace, vectors from another; a key that a later version adds makes no third."""
+    table = table_named("4.12")
+    recipes = [load_training_recipe(row.recipe, {**table.set, **row.set}) for row in table.rows]
+    data = [load_recipe(recipe.data, recipe.data_changes) for recipe in recipes]
+    assert len({one.digest() for one in data}) == len({one.store for one in data}) == 2
+
+    class Later(Recipe):
+        added: int | None = None
+
+    assert Later(**data[0].model_dump()).digest() == data[0].digest() != Later(**data[0].model_dump(), added=1).digest()
 
 
 # ---------------------------------------------------------------- from nothing to a table

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,7 +118,7 @@ def material_of(recipe: TrainingRecipe, data: str | Path | None, *, render: bool
     share = world.split.train if recipe.split == world.split.by else 1.0
     each = world.flight.pings - samples.frames + 1
     validation = _rendered_validation(recipe, world, gain) if stored is None else _validation(recipe, stored)
-    about = {"name": world.name, "digest": _digest(world, "rendered"), "gain": gain}
+    about = {"name": world.name, "digest": world.digest("rendered"), "gain": gain}
     return Material(samples, None, max(1, round(world.sequences * share * recipe.part_of_data)) * each, validation, about)
 
 
@@ -133,7 +131,7 @@ def _stored(recipe: TrainingRecipe, data: str | Path) -> Material:
             "lower batch"
         )
     validation = _validation(recipe, _part(recipe, data, "validation", labels="raw"))
-    digest, gain = _digest(pairs.recipe, len(pairs.store)), pairs.store.about.get("gain")
+    digest, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
     about = {"name": pairs.recipe.name, "digest": digest, "gain": gain}
     return Material(pairs, numbers, len(numbers), validation, about)
 
@@ -177,10 +175,6 @@ def _rendered_validation(recipe: TrainingRecipe, world: Recipe, gain: float) -> 
     length = -(-count // (max(each, 1) * VALIDATION_WORLDS))
     samples = RenderedPairs(world, gain=gain, length=count, buffer=1, sequences_a_world=length, **words)
     return Validation(samples, list(samples.raw()), [*wanted.noise, *recipe.noises])
-
-
-def _digest(recipe: Recipe, *more: Any) -> str:
-    return hashlib.sha256(json.dumps([recipe.model_dump(mode="json"), *more]).encode()).hexdigest()[:16]
 
 
 # ---------------------------------------------------------------- batches
