@@ -44,7 +44,7 @@ from mitsonar.training.recipe import (  # noqa: E402
     load_training_recipe,
     training_recipe_from,
 )
-from mitsonar.training.run import Report, train  # noqa: E402
+from mitsonar.training.run import Report, _score, train  # noqa: E402
 
 FIELDS: dict[str, Any] = {
     "network": {"name": "posenet", "width": 0.03},
@@ -370,6 +370,18 @@ def test_validation_states_and_workers_do_not_touch_the_training(made: Path, who
     assert torch.get_num_threads() == threads
     assert not torch.are_deterministic_algorithms_enabled()
     assert_same(weights(whole), weights(tmp_path / "seldom"))
+
+
+def test_the_network_kept_is_that_which_is_better_on_every_axis_alike() -> None:
+    """A per cent of an axis that nobody tells does not outweigh the halving of another; levels of noise count alike."""
+    zero = np.array([11.6, 11.6, 0.26])
+    told, moved = np.array([0.4, 0.5, 0.190]), np.array([0.8, 0.7, 0.185])
+    assert _score([told], zero) < _score([moved], zero)
+    assert _score([told, moved], zero) == pytest.approx(np.sqrt(_score([told], zero) * _score([moved], zero)))
+    assert _score([zero], zero) == pytest.approx(1)
+    still = np.array([11.6, 0.0, 0.26])  # no sample moves forward
+    assert _score([told], still) == pytest.approx(np.sqrt(0.4 / 11.6 * 0.190 / 0.26))
+    assert _score([told], np.zeros(3)) == pytest.approx(told.mean())
 
 
 def test_a_run_keeps_what_it_promises(made: Path, tmp_path: Path) -> None:

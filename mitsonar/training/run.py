@@ -17,6 +17,7 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
+from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.metrics import Axis
@@ -33,6 +34,8 @@ STATE_MINUTES = 5.0
 
 SMOOTH = 0.98
 """Weight of the past in the running numbers of a report."""
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -263,8 +266,7 @@ class Journal(Callback):
             row |= {column(level, axis): value for axis, value in zip(self.axes, values, strict=True)}
         self.kept.rows.append(row)
         self.kept.loss_sum, self.kept.loss_count = 0.0, 0
-        still = np.where(zero > 0, zero, 1.0)
-        score = float(np.mean([np.sqrt(np.mean((rmse[level] / still) ** 2)) for level in self.recipe.noises]))
+        score = _score([rmse[level] for level in self.recipe.noises], zero)
         if self._finite() and not score >= self.kept.best:
             self.kept.best = score
             self._checkpoint(row).save(self.folder.network)
@@ -327,6 +329,14 @@ class _Running:
         self.weight = SMOOTH * self.weight + 1
         self.loss = self.loss + (loss - self.loss) / self.weight
         self.squares = self.squares + (squares - self.squares) / self.weight
+
+
+def _score(rmse: list[Array], zero: Array) -> float:
+    """What the kept network has least of: RMSE over that of answering nothing, as a geometric mean over axes and levels of
+    noise. One axis that no network tells does not outweigh all others, and ten per cent are ten per cent on each."""
+    moves = zero > 0
+    parts = np.array([level[moves] / zero[moves] for level in rmse])
+    return float(np.exp(np.log(np.maximum(parts, 1e-9)).mean())) if moves.any() else float(np.mean(rmse))
 
 
 def _changed(recipe: TrainingRecipe, scale: float | None, pairs: int | None, precision: str | None) -> TrainingRecipe:
