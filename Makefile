@@ -11,7 +11,7 @@ demo: $(VENV)/.installed
 	$(VENV)/bin/python -m mitsonar render sunken_ship --cartesian -o out/demo
 
 test: $(VENV)/.tested
-	$(VENV)/bin/python -m pytest -m "not slow" -n 2 --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -m "not slow" -n 2 --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
 
 lint: $(VENV)/.tested
 	$(VENV)/bin/ruff check .
