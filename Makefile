@@ -10,6 +10,7 @@ demo: $(VENV)/.installed
 	@rm -rf out/demo
 	$(VENV)/bin/python -m mitsonar render sunken_ship --cartesian -o out/demo
 
+# threads of two workers on two cores wait for one another: one each
 test: $(VENV)/.tested
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -m "not slow" -n 2 --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
 

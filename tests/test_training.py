@@ -413,6 +413,17 @@ def test_a_run_keeps_what_it_promises(made: Path, tmp_path: Path) -> None:
     assert load_training_recipe(out / "recipe.yaml") == told
 
 
+def test_a_run_that_was_stopped_before_it_validated_asks_for_more_minutes(made: Path, tmp_path: Path) -> None:
+    told = recipe(steps=3, validate={"every_steps": 100, "pairs": 4, "noise": ["none"]})
+    with pytest.raises(KeyboardInterrupt):
+        train(told, made, tmp_path / "run", threads=1, stop=lambda: True)
+    with pytest.raises(
+        MitsonarError, match=r"stopped before it validated once, and has had its 1e-09 minutes .* resume it with more"
+    ):
+        train(told, made, tmp_path / "run", resume=True, minutes=1e-9)
+    assert train(told, made, tmp_path / "run", resume=True, minutes=5).trained["steps"] == 3
+
+
 def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     told = recipe(steps=2)

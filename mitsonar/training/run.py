@@ -150,6 +150,11 @@ def train(
         done = begun["global_step"] if begun else 0
         used = float(begun["callbacks"][journal.state_key]["minutes"]) if begun else 0.0
         del begun
+        if done < module.steps and minutes is not None and used >= minutes and not folder.network.is_file():
+            raise MitsonarError(
+                f"the run in {folder.path} was stopped before it validated once, and has had its {minutes:g} minutes "
+                f"({used:.1f}): resume it with more"
+            )
         if done < module.steps and (minutes is None or used < minutes):
             module.workers = workers
             trainer.fit(module, ckpt_path=state, weights_only=True)
