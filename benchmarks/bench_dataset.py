@@ -202,8 +202,8 @@ def reading(url: Path) -> Iterator[dict[str, Any]]:
 
 def largest_field(folder: Path) -> dict[str, Any]:
     """Seconds to build, write and load 130 x 130 rocks of each kind, and the memory of it all."""
-    from mitsonar.simulation.scenes import load_scene
-    from mitsonar.simulation.worlds.rocky_field import RockyField
+    from mitsonar.simulation.scene import load_scene
+    from mitsonar.worlds.rocky_field import RockyField
 
     start = time.perf_counter()
     world = RockyField(size_m=50, a_side=(130, 130)).build(0)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from mitsonar import ChannelSimulator, ChannelSonar, load_scene
 from mitsonar.simulation.variant import ensure_variant, use_threads
-from mitsonar.simulation.worlds.families import create_family
+from mitsonar.worlds.families import create_family
 
 HEIGHT_M, FASTEST, APART_S = 10.0, 2.0, 0.05
 
@@ -121,12 +121,12 @@ def shares(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: ND
     """Time of the parts of a response, each alone."""
     from mitsonar.simulation.channel import FOR_RESPONSES, impulse_response
 
-    hearing = simulator.hearing
-    heard = simulator.paths(poses[0], velocity[0])
+    tracer = simulator.tracer
+    received = simulator.paths(poses[0], velocity[0])
     parts: dict[str, Callable[[], Any]] = {
-        "which points": lambda: hearing.source.asked(poses[0], 0),
-        "these, tracing, delays": lambda: hearing.hear(poses[0], velocity[0], 0, FOR_RESPONSES),
-        "transform (one thread)": lambda: impulse_response(heard.delay_s, heard.amplitude, simulator.sonar),
+        "which points": lambda: tracer.source.asked(poses[0], 0),
+        "these, tracing, delays": lambda: tracer.trace(poses[0], velocity[0], 0, FOR_RESPONSES),
+        "transform (one thread)": lambda: impulse_response(received.delay_s, received.amplitude, simulator.sonar),
     }
     print("  " + ", ".join(f"{name} {1e3 * median_seconds(part):.2f} ms" for name, part in parts.items()))
 

@@ -32,18 +32,18 @@ from bench_impulse import cpu
 from numpy.typing import NDArray
 
 from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, Simulator, load_recipe, load_scene, load_sonar
-from mitsonar.courses import COURSES, course
-from mitsonar.dataset.packing import with_noise
-from mitsonar.dataset.plan import scenes_of, sequences_of
-from mitsonar.dataset.recipe import Recipe
-from mitsonar.estimation.estimators import create_estimator
-from mitsonar.estimation.impulse_estimators import create_impulse_estimator
-from mitsonar.estimation.impulse_limit import impulse_limit
+from mitsonar.config.data_recipe import Recipe
+from mitsonar.datasets.plan import scenes_of, sequences_of
+from mitsonar.datasets.response_packing import with_noise
+from mitsonar.estimation.channel.named_channel_estimators import create_impulse_estimator
+from mitsonar.estimation.channel_crlb import channel_crlb
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.odometry import odometry
-from mitsonar.mapping.paths import path_of
 from mitsonar.mapping.response_source import ResponseSource
-from mitsonar.metrics import in_units
-from mitsonar.motion import Pose, motions, velocities
+from mitsonar.mapping.trajectory_smoothing import path_of
+from mitsonar.motion.courses import COURSES, course
+from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.pose import Pose, motions, velocities
 
 SEED, SCENES = 4201, 5
 
@@ -137,7 +137,7 @@ def simulator_of(recipe: Recipe, scene: Any) -> ChannelSimulator:
             path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
             _LAST[key] = ChannelSimulator(load_scene(path, **parameters), recipe.channel_sonar)
     like = _LAST[key]
-    return ChannelSimulator(like.hearing.scene, recipe.channel_sonar, like=like)
+    return ChannelSimulator(like.tracer.scene, recipe.channel_sonar, like=like)
 
 
 # ---------------------------------------------------------------- estimates
@@ -152,7 +152,7 @@ def told(work: tuple[str, dict[str, Any], ImpulseResponses]) -> list[float]:
     except MitsonarError:
         return [0.0] * 6 + [0.0, time.perf_counter() - begun]
     spread = np.full(3, np.nan) if found.covariance is None else np.sqrt(np.abs(np.diag(found.covariance)))
-    return [*found.motion, *spread, float(found.believe), time.perf_counter() - begun]
+    return [*found.motion, *spread, float(found.valid), time.perf_counter() - begun]
 
 
 def estimates(
@@ -215,7 +215,7 @@ def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponse
         stds = []
         for one, true in list(zip(samples, truth(samples), strict=True))[:24]:
             span = float(one.time_s[-1] - one.time_s[0])
-            stds.append(impulse_limit(one.sonar, 10.0, true, pings=len(one), span_s=span, free=free).tolist())
+            stds.append(channel_crlb(one.sonar, 10.0, true, pings=len(one), span_s=span, free=free).tolist())
         path.write_text(json.dumps(stds))
     stds = np.array(json.loads(path.read_text()))
     scale = np.array([1e3, 1e3, 180 / np.pi])[: stds.shape[1]]
@@ -325,22 +325,22 @@ def figure(asked: argparse.Namespace) -> None:
     from matplotlib.figure import Figure
 
     recipe = load_recipe("impulse-standard", {"seed": SEED, "channel.model": asked.model})
-    scene = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0]).hearing.scene
+    scene = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0]).tracer.scene
     flown = course("sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
     sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
     frames = Simulator(scene, sonar).render(flown)
     seen = odometry(frames, create_estimator("direct"), start=Pose(*flown.poses[0]))
     path = asked.out / f"course-sinusoid-{asked.model}-{asked.pings}-correlation.json"
-    heard = np.array(json.loads(path.read_text()))[:, :3]
+    received = np.array(json.loads(path.read_text()))[:, :3]
     driven_by = {
-        "impulse responses, correlation of ten pings": path_of(heard, Pose(*flown.poses[0]), flown.time_s).poses,
+        "impulse responses, correlation of ten pings": path_of(received, Pose(*flown.poses[0]), flown.time_s).poses,
         "DIDSON images, direct": seen.path.poses,
     }
     drawn = Figure(figsize=(10, 5), layout="constrained")
     axes = drawn.add_subplot()
     axes.plot(*flown.poses[:, :2].T, "k--", lw=2, label="true")
     true = motions(flown.poses)
-    for (name, poses), answers in zip(driven_by.items(), (heard, seen.series.motions), strict=True):
+    for (name, poses), answers in zip(driven_by.items(), (received, seen.series.motions), strict=True):
         rmse = np.sqrt((in_units(answers - true) ** 2).mean(axis=0))
         end = float(np.hypot(*(poses[-1, :2] - flown.poses[-1, :2])))
         print(

@@ -167,7 +167,7 @@ def open3d_frames(seabed: Seabed, sonar: mitsonar.Sonar) -> Callable[[np.ndarray
     """What a user would write: RaycastingScene, rays and bins in NumPy, the thesis model."""
     import open3d as o3d
 
-    from mitsonar.motion import vehicle_rotation
+    from mitsonar.motion.pose import vehicle_rotation
 
     half = 15.0
     floor = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]], np.float32)
@@ -252,9 +252,9 @@ def memory(frames: int) -> dict[str, Any]:
 
 def render_for_memory(frames: int, rays: int) -> None:
     """Render frames over the seabed into a folder and print the peak memory of this process."""
-    from mitsonar.motion import Trajectory
-    from mitsonar.noise import NoiseModel
-    from mitsonar.simulation.runs import Outputs, run
+    from mitsonar.acoustics.noise import NoiseModel
+    from mitsonar.motion.pose import Trajectory
+    from mitsonar.simulation.render_run import Outputs, run
 
     ensure_variant()
     sonar = instrument(96, rays, "physical").replace(range_bins=128)

@@ -28,21 +28,21 @@ import numpy as np
 from bench_impulse import cpu
 
 from mitsonar import load_recipe
-from mitsonar.dataset.generate import make
-from mitsonar.dataset.store import DataStore
-from mitsonar.estimation.estimators import estimator_from
-from mitsonar.estimation.height import DirectHeight
-from mitsonar.estimation.view_network import ViewNetwork
-from mitsonar.frames import SonarFrames
-from mitsonar.mapping.heights import measured
-from mitsonar.mapping.results import run_odometry
+from mitsonar.acoustics.noise import load_noise
+from mitsonar.config.training_recipe import load_training_recipe
+from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.store import DataStore
+from mitsonar.estimation.height.direct_height import DirectHeight
+from mitsonar.estimation.learned.view_network import ViewNetwork
+from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.mapping.measured_heights import measured
+from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.view_source import open_views
-from mitsonar.metrics import in_units
+from mitsonar.motion.motion_errors import in_units
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.noise import load_noise
+from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.training.evaluation import evaluate
-from mitsonar.training.recipe import load_training_recipe
-from mitsonar.training.run import train
+from mitsonar.training.training_run import train
 
 QUADRANTS, CONES = ["q1", "q2", "q3", "q4"], ["c1", "c2", "c3", "c4"]
 
@@ -79,7 +79,7 @@ def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -
     """Vectors from 10 m up at 1024 levels, made or gone on with."""
     words = {"store": "vectors", "segments": QUADRANTS + CONES, "name": name, "sonar.range_bins": 1024, **changes}
     path = asked.out / f"{name}.zarr"
-    make(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=asked.workers)
+    make_dataset(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=asked.workers)
     return path
 
 
@@ -202,7 +202,7 @@ def heights(asked: argparse.Namespace) -> None:
     print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | believed | ms |\n" + 9 * "|---" + "|")
     for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
         path = asked.out / f"{recipe}.zarr"
-        make(load_recipe(recipe, {"store": "vectors"}), str(path), workers=asked.workers)
+        make_dataset(load_recipe(recipe, {"store": "vectors"}), str(path), workers=asked.workers)
         for noise in ("none", "high"):
             print(height_row(path, recipe, noise, interval), flush=True)
 
@@ -219,7 +219,7 @@ def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
         begun = time.process_time()
         said.append(measured(frame, DirectHeight())[1][0])
         spent.append(1e3 * (time.process_time() - begun))
-    believed = np.array([one.believe for one in said])
+    believed = np.array([one.valid for one in said])
     error = 100 * (np.array([one.height_m for one in said]) - poses[::5, 2])[believed]
     rmse = np.sqrt((error**2).mean())
     return (
@@ -236,7 +236,7 @@ def paths(asked: argparse.Namespace) -> None:
     if not asked.rows:
         raise SystemExit("paths needs --rows: folders of trained networks of c1..c4 from 10 m, with commas between them")
     path = asked.out / "runs10.zarr"
-    make(load_recipe("looking-down-runs", {"sonar.range_bins": 1024}), str(path), workers=asked.workers)
+    make_dataset(load_recipe("looking-down-runs", {"sonar.range_bins": 1024}), str(path), workers=asked.workers)
     print(
         "| network | path | pairs | believed | RMSE sideways / forward mm / yaw deg | end off, mm (of path) |\n"
         + 6 * "|---"
@@ -266,11 +266,11 @@ def halves(asked: argparse.Namespace) -> None:
     """Two halves of a forward-looking sonar, learnt on simulated hulls with the chapter's noise (4.4.5)."""
     print(HEAD)
     learnt = asked.out / "hulls.zarr"
-    make(load_recipe("ship-hull"), str(learnt), sequences=300, workers=asked.workers)
+    make_dataset(load_recipe("ship-hull"), str(learnt), sequences=300, workers=asked.workers)
     other = asked.out / "hulls-unseen.zarr"
     gain = DataStore.open(str(learnt)).about["gain"]  # one sonar
     words = {"seed": 7919, "name": "hulls-unseen", "gain": gain}
-    make(load_recipe("ship-hull", words), str(other), sequences=100, workers=asked.workers)
+    make_dataset(load_recipe("ship-hull", words), str(other), sequences=100, workers=asked.workers)
     noise = "0.04,0.02,0.04"
     given = {"input": {"kind": "vector", "halves": True}, "noise": noise, "data": "ship-hull", "data_changes": {}}
     for name, recipe in (
@@ -283,7 +283,7 @@ def halves(asked: argparse.Namespace) -> None:
             frames = lamprey(asked.frames)
             pairs = [network.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
             told = in_units(np.array([one.motion for one in pairs]))
-            believed = sum(one.believe for one in pairs)
+            believed = sum(one.valid for one in pairs)
             mean, spread = (" / ".join(f"{v:.3g}" for v in fold(told, axis=0)) for fold in (np.mean, np.std))
             print(f"{name}, {len(pairs)} pairs of a DIDSON at rest: mean {mean}, spread {spread}, {believed} believed")
 

@@ -20,17 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
-from mitsonar.dataset.pairs import SonarPairs
-from mitsonar.dataset.plan import scenes_of
-from mitsonar.dataset.rendering import SceneRenderer
-from mitsonar.dataset.store import DataStore
-from mitsonar.estimation.limit import bound, overall
-from mitsonar.geometry import GroundGeometry
-from mitsonar.metrics import in_units
-from mitsonar.motion import Pose
-from mitsonar.noise import NoiseModel, information, load_noise
+from mitsonar.acoustics.noise import NoiseModel, information, load_noise
+from mitsonar.datasets.plan import scenes_of
+from mitsonar.datasets.scene_rendering import SceneRenderer
+from mitsonar.datasets.store import DataStore
+from mitsonar.datasets.torch_pairs import SonarPairs
+from mitsonar.estimation.crlb.image_crlb import bound, overall
+from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.pose import Pose
 from mitsonar.simulation.derivatives import Derivative, differentiate, jittered
-from mitsonar.sonar import Sonar
 
 TILE = 32
 BANDS = 4

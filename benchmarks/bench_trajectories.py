@@ -36,20 +36,20 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from mitsonar.dataset.plan import run_poses
-from mitsonar.dataset.recipe import load_recipe, shipped_recipes
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.config.data_recipe import load_recipe, shipped_recipes
+from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.estimators import create_estimator
-from mitsonar.files import write_whole
-from mitsonar.frames import SonarFrames, to_uint8
-from mitsonar.mapping.assessment import assess
+from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.io.whole_files import write_whole
 from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
-from mitsonar.mapping.paths import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
-from mitsonar.metrics import motion_errors
-from mitsonar.motion import Pose, Trajectory, motions, mounted
-from mitsonar.noise import NOISE_MODELS
-from mitsonar.plots import GAMMA
+from mitsonar.mapping.trajectory_smoothing import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
+from mitsonar.motion.motion_errors import motion_errors
+from mitsonar.motion.pose import Pose, Trajectory, motions, mounted
+from mitsonar.motion.trajectory_errors import assess
+from mitsonar.plotting.fan_figure import GAMMA
+from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -243,7 +243,7 @@ def make_pattern_runs(out: Path, model: str) -> None:
 
 def run_table21(job: Job, out: Path) -> dict[str, Any]:
     """Consecutive pairs of a run: all, one of so many, or some spread over it."""
-    from mitsonar.dataset.pairs import SonarPairs
+    from mitsonar.datasets.torch_pairs import SonarPairs
 
     pairs = SonarPairs(pattern_runs(out, job.model), part="all", split="sequence", noise=job.noise)
     number = TEXTURES.index(job.texture) * len(RUNS) + RUNS.index(job.run)
@@ -272,10 +272,10 @@ def estimates_of(method: str, pairs: Iterable[SonarFrames]) -> tuple[list[Estima
 def scores(found: list[Estimate], true: Array) -> dict[str, Any]:
     """Errors that tables show; those not believed count as zero motion."""
     motion = np.array([one.motion for one in found])
-    believe = np.array([one.believe for one in found])
+    valid = np.array([one.valid for one in found])
     unknown = np.full((3, 3), np.nan)
     covariances = np.array([unknown if one.covariance is None else one.covariance for one in found])
-    errors = motion_errors(motion, true, believe, covariances)
+    errors = motion_errors(motion, true, valid, covariances)
     heights = [one.about["height_m"] for one in found if "height_m" in one.about]
     told = {name: getattr(errors, name).tolist() for name in ("rmse", "median", "bias", "slope", "zero", "believed")}
     return told | {
@@ -293,7 +293,7 @@ def keep(job: Job, out: Path, found: list[Estimate], true: Array) -> None:
         out / f"{job.name}.npz",
         motion=[one.motion for one in found],
         covariance=[unknown if one.covariance is None else one.covariance for one in found],
-        believe=[one.believe for one in found],
+        valid=[one.valid for one in found],
         height_m=[one.about.get("height_m", np.nan) for one in found],
         true=true,
     )
@@ -353,9 +353,9 @@ def driven(run: str, rate_hz: float, frames: int = 0) -> Trajectory:
 def rendered(run: str, model: str, noise: str, frames: int) -> SonarFrames:
     """The frames of a run as a sonar would store them: noisy, in 256 grey values."""
     from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.scenes import load_scene
-    from mitsonar.simulation.worlds.pattern import Pattern
-    from mitsonar.simulation.worlds.rocky_field import RockyField
+    from mitsonar.simulation.scene import load_scene
+    from mitsonar.worlds.pattern import Pattern
+    from mitsonar.worlds.rocky_field import RockyField
 
     sonar = load_recipe(RECIPES[model]).instrument
     family = Pattern(texture="gaussian") if run in RUNS else RockyField(size_m=FIELD_M)

@@ -14,11 +14,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import mitsonar
-from mitsonar.geometry import to_cartesian
-from mitsonar.motion import Pose
-from mitsonar.simulation.scenes import sonar_in
+from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.motion.pose import Pose
+from mitsonar.simulation.scene import sonar_in
 from mitsonar.simulation.variant import ensure_variant
-from mitsonar.simulation.worlds.families import create_family
+from mitsonar.worlds.families import create_family
 
 SHOWN = {
     "rocky-field": ({}, 4.0),

@@ -1,97 +1,116 @@
-"""mitsonar: sonar images from Mitsuba 3 scenes, and the motion of the vehicle that saw them.
+"""mitsonar: sonar images and impulse responses from Mitsuba 3 scenes, and the motion of the vehicle that received them.
 
-Importing mitsonar sets no Mitsuba variant and loads no Mitsuba; it only sees to it that the plugins are registered once
-a variant is set. Names are loaded when they are first used.
+    import mitsonar
+    scene = mitsonar.load_scene("sunken_ship")
+    frames = mitsonar.Simulator(scene, mitsonar.load_sonar("didson300")).render([mitsonar.Pose(0, 0, 3)])
+
+Importing mitsonar loads no Mitsuba and sets no variant; it makes sure that the plugins (``imaging_sonar``, ``echo`` ...) are
+registered for whatever variant is set, now or later.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from mitsonar import plugins
 
 if TYPE_CHECKING:
-    from mitsonar.channel_sonar import ChannelSonar
-    from mitsonar.dataset.impulse_samples import ImpulseSamples
-    from mitsonar.dataset.impulses import ImpulsePairs
-    from mitsonar.dataset.pairs import SonarPairs
-    from mitsonar.dataset.recipe import Split, load_recipe
-    from mitsonar.dataset.rendered import RenderedPairs
-    from mitsonar.dataset.store import DataStore
+    from mitsonar.acoustics.noise import load_noise
+    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.rendered_pairs import RenderedPairs
+    from mitsonar.datasets.response_pairs import ImpulsePairs
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.datasets.torch_pairs import SonarPairs
     from mitsonar.errors import MitsonarError, MitsonarWarning
-    from mitsonar.frames import SonarFrames
-    from mitsonar.motion import Motion, Pose, Trajectory
-    from mitsonar.noise import NoiseModel, load_noise
-    from mitsonar.presets import PRESETS, load_sonar
-    from mitsonar.responses import ImpulseResponses
+    from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
+    from mitsonar.estimation.estimator import Estimate
+    from mitsonar.estimation.named_estimators import create_estimator, load_checkpoint
+    from mitsonar.instruments.channel_sonar import ChannelSonar
+    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.mapping.frame_source import load_frames
+    from mitsonar.mapping.mosaic import build_mosaic
+    from mitsonar.mapping.odometry import odometry
+    from mitsonar.motion.pose import Motion, Pose, Trajectory
+    from mitsonar.records.impulse_responses import ImpulseResponses
+    from mitsonar.records.sonar_frames import SonarFrames
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.scenes import load_scene
-    from mitsonar.sonar import Sonar
-
-__version__ = "0.1.0"
+    from mitsonar.simulation.scene import load_scene
 
 __all__ = [
-    "PRESETS",
     "ChannelSimulator",
     "ChannelSonar",
     "DataStore",
+    "Estimate",
     "ImpulsePairs",
     "ImpulseResponses",
-    "ImpulseSamples",
     "MitsonarError",
     "MitsonarWarning",
     "Motion",
-    "NoiseModel",
     "Pose",
     "RenderedPairs",
     "Simulator",
     "Sonar",
     "SonarFrames",
     "SonarPairs",
-    "Split",
     "Trajectory",
+    "build_mosaic",
+    "cramer_rao_bound",
+    "create_estimator",
+    "load_checkpoint",
+    "load_frames",
     "load_noise",
     "load_recipe",
     "load_scene",
     "load_sonar",
+    "make_dataset",
+    "odometry",
 ]
 
-_HOME = {
-    "PRESETS": "presets",
+_MODULES = {
     "ChannelSimulator": "simulation.channel",
-    "ChannelSonar": "channel_sonar",
-    "ImpulseResponses": "responses",
-    "DataStore": "dataset.store",
-    "ImpulsePairs": "dataset.impulses",
-    "ImpulseSamples": "dataset.impulse_samples",
+    "ChannelSonar": "instruments.channel_sonar",
+    "DataStore": "datasets.store",
+    "Estimate": "estimation.estimator",
+    "ImpulsePairs": "datasets.response_pairs",
+    "ImpulseResponses": "records.impulse_responses",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
-    "Motion": "motion",
-    "NoiseModel": "noise",
-    "Pose": "motion",
-    "RenderedPairs": "dataset.rendered",
+    "Motion": "motion.pose",
+    "Pose": "motion.pose",
+    "RenderedPairs": "datasets.rendered_pairs",
     "Simulator": "simulation.imaging",
-    "Sonar": "sonar",
-    "SonarFrames": "frames",
-    "SonarPairs": "dataset.pairs",
-    "Split": "dataset.recipe",
-    "Trajectory": "motion",
-    "load_noise": "noise",
-    "load_recipe": "dataset.recipe",
-    "load_scene": "simulation.scenes",
-    "load_sonar": "presets",
+    "Sonar": "instruments.imaging_sonar",
+    "SonarFrames": "records.sonar_frames",
+    "SonarPairs": "datasets.torch_pairs",
+    "Trajectory": "motion.pose",
+    "build_mosaic": "mapping.mosaic",
+    "cramer_rao_bound": "estimation.crlb.image_crlb",
+    "create_estimator": "estimation.named_estimators",
+    "load_checkpoint": "estimation.named_estimators",
+    "load_frames": "mapping.frame_source",
+    "load_noise": "acoustics.noise",
+    "load_recipe": "config.data_recipe",
+    "load_scene": "simulation.scene",
+    "load_sonar": "instruments.named_sonars",
+    "make_dataset": "datasets.generation",
+    "odometry": "mapping.odometry",
 }
 
 plugins.install()
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name == "__version__":
+        return version("mitsonar")
+    if name not in _MODULES:
         raise AttributeError(f"module 'mitsonar' has no attribute {name!r}")
-    return getattr(import_module(f"mitsonar.{_HOME[name]}"), name)
+    return getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*globals(), *__all__, "__version__"])

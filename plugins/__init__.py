@@ -16,7 +16,15 @@ from types import ModuleType
 
 __all__ = ["PLUGINS", "install"]
 
-PLUGINS = ("surfaces", "place", "imaging_sonar", "channel_sonar", "echo", "cell_noise", "perlin")
+PLUGINS = (
+    "surfaces",
+    "hashed_texture",
+    "imaging_sonar_sensor",
+    "channel_sonar_sensor",
+    "echo_integrator",
+    "cell_noise",
+    "perlin",
+)
 """The modules that speak Mitsuba, in the order in which they import each other."""
 
 

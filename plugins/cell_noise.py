@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsonar.errors import MitsonarError
-from mitsonar.plugins.place import TextureOfPlace
+from mitsonar.plugins.hashed_texture import HashedTexture
 
 __all__ = ["CellNoise"]
 
 
-class CellNoise(TextureOfPlace):
+class CellNoise(HashedTexture):
     """Independent reflectivity in every cell of a grid, from a hash: no bitmap in memory, however fine the grid.
 
     Properties: ``coordinates`` [uv]: uv or position; ``cells`` [2048]: cells a unit of uv; ``cell_size`` [m, 0.015]: edge

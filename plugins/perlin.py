@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsonar.errors import MitsonarError
-from mitsonar.plugins.place import TextureOfPlace
+from mitsonar.plugins.hashed_texture import HashedTexture
 
 __all__ = ["Perlin"]
 
 
-class Perlin(TextureOfPlace):
+class Perlin(HashedTexture):
     """Perlin's gradient noise (Perlin, Improving Noise, 2002) in two dimensions (uv) or three (position).
 
     Properties: ``coordinates`` [uv]: uv or position; ``cells`` [64]: lattice cells a unit of uv; ``cell_size`` [m, 0.5]:

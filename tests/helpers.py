@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from mitsonar.motion import Pose
-from mitsonar.sonar import Sonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -227,7 +227,7 @@ def tiny_recipe(**changes: Any) -> Any:
     """The tiny recipe with some keys changed; dots between levels become ``__``."""
     import copy
 
-    from mitsonar.dataset.recipe import recipe_from
+    from mitsonar.config.data_recipe import recipe_from
 
     fields = copy.deepcopy(TINY)
     for key, value in changes.items():
@@ -250,7 +250,7 @@ DOWN: dict[str, Any] = {
 
 
 HEARD: dict[str, Any] = {
-    "name": "heard",
+    "name": "received",
     "world": {"family": "flat-objects", "size_m": 16.0, "seabed_cells": 96, "rectangles": 20, "ellipses": 20},
     "scenes": [{"count": 4, "sequences": 10}],
     "channel": {"range_max": 8.0, "frequency_step_hz": 40.0, "frame_rate_hz": 40.0},
@@ -261,9 +261,9 @@ HEARD: dict[str, Any] = {
 """Four small scenes of ten sequences of three pings: a second each."""
 
 
-def heard_recipe(**changes: Any) -> Any:
+def impulse_recipe(**changes: Any) -> Any:
     """The small recipe of responses with some groups of keys changed."""
-    from mitsonar.dataset.recipe import recipe_from
+    from mitsonar.config.data_recipe import recipe_from
 
     groups = {
         name: {**HEARD[name], **value} if isinstance(value, dict) and name in HEARD else value

@@ -9,9 +9,9 @@ import numpy as np
 from helpers import axes
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.channel_sonar import ChannelSonar
-from mitsonar.motion import Motion, Pose, compose
-from mitsonar.responses import ImpulseResponses
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.motion.pose import Motion, Pose, compose
+from mitsonar.records.impulse_responses import ImpulseResponses
 
 Array = NDArray[np.float64]
 
@@ -56,9 +56,9 @@ def ping(
         points, strength = ground.points[of], ground.strength[of]
         sent = points - place
         there = np.linalg.norm(sent, axis=1)
-        heard = sent - np.array(receiver.position) @ turn
-        back = np.linalg.norm(heard, axis=1)
-        ahead, aside, above = sonar.field_of_view[receiver.name].axes @ turn @ (heard / back[:, None]).T
+        received = sent - np.array(receiver.position) @ turn
+        back = np.linalg.norm(received, axis=1)
+        ahead, aside, above = sonar.field_of_view[receiver.name].axes @ turn @ (received / back[:, None]).T
         gain = sonar.field_of_view[receiver.name].sensitivity(ahead, aside, above)
         if keep is not None and len(keep) <= number:
             wide = sonar.field_of_view[receiver.name].model_copy(update={"taper": 0.0})
@@ -68,8 +68,8 @@ def ping(
         tau = there[on] / sonar.sound_speed
         delay = tau + back[on] / sonar.sound_speed
         for _ in range(6):  # of 5.5 to 5.14, to convergence
-            delay = tau + np.linalg.norm(heard[on] - delay[:, None] * speed, axis=1) / sonar.sound_speed
-        cosines = -sent[on, 2] / there[on] * -heard[on, 2] / back[on]
+            delay = tau + np.linalg.norm(received[on] - delay[:, None] * speed, axis=1) / sonar.sound_speed
+        cosines = -sent[on, 2] / there[on] * -received[on, 2] / back[on]
         amplitude = gain[on] * np.sqrt(strength[on] * cosines) / (there[on] * back[on] if sonar.spreads else 1.0)
         found.append(_response(sonar, amplitude, delay))
     return np.array(found, dtype=np.complex64)

@@ -14,108 +14,29 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SETUPTOOLS = PROJECT["tool"]["setuptools"]
 
-STAGES = (
-    *(
-        "errors",
-        "files",
-        "sonar",
-        "channel_sonar",
-        "presets",
-        "motion",
-        "courses",
-        "frames",
-        "responses",
-        "framestore",
-        "viewframes",
-        "noise",
-        "geometry",
-        "height",
-        "metrics",
-        "plots",
-        "response_plots",
-    ),
-    "simulation.echoes",
-    *(f"plugins.{name}" for name in ("surfaces", "place", "imaging_sonar", "channel_sonar", "echo", "cell_noise", "perlin")),
-    *(f"simulation.worlds.{name}" for name in ("shapes", "perlin", "world")),
-    *(f"simulation.worlds.{name}" for name in ("rocky_field", "ship_hull", "pattern", "flat_objects")),
-    *(f"simulation.worlds.{name}" for name in ("user_mesh", "scene_file")),
-    "simulation.worlds.families",
-    *(f"simulation.{name}" for name in ("variant", "scenes", "acoustics", "tracing", "views", "segments", "bistatic")),
-    *(f"simulation.{name}" for name in ("binning", "imaging", "runs", "derivatives")),
-    *(f"simulation.{name}" for name in ("paths", "scatterers", "hearing", "transform", "channel", "impulse_runs")),
-    *(
-        f"dataset.{name}"
-        for name in ("recipe", "recording", "image_recording", "response_recording", "recordings", "plan", "split", "place")
-    ),
-    *(f"dataset.{name}" for name in ("store", "rendering", "hearing", "renderers", "shards", "workers", "generate")),
-    *(
-        f"dataset.{name}"
-        for name in ("check", "response_sheet", "sheet", "arrangement", "ground", "parts", "batches", "pairs", "rendered")
-    ),
-    *(f"dataset.{name}" for name in ("again", "packing", "impulse_samples", "impulses")),
-    *(
-        f"networks.{name}"
-        for name in ("law", "blocks", "posenet", "sfmnet", "cnn1b", "cnn4b", "cnn4posenet", "posenet_dual")
-    ),
-    *(
-        f"networks.{name}"
-        for name in (
-            "look",
-            "matching",
-            "slopes",
-            "corrnet",
-            "impulse_posenet",
-            "posenetvec",
-            "profilenet",
-            "create",
-            "shipped",
-            "checkpoint",
-            "onnx",
-        )
-    ),
-    *(
-        f"estimation.{name}"
-        for name in (
-            "estimator",
-            "zero",
-            "ground",
-            "ecc",
-            "phase",
-            "flow",
-            "direct",
-            "trained",
-            "network",
-            "view_network",
-            "nearest",
-            "estimators",
-        )
-    ),
-    *(f"estimation.{name}" for name in ("floor", "height", "height_network", "heights")),
-    *(f"estimation.{name}" for name in ("limit", "impulse", "comparison", "regressors")),
-    *(f"estimation.{name}" for name in ("ground_law", "impulse_bands", "impulse_search", "impulse_limit")),
-    *(f"estimation.{name}" for name in ("impulse_correlation", "impulse_likelihood", "impulse_estimators")),
-    *(
-        f"mapping.{name}"
-        for name in (
-            "paths",
-            "assessment",
-            "heights",
-            "source",
-            "response_source",
-            "view_source",
-            "continuity",
-            "odometry",
-            "mosaic",
-            "charts",
-            "results",
-        )
-    ),
-    *(f"training.{name}" for name in ("recipe", "loss", "data", "augment", "module", "journal", "run")),
-    *(f"training.{name}" for name in ("evaluation", "tables", "reproduce")),
+ROOMS = (
+    "errors",
+    "io",
+    "motion",
+    "instruments",
+    "geometry",
+    "acoustics",
+    "records",
+    "plugins",
+    "worlds",
+    "config",
+    "plotting",
+    "simulation",
+    "recordings",
+    "datasets",
+    "networks",
+    "estimation",
+    "mapping",
+    "training",
     "cli",
     "__main__",
 )
-"""Each module imports only from earlier ones; those of `cli` may import each other. A new module needs a place here."""
+"""Rooms in the order in which data flows: a module imports only from its own room and from earlier ones."""
 
 
 def folder_of(package: str) -> Path:
@@ -166,36 +87,51 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def stage(name: str) -> int:
-    """The place of a module in the order."""
-    return STAGES.index("cli" if name.split(".")[0] == "cli" else name)
+def room(name: str) -> str:
+    """The room of a module: ``simulation`` of ``simulation.imaging``."""
+    return name.split(".")[0]
 
 
-PACKAGES = {"", "plugins", "simulation", "simulation.worlds", "dataset", "networks", "estimation", "mapping", "training"}
-PACKAGES |= {"scenes", "recipes"}
+DATA = ("scenes", "recipes")
+"""Packages that hold data; a script that makes them may stand beside."""
+
+PACKAGES = {name for name, path in MODULES.items() if path.stem == "__init__"}
 """Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
-
-def test_every_module_has_its_place() -> None:
-    # scenes holds data; a script that makes them may stand beside
-    unknown = {name for name in MODULES if name not in STAGES and name.split(".")[0] not in ("cli", "scenes")} - PACKAGES
-    assert not unknown, f"give these modules their place in STAGES: {sorted(unknown)}"
-    missing = {name for name in STAGES if name not in MODULES}
-    assert not missing, f"these have gone: {sorted(missing)}"
+HOUSE = {name: imported(path) for name, path in MODULES.items() if name not in PACKAGES and room(name) not in DATA}
+"""What each module imports."""
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if name not in PACKAGES and not name.startswith("scenes")])
-def test_modules_import_from_earlier_stages_only(name: str) -> None:
-    for other in imported(MODULES[name]) - {"scenes"}:
+def test_every_module_has_its_room() -> None:
+    lost = {name for name in HOUSE if room(name) not in ROOMS}
+    assert not lost, f"give these modules a room: {sorted(lost)}"
+
+
+@pytest.mark.parametrize("name", HOUSE)
+def test_modules_import_from_their_own_and_earlier_rooms_only(name: str) -> None:
+    for other in HOUSE[name] - set(DATA):
         assert other, f"{name} imports from mitsonar itself: import from the module that holds the name"
-        same_command_line = other.split(".")[0] == name.split(".")[0] == "cli"
-        assert other not in PACKAGES, f"{name} imports the package {other}: import from its modules"
-        assert same_command_line or stage(other) < stage(name), f"{name} imports from {other}, a later stage"
+        assert other not in PACKAGES or room(name) in ("cli", "__main__"), f"{name} imports the package {other}: import from its modules"
+        assert ROOMS.index(room(other)) <= ROOMS.index(room(name)), f"{name} imports from {other}, a later room"
+
+
+def test_no_circles_within_a_room() -> None:
+    waiting = {name: {other for other in others if other in HOUSE} for name, others in HOUSE.items() if room(name) != "cli"}
+    while ready := [name for name, others in waiting.items() if not others & set(waiting)]:
+        for name in ready:
+            del waiting[name]
+    assert not waiting, f"these import each other in a circle: {sorted(waiting)}"
+
+
+def test_no_name_of_a_file_stands_twice() -> None:
+    names = [name.rpartition(".")[2] for name in HOUSE]
+    assert len(names) == len(set(names)), sorted({name for name in names if names.count(name) > 1})
 
 
 def test_packages_import_nothing_but_the_register_of_plugins() -> None:
-    found = {name: imported(MODULES[name]) for name in PACKAGES}
-    assert found == {name: {"": {"plugins"}, "networks": {"networks.create"}}.get(name, set()) for name in PACKAGES}
+    allowed = {"": {"plugins"}, "networks": {"networks.create"}}
+    found = {name: imported(MODULES[name]) for name in PACKAGES if name != "cli"}
+    assert found == {name: allowed.get(name, set()) for name in found}
 
 
 def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
@@ -287,10 +223,10 @@ def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:
         import sys
         sys.path.insert(0, {str(ROOT / "tests")!r})
         from helpers import tiny_recipe
-        from mitsonar.dataset.check import check
-        from mitsonar.dataset.generate import make
-        from mitsonar.dataset.store import DataStore
-        make(tiny_recipe(), {str(tmp_path / "tiny.zarr")!r}, sequences=2)
+        from mitsonar.datasets.data_check import check
+        from mitsonar.datasets.generation import make_dataset
+        from mitsonar.datasets.store import DataStore
+        make_dataset(tiny_recipe(), {str(tmp_path / "tiny.zarr")!r}, sequences=2)
         assert check(DataStore.open({str(tmp_path / "tiny.zarr")!r})) == []
     """
     run_python(script, block=("torch",))
@@ -320,7 +256,7 @@ def test_package_data_names_every_shipped_file() -> None:
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.scenes"] for path in scenes.glob(pattern)}
     shipped = {path for path in scenes.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
     assert shipped == named
-    recipes = set((ROOT / "mitsonar" / "dataset").glob(SETUPTOOLS["package-data"]["mitsonar.dataset"][0]))
+    recipes = set((ROOT / "mitsonar" / "config").glob(SETUPTOOLS["package-data"]["mitsonar.config"][0]))
     assert len(recipes) == 30
     training = ROOT / "benchmarks" / "recipes"
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.recipes"] for path in training.glob(pattern)}

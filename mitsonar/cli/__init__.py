@@ -10,22 +10,22 @@ def main() -> None:
     import typer
 
     from mitsonar.cli import (
-        compare,
-        dataset,
-        doctor,
-        evaluate,
-        export,
-        height,
-        image,
-        impulse,
-        limit,
-        mosaic,
-        odometry,
-        presets,
-        render,
-        reproduce,
-        train,
-        world,
+        compare_command,
+        crlb_command,
+        dataset_command,
+        doctor_command,
+        evaluate_command,
+        export_command,
+        height_command,
+        image_command,
+        impulse_command,
+        mosaic_command,
+        odometry_command,
+        presets_command,
+        render_command,
+        reproduce_command,
+        train_command,
+        world_command,
     )
 
     app = typer.Typer(
@@ -36,21 +36,21 @@ def main() -> None:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.command()(render.render)
-    app.command()(impulse.impulse)
-    app.command()(image.image)
-    app.command()(presets.presets)
-    app.command()(presets.scenes)
-    app.command()(doctor.doctor)
-    app.command()(compare.compare)
-    app.command()(limit.limit)
-    app.command()(height.height)
-    app.command()(odometry.odometry)
-    app.command()(mosaic.mosaic)
-    app.command()(train.train)
-    app.command()(evaluate.evaluate)
-    app.command()(export.export)
-    app.command()(reproduce.reproduce)
-    app.add_typer(world.worlds(), name="world")
-    app.add_typer(dataset.datasets(), name="dataset")
+    app.command()(render_command.render)
+    app.command()(impulse_command.impulse)
+    app.command()(image_command.image)
+    app.command()(presets_command.presets)
+    app.command()(presets_command.scenes)
+    app.command()(doctor_command.doctor)
+    app.command()(compare_command.compare)
+    app.command()(crlb_command.limit)
+    app.command()(height_command.height)
+    app.command()(odometry_command.odometry)
+    app.command()(mosaic_command.mosaic)
+    app.command()(train_command.train)
+    app.command()(evaluate_command.evaluate)
+    app.command()(export_command.export)
+    app.command()(reproduce_command.reproduce)
+    app.add_typer(world_command.worlds(), name="world")
+    app.add_typer(dataset_command.datasets(), name="dataset")
     app()

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.frames import SonarFrames
-from mitsonar.motion import Motion
+from mitsonar.motion.pose import Motion
+from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = [
     "FEWEST_BLOCKS",
@@ -22,14 +22,14 @@ __all__ = [
     "Estimator",
     "blank",
     "correlation_of",
-    "matching_doubt",
+    "matching_rejection",
+    "rejected",
     "spread_of",
     "two_frames",
-    "unbelieved",
 ]
 
 INPUTS = "pitch; height where no first echoes show"
-"""What methods that know the geometry are given beside the images; see :mod:`mitsonar.height`."""
+"""What methods that know the geometry are given beside the images; see :mod:`mitsonar.geometry.attitude`."""
 
 FEWEST_CELLS = 8
 """Bins and beams of an image that can be registered."""
@@ -58,12 +58,12 @@ class Estimate:
 
     motion: Motion
     covariance: NDArray[np.float64] | None = None
-    believe: bool = True
+    valid: bool = True
     reason: str = ""
     about: dict[str, Any] = field(default_factory=dict)
 
 
-def unbelieved(reason: str) -> Estimate:
+def rejected(reason: str) -> Estimate:
     """No motion, and why not to believe it."""
     return Estimate(Motion(0.0, 0.0, 0.0), None, False, reason)
 
@@ -130,7 +130,7 @@ def spread_of(shares: NDArray[np.floating]) -> float:
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0
 
 
-def matching_doubt(
+def matching_rejection(
     first: NDArray[Any], second: NDArray[Any], inside: NDArray[np.bool_], *, alike: float, block: int = 32
 ) -> str:
     """What speaks against two images ``(rows, columns)`` that should now be alike; empty where nothing does.

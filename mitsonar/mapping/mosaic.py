@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.files import write_whole
-from mitsonar.frames import SonarFrames
-from mitsonar.geometry import GroundGeometry, directions, moved
-from mitsonar.motion import Pose
+from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.instruments.beam_directions import directions
+from mitsonar.io.whole_files import write_whole
+from mitsonar.motion.pose import Pose
+from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["ILLUMINATION_FRAMES", "Blend", "Mosaic", "build_mosaic", "illumination", "save_geotiff"]
 
@@ -105,7 +106,8 @@ class Mosaic:
     Cells are squares; their edges lie on whole multiples of ``cell_m`` in the world, so that maps of one cell size fit
     together. The map grows where frames need it. Every cell takes from each frame that shows it the value at its own
     (range, bearing), bilinear between the centres of bins and beams, over level ground with the exact geometry
-    (:class:`mitsonar.geometry.GroundGeometry`). Ground outside the window, the beams or the elevation field of view is not
+    (:class:`mitsonar.geometry.ground_plane.GroundGeometry`). Ground outside the window, the beams or the elevation field of
+    view is not
     touched. A pixel of 0 within them counts: a shadow is dark. Not modelled: relief; what stands up lies too near.
 
     Args:
@@ -219,7 +221,7 @@ class Mosaic:
             return False
         self._make_room(box, slack=SLACK)
         points = self._points(box, pose)
-        radius, bearing = fan.ground.see(points)
+        radius, bearing = fan.ground.to_polar(points)
         weight = self._weights(fan, points, radius, bearing)
         if not weight.any():
             return False

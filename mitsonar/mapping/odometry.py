@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.estimation.estimator import Estimate, Estimator, unbelieved
-from mitsonar.estimation.impulse import ImpulseEstimator
-from mitsonar.frames import SonarFrames
-from mitsonar.mapping.assessment import assess, path_length
-from mitsonar.mapping.continuity import continued
-from mitsonar.mapping.heights import without_height
-from mitsonar.mapping.paths import (
+from mitsonar.estimation.channel.channel_estimator import ImpulseEstimator
+from mitsonar.estimation.estimator import Estimate, Estimator, rejected
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.measured_heights import without_height
+from mitsonar.mapping.mode_continuity import continued
+from mitsonar.mapping.response_source import ResponseSource
+from mitsonar.mapping.trajectory_smoothing import (
     MotionSeries,
     fit_scale,
     kalman_smoothed,
@@ -36,11 +36,11 @@ from mitsonar.mapping.paths import (
     scaled,
     spline_smoothed,
 )
-from mitsonar.mapping.response_source import ResponseSource
-from mitsonar.mapping.source import FrameSource
 from mitsonar.mapping.view_source import ViewSource
-from mitsonar.metrics import AXES, in_units, motion_errors
-from mitsonar.motion import Pose, Trajectory, motions
+from mitsonar.motion.motion_errors import AXES, in_units, motion_errors
+from mitsonar.motion.pose import Pose, Trajectory, motions
+from mitsonar.motion.trajectory_errors import assess, path_length
+from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Method", "Odometry", "Row", "Smoothing", "Source", "bridged", "estimate_motions", "odometry", "series_of"]
 
@@ -92,7 +92,7 @@ class Odometry:
     @property
     def believed(self) -> NDArray[np.bool_]:
         """Which motions the estimator stands for ``(frames - 1,)``; the others were bridged."""
-        return np.array([estimate.believe for estimate in self.estimates], dtype=bool)
+        return np.array([estimate.valid for estimate in self.estimates], dtype=bool)
 
     @property
     def true_at_frames(self) -> Trajectory | None:
@@ -130,7 +130,7 @@ class Odometry:
 
     def warnings(self) -> list[str]:
         """What the user should know: how many motions are not believed, and why."""
-        lost = [estimate.reason for estimate in self.estimates if not estimate.believe]
+        lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         if len(lost) <= MANY * len(self.estimates):
             return []
         part = 100 * len(lost) / len(self.estimates)
@@ -237,7 +237,7 @@ def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
     Raises:
         MitsonarError: none is believed; why is said.
     """
-    if estimates and not any(estimate.believe for estimate in estimates):
+    if estimates and not any(estimate.valid for estimate in estimates):
         reasons = _usual([estimate.reason for estimate in estimates])
         raise MitsonarError(
             f"none of {len(estimates)} motions is believed, so that nothing tells the path ({reasons}): check what the "
@@ -371,7 +371,7 @@ def _made_beside(
 def _estimates(estimator: Any, frames: Any) -> list[Estimate]:
     """Of consecutive frames or pings."""
     pairs = [frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)]
-    return [unbelieved("no height was found in the frames") if without_height(p) else estimator.estimate(p) for p in pairs]
+    return [rejected("no height was found in the frames") if without_height(p) else estimator.estimate(p) for p in pairs]
 
 
 @contextmanager

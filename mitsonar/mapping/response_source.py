@@ -1,4 +1,4 @@
-"""Impulse responses of one run, for odometry, as :class:`~mitsonar.mapping.source.FrameSource` gives frames."""
+"""Impulse responses of one run, for odometry, as :class:`~mitsonar.mapping.frame_source.FrameSource` gives frames."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.dataset.packing import snr_of, snr_said, with_noise
+from mitsonar.acoustics.signal_to_noise import snr_of, snr_said
+from mitsonar.datasets.response_packing import with_noise
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import Trajectory
-from mitsonar.responses import ImpulseResponses
+from mitsonar.motion.pose import Trajectory
+from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["ResponseSource", "holds_responses", "open_responses"]
 

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.mapping.heights import measured
-from mitsonar.mapping.source import sequence_in
-from mitsonar.motion import Trajectory
-from mitsonar.noise import NoiseModel
-from mitsonar.viewframes import ViewFrames
+from mitsonar.mapping.frame_source import sequence_in
+from mitsonar.mapping.measured_heights import measured
+from mitsonar.motion.pose import Trajectory
+from mitsonar.records.view_frames import ViewFrames
 
 if TYPE_CHECKING:
-    from mitsonar.dataset.store import DataStore
-    from mitsonar.estimation.height import HeightEstimator
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.estimation.height.direct_height import HeightEstimator
 
 __all__ = ["ViewSource", "open_views"]
 
@@ -102,8 +102,8 @@ class ViewSource:
 
     def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
         """Pings as they are stored, with noise."""
-        from mitsonar.dataset.arrangement import arrangement_of
-        from mitsonar.dataset.image_recording import array_names
+        from mitsonar.config.data_recipe import array_names
+        from mitsonar.datasets.arrangement import arrangement_of
 
         here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
         kept = chosen - chosen[0]
@@ -144,7 +144,7 @@ def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | Non
     Raises:
         MitsonarError: no data set, or one without such views, kind or sequence.
     """
-    from mitsonar.dataset.store import DataStore  # half a second that other sources do without
+    from mitsonar.datasets.store import DataStore  # half a second that other sources do without
 
     store = DataStore.open(url)
     _check_there(store, views, kind)
@@ -161,7 +161,7 @@ def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
     Raises:
         MitsonarError: it does not.
     """
-    from mitsonar.dataset.image_recording import array_names
+    from mitsonar.config.data_recipe import array_names
 
     there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
     lacking = [view for view in views if view not in there]

@@ -45,12 +45,12 @@ class Network(nn.Module):
         options: what the network was made with, defaults included; plain values.
         needs: words of the input's arrangement that it cannot do without.
         any_sonar: whether it serves sonars that it was not trained on.
-        says_law: whether it returns a :class:`~mitsonar.networks.law.MotionLaw` rather than labels.
+        says_law: whether it returns a :class:`~mitsonar.networks.gaussian_head.GaussianHead` rather than labels.
     """
 
     needs: ClassVar[dict[str, Any]] = {}
     any_sonar: ClassVar[bool] = False
-    says_law: ClassVar[bool] = False
+    has_covariance: ClassVar[bool] = False
 
     def __init__(self, *, outputs: int, width: float, dropout: float, channels: int | None = None, **sizes: Size) -> None:
         """Check and keep the options that networks share.

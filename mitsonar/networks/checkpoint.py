@@ -16,16 +16,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mitsonar.channel_sonar import ChannelSonar
-from mitsonar.dataset.arrangement import LABELS, Labels
-from mitsonar.dataset.batches import Batches
+from mitsonar.datasets.arrangement import LABELS, Labels
+from mitsonar.datasets.batches import Batches
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.files import write_whole
-from mitsonar.metrics import AXES
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.whole_files import write_whole
+from mitsonar.motion.motion_errors import AXES
 from mitsonar.networks.create import NETWORKS, create_network
-from mitsonar.networks.law import MotionLaw
+from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.shipped import SHIPPED, shipped_path
-from mitsonar.sonar import Sonar
 
 __all__ = ["FILE", "FORMAT", "WORDS", "Checkpoint"]
 
@@ -46,7 +46,7 @@ WORDS = {
     "cartesian_rows": int,
     "ground": bool,
 }
-"""The words of :class:`~mitsonar.dataset.pairs.SonarPairs` that say what a network is given, with their types."""
+"""The words of :class:`~mitsonar.datasets.torch_pairs.SonarPairs` that say what a network is given, with their types."""
 
 LATER: dict[str, Any] = {"range_levels": (int, type(None)), "halves": bool}
 """Words that files of earlier versions lack: then they are what SonarPairs has without them."""
@@ -85,7 +85,7 @@ class Checkpoint:
     arrangement: dict[str, Any]
     labels: dict[str, Any]
     sonar: dict[str, dict[str, Any]]
-    stands: dict[str, Any]
+    trained_at: dict[str, Any]
     model: str
     noise: str
     data: str
@@ -171,10 +171,10 @@ class Checkpoint:
     @property
     def fixed(self) -> str:
         """What training has fixed, in words: ``height 2.5 m, pitch 35 deg``."""
-        low, high = self.stands["height_m"]
+        low, high = self.trained_at["height_m"]
         height = f"{low:g} m" if low == high else f"{low:g}..{high:g} m"
-        roll = f", roll {self.stands['roll_deg']:g} deg" if self.stands["roll_deg"] else ""
-        return f"height {height}, pitch {self.stands['pitch_deg']:g} deg{roll}"
+        roll = f", roll {self.trained_at['roll_deg']:g} deg" if self.trained_at["roll_deg"] else ""
+        return f"height {height}, pitch {self.trained_at['pitch_deg']:g} deg{roll}"
 
     @property
     def covariance(self) -> NDArray[np.float64] | None:
@@ -193,9 +193,9 @@ class Checkpoint:
             return None
         return np.asarray(np.sqrt((np.array(chosen, dtype=float) ** 2).mean(axis=0)))
 
-    def decode(self, answer: Tensor | MotionLaw) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    def decode(self, answer: Tensor | GaussianHead) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Targets ``(batch, n)`` [m, rad] of what the network answers; covariances ``(batch, n, n)``, if it says them."""
-        if isinstance(answer, MotionLaw):
+        if isinstance(answer, GaussianHead):
             mean, covariance = (values.detach().cpu().double().numpy() for values in answer)
             return mean, covariance
         return self.coder.decode(answer.detach().cpu().numpy()), None
@@ -220,8 +220,10 @@ class Checkpoint:
             for one in self.sonars.values()
         ]
         if self.channel is not None:
-            heard = self.channel
-            sonars = [f"{heard.name}, {heard.carrier_hz:g} Hz, {heard.bandwidth_hz:g} Hz wide, {heard.taps} taps"]
+            received = self.channel
+            sonars = [
+                f"{received.name}, {received.carrier_hz:g} Hz, {received.bandwidth_hz:g} Hz wide, {received.taps} taps"
+            ]
         spans = zip(self.labels["names"], self.labels["low"], self.labels["high"], strict=True)
         rows = [
             ("network", f"{self.network}{options}"),
@@ -334,7 +336,10 @@ def _faults(table: dict[Any, Any]) -> list[str]:
     found += [f"{key!r} is unknown" for key in table if key not in names]
     if found:
         return found
-    texts, tables = ("network", "model", "noise", "data", "version"), ("options", "arrangement", "labels", "sonar", "stands")
+    texts, tables = (
+        ("network", "model", "noise", "data", "version"),
+        ("options", "arrangement", "labels", "sonar", "trained_at"),
+    )
     found += [f"{name} is not a text" for name in texts if not isinstance(table[name], str)]
     for name in (*tables, "weights", "data_recipe", "recipe", "metrics", "trained"):
         if not (isinstance(table[name], dict) and all(isinstance(key, str) for key in table[name])):
@@ -354,8 +359,8 @@ def _faults(table: dict[Any, Any]) -> list[str]:
     found += [f"arrangement {word} is not said" for word in later if not isinstance(words[word], LATER[word])]
     if not found and not (words["views"] and all(isinstance(view, str) for view in words["views"])):
         found.append("arrangement views are not names")
-    hears = words["kind"] == "response" if not found else False
-    return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["stands"], hears)
+    receives = words["kind"] == "response" if not found else False
+    return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["trained_at"], receives)
 
 
 def _faults_of_labels(labels: dict[str, Any]) -> list[str]:
@@ -369,18 +374,18 @@ def _faults_of_labels(labels: dict[str, Any]) -> list[str]:
     return []
 
 
-def _faults_of_sonar(sonar: dict[str, Any], stands: dict[str, Any], hears: bool) -> list[str]:
-    if hears and list(sonar) != ["channel"]:
+def _faults_of_sonar(sonar: dict[str, Any], trained_at: dict[str, Any], receives: bool) -> list[str]:
+    if receives and list(sonar) != ["channel"]:
         return ["sonar has no channel"]
     for view, own in sonar.items():
         if not isinstance(own, dict):
             return [f"sonar {view} is not a table"]
         try:
-            (ChannelSonar if hears else Sonar).create(**own)
+            (ChannelSonar if receives else Sonar).create(**own)
         except (MitsonarError, TypeError) as error:
             return [f"sonar {view}: {error}"]
-    angles = [stands.get("pitch_deg"), stands.get("roll_deg")]
-    if not (_are_numbers(stands.get("height_m"), 2) and _are_numbers(angles, 2)):
+    angles = [trained_at.get("pitch_deg"), trained_at.get("roll_deg")]
+    if not (_are_numbers(trained_at.get("height_m"), 2) and _are_numbers(angles, 2)):
         return ["stands must hold height_m (low, high), pitch_deg and roll_deg"]
     return []
 

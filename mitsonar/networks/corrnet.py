@@ -22,10 +22,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mitsonar.errors import MitsonarError
-from mitsonar.networks.law import MotionLaw
-from mitsonar.networks.look import Ground, Look
+from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.matching import Matching, channels_last, quiet
 from mitsonar.networks.slopes import STEP, Slopes
+from mitsonar.networks.warp_grid import Ground, WarpGrid
 
 __all__ = ["CorrNet"]
 
@@ -63,7 +63,7 @@ class CorrNet(nn.Module):
 
     needs: ClassVar[dict[str, Any]] = {"layout": "channels", "ground": True}
     any_sonar: ClassVar[bool] = True
-    says_law: ClassVar[bool] = True
+    has_covariance: ClassVar[bool] = True
 
     def __init__(self, *, width: float = 1.0, looks: int = 2, finer: int = 3, relief: bool = True) -> None:
         super().__init__()
@@ -88,12 +88,12 @@ class CorrNet(nn.Module):
         self.floor = nn.Parameter(torch.tensor([-1.0, -2.0, -1.0]))
         self.share = nn.Parameter(torch.tensor(-4.0))
 
-    def forward(self, images: Tensor, ground: Ground) -> MotionLaw:
+    def forward(self, images: Tensor, ground: Ground) -> GaussianHead:
         """The motion between two frames.
 
         Args:
             images: ``(batch, 2, bins, beams)`` in 0..1.
-            ground: a batch of :func:`mitsonar.dataset.ground.ground_at`.
+            ground: a batch of :func:`mitsonar.datasets.ground_nodes.ground_at`.
 
         Returns:
             The law of the motion; in training that of each look.
@@ -113,19 +113,19 @@ class CorrNet(nn.Module):
         unit, laws = _units(ground), []
         relief = None if self.relief is None else self.relief(*blocks)
         motion, judged = images.new_zeros(batch, 3), None
-        look = Look(ground, unit, BLOCK, size, blocks[0].shape[-2:], relief)
+        warp_grid = WarpGrid(ground, unit, BLOCK, size, blocks[0].shape[-2:], relief)
         for _ in range(self.options["looks"]):
-            motion, normal = self.matching(blocks, look, motion)
+            motion, normal = self.matching(blocks, warp_grid, motion)
             laws.append((motion, normal))
-        look = Look(ground, unit, (STEP, 1), size, cells[0].shape[-2:], _resized(relief, cells[0]))
+        warp_grid = WarpGrid(ground, unit, (STEP, 1), size, cells[0].shape[-2:], _resized(relief, cells[0]))
         for k in range(self.options["finer"]):
-            motion, normal, judged = self.slopes(cells, look, motion, judged if k >= JUDGED else None)
+            motion, normal, judged = self.slopes(cells, warp_grid, motion, judged if k >= JUDGED else None)
             laws.append((motion, normal))
         if not self.training:
             return self._law(motion, normal, unit)
-        return MotionLaw(*(torch.stack(values) for values in zip(*(self._law(*law, unit) for law in laws), strict=True)))
+        return GaussianHead(*(torch.stack(values) for values in zip(*(self._law(*law, unit) for law in laws), strict=True)))
 
-    def _law(self, motion: Tensor, normal: Tensor, unit: Tensor) -> MotionLaw:
+    def _law(self, motion: Tensor, normal: Tensor, unit: Tensor) -> GaussianHead:
         """Mean and covariance: what cells say is not independent, something remains always, and scale errors grow with the
         motion."""
         inverse = torch.linalg.inv(normal)
@@ -133,7 +133,7 @@ class CorrNet(nn.Module):
         covariance = torch.exp(2 * self.scale) * (inverse + inverse.mT) / 2 + torch.diag_embed(
             torch.exp(2 * self.floor) + torch.exp(2 * self.share) * far.square()
         )
-        return MotionLaw(motion * unit, covariance * unit[:, :, None] * unit[:, None, :])
+        return GaussianHead(motion * unit, covariance * unit[:, :, None] * unit[:, None, :])
 
 
 class Relief(nn.Module):

@@ -33,7 +33,8 @@ NETWORKS: dict[str, Any] = {
     "posenetvec": PoseNetVec,
     "profilenet": ProfileNet,
 }
-"""Classes of networks; of each: ``needs``, ``any_sonar``, ``says_law``, as in :class:`~mitsonar.networks.blocks.Network`."""
+"""Classes of networks; of each: ``needs``, ``any_sonar``, ``has_covariance``, as in
+:class:`~mitsonar.networks.blocks.Network`."""
 
 
 def create_network(name: str, **options: Any) -> nn.Module:
@@ -76,7 +77,7 @@ def options_for(name: str, inputs: Any, labels: Tensor, receivers: int = 1) -> d
 
     Args:
         name: of :data:`NETWORKS`.
-        inputs: of a batch, as :class:`~mitsonar.dataset.pairs.SonarPairs` gives them: one tensor or a tuple.
+        inputs: of a batch, as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` gives them: one tensor or a tuple.
         labels: ``(batch, outputs)``.
         receivers: whose impulse responses the input holds.
 

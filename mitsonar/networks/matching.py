@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mitsonar.networks.look import Look
+from mitsonar.networks.warp_grid import WarpGrid
 
 __all__ = ["Matching", "Pair", "channels_last", "quiet"]
 
@@ -49,7 +49,7 @@ class Matching(nn.Module):
             self.smooth.weight.zero_()
             self.smooth.weight[range(count), range(count)] = 1 / 9
 
-    def forward(self, cells: Pair, look: Look, motion: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, cells: Pair, warp_grid: WarpGrid, motion: Tensor) -> tuple[Tensor, Tensor]:
         """A better motion ``(batch, 3)`` in units, and the normal matrix ``(batch, 3, 3)`` behind it.
 
         Args:
@@ -57,13 +57,13 @@ class Matching(nn.Module):
             look: where these cells are.
             motion: found so far.
         """
-        second, inside = look.draw(cells[1], motion)
+        second, inside = warp_grid.draw(cells[1], motion)
         displaced, sure = self.displaced(cells[0], second)
         l11, l22, l21 = (sure * inside[:, None]).unbind(dim=1)
         along, across, both = l11 * l11, l21 * l21 + l22 * l22, l11 * l21
         down, aside = displaced.unbind(dim=1)
         pull = torch.stack([along * down + both * aside, both * down + across * aside], dim=1)
-        step, normal = look.solved(torch.stack([along, across, both], dim=1), pull)
+        step, normal = warp_grid.solved(torch.stack([along, across, both], dim=1), pull)
         return motion + step, normal
 
     def displaced(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mitsonar.networks.look import Look
 from mitsonar.networks.matching import Pair, channels_last, quiet
+from mitsonar.networks.warp_grid import WarpGrid
 
 __all__ = ["STEP", "Judged", "Slopes"]
 
@@ -90,7 +90,7 @@ class Slopes(nn.Module):
         return first, finer, _slope(first, 2), _slope(first, 3)
 
     def forward(
-        self, frames: Pair, look: Look, motion: Tensor, judged: Judged | None = None
+        self, frames: Pair, warp_grid: WarpGrid, motion: Tensor, judged: Judged | None = None
     ) -> tuple[Tensor, Tensor, Judged]:
         """A better motion ``(batch, 3)`` in units, the normal matrix ``(batch, 3, 3)`` behind it, and what was judged.
 
@@ -101,12 +101,12 @@ class Slopes(nn.Module):
             judged: of a look nearby, to be kept.
         """
         first = frames[0]
-        second, inside = look.draw(frames[1], motion)
+        second, inside = warp_grid.draw(frames[1], motion)
         residual = second - first
         if judged is None:
             judged = self._judged(frames, second, residual, inside)
         pull = -torch.stack([(judged.down * residual).sum(dim=1), (judged.aside * residual).sum(dim=1)], dim=1)
-        step, normal = look.solved(judged.information, pull)
+        step, normal = warp_grid.solved(judged.information, pull)
         step = (step / judged.true).clamp(-LONGEST, LONGEST)
         return motion + step, normal * judged.true[..., None] * torch.exp(self.scale), judged
 

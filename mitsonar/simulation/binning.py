@@ -19,10 +19,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.simulation.acoustics import level
-from mitsonar.simulation.echoes import Echoes
-from mitsonar.simulation.views import NARROWEST, Seen, View
-from mitsonar.sonar import Sonar
+from mitsonar.acoustics.echo_level import level
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.views import View
+from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.view_echoes import NARROWEST, ViewEchoes, ViewTracer
 
 __all__ = ["Counts", "accumulate", "develop", "fetch", "strongest"]
 
@@ -51,21 +52,21 @@ def stride(sonar: Sonar) -> int:
     return sonar.range_bins + 1 + COUNTERS
 
 
-def accumulate(seen: Seen, ping: mi.UInt32, pings: int, view: View) -> mi.UInt64:
+def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer) -> mi.UInt64:
     """Sums ``(pings, beams, stride)``, flat. Joins the kernel that makes the echoes.
 
     Args:
         seen: Dr.Jit arrays, one value a ray.
         ping: which ping of the launch a ray belongs to.
         pings: how many there are.
-        view: whose image it is.
+        tracer: of the view whose image it is.
     """
-    sonar, active, beams = view.sonar, seen.active, len(view.bearing_rad)
+    sonar, active, beams = tracer.view.sonar, seen.active, len(tracer.view.bearing_rad)
     exact = _exact(seen.echoes)
     hit = exact.hit > 0
     sums = dr.zeros(mi.UInt64, pings * beams * stride(sonar))
     start = (ping * beams + seen.beam) * stride(sonar)
-    value = level(exact, sonar, dr.select) * 2.0**view.bits
+    value = level(exact, sonar, dr.select) * 2.0**tracer.bits
     if sonar.model == "thesis":
         place = (exact.range_m - sonar.range_min) * (1 / sonar.bin_m)
         inside = active & hit & (place >= 0) & (place < sonar.range_bins)
@@ -101,13 +102,14 @@ def footprint(exact: Echoes, sonar: Sonar) -> tuple[Any, Any, Any]:
     return a, b, b - a
 
 
-def develop(sums: mi.UInt64, pings: int, view: View) -> tuple[mi.Float, mi.UInt64]:
+def develop(sums: mi.UInt64, pings: int, tracer: ViewTracer) -> tuple[mi.Float, mi.UInt64]:
     """Levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat, from the sums."""
+    view = tracer.view
     size, lines = stride(view.sonar), pings * len(view.bearing_rad)
     total = sums if view.sonar.model == "thesis" else dr.block_prefix_sum(sums, size, exclusive=False)
     index = dr.arange(mi.UInt32, lines * COUNTERS)
     counters = dr.gather(mi.UInt64, sums, index % lines * size + (view.sonar.range_bins + 1) + index // lines)
-    return mi.Float(mi.Float64(total) * 2.0**-view.bits), counters
+    return mi.Float(mi.Float64(total) * 2.0**-tracer.bits), counters
 
 
 def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple[NDArray[np.float32], Counts]:
@@ -122,7 +124,7 @@ def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple
     return levels.transpose(0, 2, 1), Counts(inside, near, far, miss)
 
 
-def strongest(seen: Seen, ping: mi.UInt32, ray: mi.UInt32, pings: int, view: View) -> mi.UInt64:
+def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, view: View) -> mi.UInt64:
     """For each cell ``(pings, beams, bins)`` the strongest ray that reaches it: density in the high 32 bits, the ray's
     number in its ping in the low."""
     sonar, beams = view.sonar, len(view.bearing_rad)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.channel_sonar import PADDING, ChannelSonar
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import Trajectory, velocities
-from mitsonar.responses import ImpulseResponses
-from mitsonar.simulation.transform import phasor_sums
+from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
+from mitsonar.motion.pose import Trajectory, velocities
+from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.simulation.nonuniform_fft import phasor_sums
 from mitsonar.simulation.variant import thread_count
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impul
 
 FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
-"""What is fetched of :class:`~mitsonar.simulation.hearing.Heard`."""
+"""What is fetched of :class:`~mitsonar.simulation.channel_tracing.EchoBatch`."""
 
 PINGS_AT_A_TIME = 16
 """Whose launches wait for their transforms: 50 bytes an echo and receiver."""
@@ -91,10 +91,10 @@ class ChannelSimulator:
 
     def __init__(self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None) -> None:
         self.sonar = sonar
-        from mitsonar.simulation.hearing import Hearing
+        from mitsonar.simulation.channel_tracing import ChannelTracer
 
-        self.hearing: Hearing = Hearing(scene, sonar, None if like is None else like.hearing)
-        self.notes = self.hearing.notes
+        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer)
+        self.notes = self.tracer.notes
 
     def responses(
         self, flown: Trajectory, velocity: ArrayLike | None = None, progress: Callable[[int], None] = lambda pings: None
@@ -103,8 +103,9 @@ class ChannelSimulator:
 
         Args:
             flown: poses of the transmitter and times.
-            velocity: in the vehicle's axes, see :class:`~mitsonar.responses.ImpulseResponses`; default: that of the
-                trajectory (:func:`~mitsonar.motion.velocities`).
+            velocity: in the vehicle's axes, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`; default:
+            that of the
+                trajectory (:func:`~mitsonar.motion.pose.velocities`).
             progress: called with the number of pings that were added.
 
         Raises:
@@ -162,38 +163,38 @@ class ChannelSimulator:
         if not 0 <= receiver < len(self.sonar.receivers):
             raise MitsonarError(f"receiver must be 0..{len(self.sonar.receivers) - 1}, its number: got {receiver!r}")
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
-        heard = self.hearing.hear(table[0], speeds[0], receiver, FOR_PATHS)
-        keep = heard["counts"].astype(bool)
-        delay, amplitude, doppler = (heard[name][keep].astype(float) for name in ("delay", "amplitude", "doppler"))
-        return Paths(delay, amplitude, doppler, int(np.count_nonzero(heard["beyond"])))
+        received = self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS)
+        keep = received["counts"].astype(bool)
+        delay, amplitude, doppler = (received[name][keep].astype(float) for name in ("delay", "amplitude", "doppler"))
+        return Paths(delay, amplitude, doppler, int(np.count_nonzero(received["beyond"])))
 
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
     ) -> Channels:
         """Responses of some pings: a launch for each; which points it asks for and its transform are found beside others."""
         shape = (len(poses), len(self.sonar.receivers))
-        asked = [threads.submit(self.hearing.source.asked, poses[k], receiver) for k, receiver in np.ndindex(shape)]
+        asked = [threads.submit(self.tracer.source.asked, poses[k], receiver) for k, receiver in np.ndindex(shape)]
         made = []
         for (k, receiver), ready in zip(np.ndindex(shape), asked, strict=True):
-            heard = self.hearing.hear(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result())
-            made.append(threads.submit(_one_response, self.sonar, heard))
+            received = self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result())
+            made.append(threads.submit(_one_response, self.sonar, received))
         response, echoes, dropped = zip(*(future.result() for future in made), strict=True)
         return Channels(
             first=first,
             response=np.reshape(np.asarray(response, np.complex64), (*shape, self.sonar.taps)),
-            height_m=self.hearing.height_m(poses),
+            height_m=self.tracer.height_m(poses),
             echoes=np.reshape(echoes, shape).astype(np.int64),
             dropped=np.reshape(dropped, shape).astype(np.int64),
         )
 
 
-def _one_response(sonar: ChannelSonar, heard: dict[str, NDArray[Any]]) -> tuple[NDArray[np.complex128], int, int]:
+def _one_response(sonar: ChannelSonar, received: dict[str, NDArray[Any]]) -> tuple[NDArray[np.complex128], int, int]:
     """One response, its echoes, and those from too far."""
-    keep = np.flatnonzero(heard["counts"])
+    keep = np.flatnonzero(received["counts"])
     strength = np.empty(len(keep), np.complex128)
-    strength.real, strength.imag = heard["real"][keep], heard["imag"][keep]
-    spectrum = _spectrum(sonar, heard["turn"][keep], strength, PADDING)
-    return _taps(sonar, spectrum, PADDING), len(keep), int(np.count_nonzero(heard["beyond"]))
+    strength.real, strength.imag = received["real"][keep], received["imag"][keep]
+    spectrum = _spectrum(sonar, received["turn"][keep], strength, PADDING)
+    return _taps(sonar, spectrum, PADDING), len(keep), int(np.count_nonzero(received["beyond"]))
 
 
 def frequency_response(
@@ -223,7 +224,7 @@ def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSon
 def _phasors(
     delay: NDArray[np.float64], amplitude: NDArray[Any], sonar: ChannelSonar, padding: int
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """What :class:`Heard` holds for the transform, of echoes on this side."""
+    """What :class:`EchoBatch` holds for the transform, of echoes on this side."""
     turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
     strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
     return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)

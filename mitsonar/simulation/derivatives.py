@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion import Motion, Pose, compose
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Motion, Pose, compose
 from mitsonar.simulation.imaging import Simulator
-from mitsonar.sonar import Sonar
 
 __all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "jittered", "step_for"]
 
@@ -113,7 +113,7 @@ def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, fi
             motions = within.copy()
             motions[:, axis] = (2 * side - 1) * step[axis]
             moved = np.array([compose(pose, Motion(*motion)) for motion in motions])
-            for looks in source.looks(moved, first=first):
+            for looks in source.render_views(moved, first=first):
                 for own, seen in zip(sums, looks, strict=True):
                     own.add(seen.levels, np.arange(len(seen)) + seen.first - first >= pings, gain, axis, side)
     return [own.derivative(pings, step) for own in sums]

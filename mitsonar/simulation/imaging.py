@@ -12,19 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.frames import SonarFrames
-from mitsonar.motion import Trajectory
-from mitsonar.noise import NoiseModel
-from mitsonar.simulation.echoes import Echoes
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Trajectory
+from mitsonar.records.echoes import Echoes
+from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import ensure_variant, garbage_stays
-from mitsonar.sonar import Sonar
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitsonar.instruments.views import View
     from mitsonar.simulation.binning import Counts
-    from mitsonar.simulation.views import View
 
 __all__ = ["Pings", "Simulator", "Tally", "constant_gain"]
 
@@ -76,9 +76,10 @@ class Simulator:
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
-        from mitsonar.simulation.scenes import sonar_in
+        from mitsonar.instruments.views import Whole
+        from mitsonar.simulation.scene import sonar_in
         from mitsonar.simulation.tracing import Tracer
-        from mitsonar.simulation.views import Whole
+        from mitsonar.simulation.view_tracers import view_tracers
 
         if sonar is None:
             found = sonar_in(scene)
@@ -91,16 +92,17 @@ class Simulator:
         self.tracer = Tracer(scene, sonar)
         self.notes = self.tracer.notes
         self.views: Sequence[View] = [Whole(sonar)] if views is None else views
+        self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
         self.pings_per_launch = max(1, rays_per_launch // max(sonar.rays, cells))
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
 
     def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
         """Levels of consecutive pings in the first view; see :meth:`looks`."""
-        for looks in self.looks(poses, first=first, labels=labels):
+        for looks in self.render_views(poses, first=first, labels=labels):
             yield looks[0]
 
-    def looks(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[list[Pings]]:
+    def render_views(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[list[Pings]]:
         """Levels of consecutive pings, in batches, one of each view.
 
         Ping ``first + k`` draws its own jitter whatever the batches are.
@@ -123,7 +125,7 @@ class Simulator:
         if key not in self._launches:
             self._launches[key] = self._compile(*key)
         inputs = self.tracer.inputs(poses, first)
-        tables = [view.tables(poses) for view in self.views]
+        tables = [tracer.tables(poses) for tracer in self.view_tracers]
         with garbage_stays():
             height, made = self._launches[key](self.tracer.scene, *inputs, tables)
         height_m = np.array(height, dtype=float)
@@ -149,8 +151,13 @@ class Simulator:
             rays = Rays(sonar, index)
             ray, fan = tracer.rays_of(rays, rows, keys)
             echoes = tracer.echoes(scene, ray, fan, surfaces)
-            looks = [view.see(scene, rays, fan, echoes, own) for view, own in zip(self.views, tables, strict=True)]
-            sums = [accumulate(seen, rays.ping, pings, view) for seen, view in zip(looks, self.views, strict=True)]
+            looks = [
+                tracer.view_echoes(scene, rays, fan, echoes, own)
+                for tracer, own in zip(self.view_tracers, tables, strict=True)
+            ]
+            sums = [
+                accumulate(seen, rays.ping, pings, tracer) for seen, tracer in zip(looks, self.view_tracers, strict=True)
+            ]
             truths: list[Any] = [None] * len(looks)
             if labels:
                 truths = [
@@ -164,7 +171,8 @@ class Simulator:
                 ]
             dr.eval(sums, truths)  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
             made = [
-                (*develop(total, pings, view), truth) for total, view, truth in zip(sums, self.views, truths, strict=True)
+                (*develop(total, pings, tracer), truth)
+                for total, tracer, truth in zip(sums, self.view_tracers, truths, strict=True)
             ]
             return tracer.height_m(scene, rows), made
 
@@ -251,7 +259,7 @@ def to_image(pings: Pings, gain: float) -> NDArray[np.float32]:
 
 
 def labels_of(pings: Pings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
-    """Label maps of a batch (see :class:`mitsonar.frames.SonarFrames`), from the strongest ray of each cell.
+    """Label maps of a batch (see :class:`mitsonar.records.sonar_frames.SonarFrames`), from the strongest ray of each cell.
 
     ``rays`` is how many a ping has.
     """

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mitsonar.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.plugins.cell_noise import CellNoise
-from mitsonar.plugins.place import ROUNDS
+from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.surfaces import facet_points, reflectances_of, reflectivity_at
 
 __all__ = ["Scatterers"]

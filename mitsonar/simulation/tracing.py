@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mitsonar.motion import to_world_matrices
-from mitsonar.plugins import echo, imaging_sonar, surfaces
-from mitsonar.simulation.echoes import Echoes
-from mitsonar.sonar import Sonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import to_world_matrices
+from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
+from mitsonar.records.echoes import Echoes
 
 __all__ = ["Rays", "Tracer", "height_below", "hidden"]
 
@@ -77,7 +77,7 @@ class Tracer:
         self.scene = scene
         self.sonar = sonar
         given = {name: value for name, value in sonar.model_dump(exclude={"name"}).items() if value is not None}
-        self.sensor: imaging_sonar.ImagingSonar = mi.load_dict({"type": "imaging_sonar", **given})
+        self.sensor: imaging_sonar_sensor.ImagingSonar = mi.load_dict({"type": "imaging_sonar", **given})
         self.surfaces = surfaces.Surfaces.of(scene)
         self.notes = self.surfaces.notes
 
@@ -88,16 +88,16 @@ class Tracer:
         # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
         return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
-    def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, imaging_sonar.Fan]:
+    def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, imaging_sonar_sensor.Fan]:
         """The rays in the world, and their fan with its directions in world axes."""
         fan = self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
         lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
         fan = fan.carried(lines)
         return mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d), fan
 
-    def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar.Fan, tables: dict[str, Any]) -> Echoes:
+    def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: dict[str, Any]) -> Echoes:
         """Echoes of :meth:`rays_of`, not evaluated yet."""
-        return echo.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan)
+        return echo_integrator.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan)
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """One ping's echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""

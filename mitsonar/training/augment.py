@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mitsonar.motion import inverse
+from mitsonar.motion.pose import inverse
 
 __all__ = ["AUGMENTATIONS", "augmented"]
 

@@ -12,17 +12,24 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
-from mitsonar.channel_sonar import ChannelSonar
-from mitsonar.dataset.impulses import ImpulsePairs
-from mitsonar.dataset.pairs import SonarPairs
-from mitsonar.dataset.parts import split_for
-from mitsonar.dataset.recipe import Recipe, Split
-from mitsonar.dataset.recordings import recording_of
-from mitsonar.dataset.store import DataStore
+from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.datasets.modalities import modality_of
+from mitsonar.datasets.response_pairs import ImpulsePairs
+from mitsonar.datasets.sample_index import split_for
+from mitsonar.datasets.store import DataStore
+from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.comparison import Answers, chosen, rows_of
-from mitsonar.estimation.trained import ANGLE_OFF_DEG, HEIGHT_OFF, Instrument, answer_of, inputs_of, one_thread
-from mitsonar.metrics import AXES, cluster_resamples
+from mitsonar.estimation.benchmark import Answers, chosen, rows_of
+from mitsonar.estimation.learned.trained_network import (
+    ANGLE_OFF_DEG,
+    HEIGHT_OFF,
+    Instrument,
+    answer_of,
+    inputs_of,
+    one_thread,
+)
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.motion.motion_errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
 
 __all__ = ["NOISES", "evaluate", "predictions"]
@@ -106,7 +113,7 @@ def evaluate(
 
     Returns:
         Numbers and texts: what was asked for; ``notes``, sentences that the reader of the tables needs; ``tables``, one a
-        level, each with ``rows``: for the network and ``zero`` what :class:`~mitsonar.estimation.comparison.Row` holds, in
+        level, each with ``rows``: for the network and ``zero`` what :class:`~mitsonar.estimation.benchmark.Row` holds, in
         mm, mm, deg (heights: mm), with ``thesis``, the RMSE in mm, mm, 1/100 deg; and ``beyond``: shares of true motions and
         of answers beyond those of training.
 
@@ -138,7 +145,7 @@ def evaluate(
         "trained": {"data": checkpoint.data, "model": checkpoint.model, "noise": checkpoint.noise, **checkpoint.trained},
         "data": str(data),
         "recipe": recipe.name,
-        "model": recording_of(recipe).sonar.model,
+        "model": modality_of(recipe).sonar.model,
         "part": part or first.split.unseen,
         "split": first.split.by,
         "pairs": len(numbers),
@@ -231,7 +238,8 @@ def _of_axes(row: dict[str, Any], axes: int) -> dict[str, Any]:
 
 
 def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArray[np.int64]) -> dict[str, Any]:
-    """What :class:`~mitsonar.metrics.MotionErrors` says of motions, of heights ``(n, 1)`` [m], in mm; zero stands for always
+    """What :class:`~mitsonar.motion.motion_errors.MotionErrors` says of motions, of heights ``(n, 1)`` [m], in mm; zero
+    stands for always
     answering the middle of the heights of training, and slopes are over the differences from it."""
     error, side = 1e3 * (heights - truth), 1e3 * (truth - middle)
     rmse, zero = (float(np.sqrt((values**2).mean())) for values in (error, side))
@@ -299,12 +307,12 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str
     same = checkpoint.data_recipe == recipe.model_dump(mode="json")
     if same and part in ("train", "all"):
         found.append(f"part {part} of this data set holds pairs that training has seen")
-    model = recording_of(recipe).sonar.model
+    model = modality_of(recipe).sonar.model
     if model != checkpoint.model:
         found.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")
     if not checkpoint.arrangement["ground"]:
         low, high = (height + recipe.mount.up_m for height in recipe.flight.heights)
-        trained = checkpoint.stands
+        trained = checkpoint.trained_at
         heights = low < trained["height_m"][0] * (1 - HEIGHT_OFF) or high > trained["height_m"][1] * (1 + HEIGHT_OFF)
         angles = [abs(getattr(recipe.mount, key) - trained[key]) > ANGLE_OFF_DEG for key in ("pitch_deg", "roll_deg")]
         if heights or any(angles):

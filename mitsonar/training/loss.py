@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mitsonar.dataset.arrangement import Labels
-from mitsonar.networks.law import likelihood
-from mitsonar.training.recipe import Loss
+from mitsonar.config.training_recipe import Loss
+from mitsonar.datasets.arrangement import Labels
+from mitsonar.networks.gaussian_head import likelihood
 
 __all__ = ["create_loss", "squared_error"]
 

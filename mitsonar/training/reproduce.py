@@ -16,17 +16,15 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from mitsonar.dataset.generate import make
-from mitsonar.dataset.place import Place
-from mitsonar.dataset.recipe import Recipe, load_recipe, recipe_from
-from mitsonar.dataset.store import DataStore
+from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
+from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe, training_recipe_from
+from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, complaint
-from mitsonar.files import read_json, write_json, write_whole
+from mitsonar.io.storage import Storage
+from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.training.evaluation import evaluate
-from mitsonar.training.recipe import TrainingRecipe, load_training_recipe, training_recipe_from
-from mitsonar.training.run import Report, train
-from mitsonar.training.tables import (
+from mitsonar.training.document_tables import (
     Found,
     Reached,
     Score,
@@ -38,6 +36,8 @@ from mitsonar.training.tables import (
     table_named,
     tables_with,
 )
+from mitsonar.training.evaluation import evaluate
+from mitsonar.training.training_run import Report, train
 
 __all__ = ["Effort", "Watch", "reproduce", "unseen_recipe"]
 
@@ -123,7 +123,7 @@ class Watch(Protocol):
         """While a network is trained; yields what is called after each step, and what is asked then: whether to stop."""
 
 
-class Nobody:
+class SilentWatch:
     """A watch that nobody keeps."""
 
     def begin(self, what: str, total: int, unit: str) -> Told:
@@ -172,9 +172,9 @@ def reproduce(
     known = table_named(table)
     recipes = {row.name: effort.recipe(row.recipe, {**known.set, **row.set}) for row in rows_named(known, rows)}
     data = {name: load_recipe(recipe.data, recipe.data_changes) for name, recipe in recipes.items()}
-    crew = Crew(workers, accelerator, devices, watch or Nobody())
-    with Place(out).locked():
-        bench = Bench.begun(Path(out), effort)
+    crew = Crew(workers, accelerator, devices, watch or SilentWatch())
+    with Storage(out).locked():
+        bench = TableBuilder.begun(Path(out), effort)
         bench.ask(table, recipes)
         report = bench.report()
         for name, recipe in recipes.items():
@@ -210,7 +210,7 @@ class Crew:
 
 
 @dataclass(frozen=True)
-class Bench:
+class TableBuilder:
     """The folder.
 
     Attributes:
@@ -222,7 +222,7 @@ class Bench:
     effort: Effort
 
     @classmethod
-    def begun(cls, folder: Path, effort: Effort) -> Bench:
+    def begun(cls, folder: Path, effort: Effort) -> TableBuilder:
         """A new folder, or the one that is there, if it was begun alike.
 
         Raises:
@@ -230,7 +230,7 @@ class Bench:
         """
         path = folder / ABOUT
         if not path.exists():
-            others = [name for name in Place(folder).sizes() if name != f".{ABOUT}.part"]
+            others = [name for name in Storage(folder).sizes() if name != f".{ABOUT}.part"]
             if others:
                 raise MitsonarError(f"{folder} holds other things ({others[0]}) and is kept: choose another -o")
             about = About(format=FORMAT, version=version("mitsonar"), **effort.plain(), tables=[], recipes={})
@@ -305,7 +305,9 @@ class Bench:
             told.append(crew.watch.begin(f"rendering {path.stem}", frames, "frames"))
             told[0](done)
 
-        make(data, str(path), sequences=sequences, workers=crew.workers, begun=begun, progress=lambda more: told[0](more))
+        make_dataset(
+            data, str(path), sequences=sequences, workers=crew.workers, begun=begun, progress=lambda more: told[0](more)
+        )
         return path
 
     def _run(self, name: str) -> Path:

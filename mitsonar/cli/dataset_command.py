@@ -1,0 +1,217 @@
+"""``mitsonar dataset``: make labelled data sets, look at them, check them."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say, say_stopped, warn
+from mitsonar.errors import MitsonarError
+
+__all__ = ["changes_of", "datasets"]
+
+Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s3://...) of a data set.")]
+
+
+def datasets() -> typer.Typer:
+    """The group of commands."""
+    app = typer.Typer(help="Make labelled data sets, look at them, check them.", no_args_is_help=True)
+    for command in (make, info, show, check, recipes):
+        app.command()(command)
+    return app
+
+
+@answered
+def make(
+    recipe: Annotated[str, typer.Argument(help="Name of a shipped recipe (`mitsonar dataset recipes`), or a YAML file.")],
+    out: Annotated[
+        str, typer.Option("-o", "--out", help="Folder or URL (s3://...) of the data set; made, or gone on with.")
+    ],
+    sequences: Annotated[int | None, typer.Option(help="Only so many sequences.")] = None,
+    scale: Annotated[float | None, typer.Option(help="Only this part of the sequences, 0..1.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of worlds, flights and jitter (default: the recipe's).")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes on this machine (default: its cores).")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler that runs: its workers render.")] = None,
+    change: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the recipe: sonar.range_bins=256.")] = None,
+    verify: Annotated[bool, typer.Option("--verify", help="Read all that is there and make again what is damaged.")] = False,
+) -> None:
+    """Make a data set. Killed at any moment, the same command goes on and ends with the same bytes."""
+    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.datasets.generation import make_dataset
+
+    described = load_recipe(recipe, changes_of(change or [], seed))
+    if sequences is not None and scale is not None:
+        raise MitsonarError("--sequences and --scale contradict each other: give one")
+    if scale is not None:
+        if not 0 < scale <= 1:
+            raise MitsonarError(f"--scale must lie in 0..1: got {scale:g}")
+        sequences = max(1, round(scale * described.sequences))
+    if workers is not None and workers < 1:
+        raise MitsonarError(f"--workers must be at least 1: got {workers}")
+    if workers is not None and scheduler is not None:
+        raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
+    crew = len(os.sched_getaffinity(0)) if workers is None else workers
+    bar = _Bar()
+    words = {"sequences": sequences, "workers": crew, "scheduler": scheduler, "verify": verify}
+    try:
+        with bar:
+            made = make_dataset(described, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
+    except KeyboardInterrupt:
+        say_stopped()
+        sys.stdout.flush()
+        os._exit(130)  # threads of Zarr and dask would complain one by one
+    for sentence in made.warnings:
+        warn(sentence)
+    there = made.shards - made.made
+    say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
+    say(f"look at it: mitsonar dataset show {made.url}")
+
+
+@answered
+def info(
+    data: Data,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    recipe: Annotated[bool, typer.Option("--recipe", help="The recipe as YAML.")] = False,
+) -> None:
+    """Print what a data set holds: frames, arrays, levels against noise, versions."""
+    import yaml
+
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.plotting.data_sheet import info as information
+
+    store = DataStore.open(data, unfinished=True)
+    if recipe:
+        say(yaml.safe_dump(store.about["recipe"], sort_keys=False, allow_unicode=True).rstrip())
+        return
+    table = information(store)
+    if as_json:
+        say(json.dumps(table, indent=2))
+        return
+    for key, value in table.items():
+        if key == "levels":
+            for view, level in value.items():
+                over = ", ".join(f"{name} {ratio:.2f}" for name, ratio in level["signal_over_noise"].items())
+                say(
+                    f"{'level of ' + view:18} {100 * level['filled']:.1f} % of pixels hold an echo, "
+                    f"mean {level['signal_mean']:.4f}"
+                )
+                say(f"{'  mean / noise':18} {over}")
+        elif key == "bytes":
+            say(f"{key:18} {value:,} ({value / max(table['frames'], 1):,.0f} a frame)")
+        elif isinstance(value, dict):
+            say(f"{key:18} " + "; ".join(f"{name}: {text}" for name, text in value.items()))
+        elif isinstance(value, list):
+            say(f"{key:18} {', '.join(map(str, value))}")
+        else:
+            say(f"{key:18} {value:,}" if isinstance(value, int) and not isinstance(value, bool) else f"{key:18} {value}")
+
+
+@answered
+def show(
+    data: Data,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Picture to write (default: NAME.png in this folder).")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, max=16, help="Samples to draw.")] = 4,
+    view: Annotated[str | None, typer.Option(help="Which view (default: the first).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Which samples.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there.")] = False,
+) -> None:
+    """Draw a sheet of sample pairs with labels, the distribution of the labels, and the mean image."""
+    import io
+
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.io.whole_files import write_whole
+    from mitsonar.plotting.data_sheet import sheet_figure
+
+    store = DataStore.open(data)
+    path = out or Path(Path(store.place.url).stem + ".png")
+    if path.suffix.lower() != ".png" or not path.parent.is_dir():
+        raise MitsonarError(f"-o must name a .png file in a folder that is there: got {path}")
+    if path.exists() and not overwrite:
+        raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
+    buffer = io.BytesIO()
+    sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
+    write_whole(path, buffer.getvalue())
+    say(f"picture: {path}")
+
+
+@answered
+def check(data: Data) -> None:
+    """Verify checksums, counts, ranges, and that labels follow from poses. Reads everything, changes nothing."""
+    from mitsonar.datasets.data_check import check as find_faults
+    from mitsonar.datasets.store import DataStore
+
+    store = DataStore.open(data, unfinished=True)
+    with progress_bar("checking", len(store), "frames") as progress:
+        faults = find_faults(store, progress)
+    for fault in faults:
+        say(fault)
+    if faults:
+        raise MitsonarError(
+            f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it goes on where it stopped, and with "
+            "--verify makes again what is damaged"
+        )
+    say(f"{len(store):,} frames in {store.shards} shards: all is well")
+
+
+@answered
+def recipes(
+    name: Annotated[str | None, typer.Argument(help="One recipe: print its YAML, to start your own from.")] = None,
+) -> None:
+    """Print the recipes that are shipped, or one of them."""
+    from mitsonar.config.data_recipe import load_recipe, shipped_recipes
+
+    if name is not None:
+        load_recipe(name)
+        say((shipped_recipes().get(name) or Path(name)).read_text(encoding="utf-8").rstrip())
+        return
+    import yaml
+
+    for key, path in shipped_recipes().items():
+        say(f"{key:24} {yaml.safe_load(path.read_text(encoding='utf-8'))['about']}")
+
+
+class _Bar:
+    """A progress bar that begins when the length is known."""
+
+    def __init__(self) -> None:
+        self.inner: Any = None
+        self.call: Any = lambda frames: None
+
+    def begin(self, frames: int, done: int) -> None:
+        self.inner = progress_bar("rendering", frames, "frames")
+        self.call = self.inner.__enter__()
+        if done:
+            self.call(done)
+
+    def advance(self, frames: int) -> None:
+        self.call(frames)
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self.inner is not None:
+            self.inner.__exit__(*error)
+
+
+def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
+    """KEY=VALUE pairs, values as YAML."""
+    import yaml
+
+    changes: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        if not (key and equals):
+            raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
+        try:
+            changes[key] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise MitsonarError(f"--set {key}: {text!r} is not a YAML value") from None
+    return changes if seed is None else {**changes, "seed": seed}

@@ -1,0 +1,38 @@
+"""``mitsonar export``: a trained network as ONNX, for programs without torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsonar.cli.console import answered, say
+from mitsonar.cli.evaluate_command import Run, checkpoint_from
+from mitsonar.errors import MitsonarError
+
+__all__ = ["export"]
+
+
+@answered
+def export(
+    run: Run,
+    onnx: Annotated[Path, typer.Option("--onnx", help="File to write, .onnx.")],
+    batch: Annotated[str, typer.Option(help="Samples at a time: a number, or `dynamic`.")] = "1",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+) -> None:
+    """Write a network with its weights as ONNX; what its numbers mean stands in the file's metadata."""
+    from mitsonar.io.whole_files import write_whole
+
+    if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
+        raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}")
+    if onnx.suffix.lower() != ".onnx" or not onnx.parent.is_dir():
+        raise MitsonarError(f"--onnx must name an .onnx file in a folder that is there: got {onnx}")
+    if onnx.exists() and not overwrite:
+        raise MitsonarError(f"{onnx} exists and is kept: choose another --onnx, or give --overwrite")
+    checkpoint = checkpoint_from(run)
+    from mitsonar.networks.onnx_export import onnx_of
+
+    content = onnx_of(checkpoint, None if batch == "dynamic" else int(batch))
+    write_whole(onnx, content)
+    say(f"{checkpoint.network} of mitsonar {checkpoint.version}, {len(content):,} bytes: {onnx}")

@@ -1,0 +1,122 @@
+"""``mitsonar height``: how high the sonar is over the ground in each frame, from the frames alone."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.odometry_command import Frames, frames_from, views_from
+from mitsonar.errors import MitsonarError
+from mitsonar.io.whole_files import write_whole
+
+if TYPE_CHECKING:
+    from mitsonar.estimation.height.direct_height import HeightEstimate
+    from mitsonar.mapping.frame_source import FrameSource
+    from mitsonar.mapping.view_source import ViewSource
+
+__all__ = ["height"]
+
+AT_ONCE = 8
+"""Frames that are read at a time."""
+
+
+@answered
+def height(
+    frames: Frames,
+    by: Annotated[str, typer.Option(help="direct, or a checkpoint that was trained on heights.")] = "direct",
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="CSV file to write, a line a frame.")] = None,
+    pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
+    sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
+    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first; of portions: whole, or all).")] = None,
+    noise: Annotated[str, typer.Option(help="Added: none, low, high, m,s,g or a YAML file.")] = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+) -> None:
+    """Tell the height over the ground from first return and fall-off, or by a network; beside it the true one, where known.
+
+    `mitsonar odometry --height-by` gives estimators the heights found like this.
+    """
+    from mitsonar.estimation.height.named_height_estimators import height_estimator_from
+    from mitsonar.mapping.measured_heights import measured
+
+    if out is not None and out.exists() and not overwrite:
+        raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or --overwrite")
+    estimator = height_estimator_from(by)
+    source: FrameSource | ViewSource
+    portions = _portions(frames, view) if estimator.views is None else (estimator.views, estimator.kind)
+    if estimator.views is not None and view is not None:
+        raise MitsonarError(f"--view is not for {by}, which reads {', '.join(estimator.views)}: leave it out")
+    if portions is not None:
+        if pitch_deg is not None:
+            raise MitsonarError("--pitch-deg is for frames without poses: a data set tells them")
+        source = views_from(frames, *portions, sequence, noise, seed)
+    else:
+        source = frames_from(frames, sequence, view, noise, seed, None, pitch_deg)
+    if source.note:
+        say(source.note)
+    said: list[HeightEstimate] = []
+    with progress_bar("measuring", len(source), "frames") as progress:
+        for first in range(0, len(source), AT_ONCE):
+            here = np.arange(first, min(first + AT_ONCE, len(source)))
+            said += measured(source.read(here), estimator)[1]
+            progress(len(here))
+    true = None if source.sonar_poses is None else source.sonar_poses[:, 2]
+    if out is not None:
+        write_whole(out, _csv(source.time_s, said, true).encode())
+    for line in _lines(said, true):
+        say(line)
+    lost = sum(not one.valid for one in said)
+    given = estimator.inputs if pitch_deg is None else f"pitch {pitch_deg:g} deg as told, which the frames cannot check"
+    say(f"{len(said):,} frames by {by} ({given}), {lost:,} not believed" + (f", in {out}" if out is not None else ""))
+    if lost == len(said):
+        warn("no height was found: check the pitch, and that the window shows ground; frames need echoes that fall off")
+
+
+def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | None:
+    """Views and their kind, of a data set that holds vectors alone, or portions of a view; None elsewhere."""
+    from mitsonar.config.data_recipe import array_names
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.mapping.frame_source import is_data_set
+
+    if not is_data_set(where):
+        return None
+    recipe = DataStore.open(where).recipe
+    kind = "image" if "image" in recipe.kinds else "vector"
+    if kind == "image" and not recipe.segments:
+        return None
+    names = tuple(name for stored, name in array_names(recipe).values() if stored == kind)
+    return (view,) if view is not None else ("whole",) if "whole" in names else names, kind
+
+
+def _csv(time_s: np.ndarray, said: list[HeightEstimate], true: np.ndarray | None) -> str:
+    """A line a frame; empty where nothing is known."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["frame", "time_s", "height_m", "std_m", "believed", "reason", "true_z_m"])
+    for k, one in enumerate(said):
+        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (one.height_m, one.std_m)]
+        z = "" if true is None else f"{true[k]:.6g}"
+        table.writerow([k, f"{time_s[k]:.9g}", *numbers, int(one.valid), one.reason, z])
+    return text.getvalue()
+
+
+def _lines(said: list[HeightEstimate], true: np.ndarray | None) -> list[str]:
+    """What is told of all frames."""
+    believed = np.array([one.valid for one in said], dtype=bool)
+    heights = np.array([one.height_m for one in said])[believed]
+    lines = []
+    for reason in dict.fromkeys(one.reason for one in said if not one.valid):
+        lines.append(f"not believed, {sum(one.reason == reason for one in said):,} frames: {reason}")
+    if len(heights):
+        lines.append(f"height {heights.min():.3f} .. {heights.max():.3f} m, median {np.median(heights):.3f} m")
+    if true is not None and len(heights):
+        error = heights - true[believed]
+        rmse, middle = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
+        lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {middle:.2f} cm, bias {100 * error.mean():+.2f} cm")
+    return lines

@@ -1,0 +1,46 @@
+"""``mitsonar image``: stored echoes are binned again, without tracing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.errors import MitsonarError
+
+__all__ = ["image"]
+
+
+@answered
+def image(
+    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
+    bins: Annotated[int | None, typer.Option(help="Range bins (default: as rendered).")] = None,
+    window: Annotated[str | None, typer.Option("--range", help="Window from,to in m (default: as rendered).")] = None,
+    noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
+    cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+) -> None:
+    """Bin the echoes of a run again: other bins, another window, other noise."""
+    from mitsonar.acoustics.noise import load_noise
+    from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
+
+    outputs = Outputs(load_noise(noise), cartesian=cartesian)
+    ends = numbers(window, 2, "--range")
+    source = StoredEchoes(run_folder, bins=bins, window=(ends[0], ends[1]) if ends else None)
+    folder = out or run_folder / "rebinned"
+    if run_folder.resolve().is_relative_to(folder.resolve()):
+        raise MitsonarError(f"-o {folder} would replace the echoes that are read: choose another folder")
+    origin = {"echoes_of": str(run_folder), "echoes_recipe": source.about.get("recipe", {})}
+    with progress_bar("binning", len(source.trajectory), "pings") as progress:
+        report = run(
+            source, source.trajectory, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress
+        )
+    for sentence in report.warnings:
+        warn(sentence)
+    say(f"{report.frames} frames of {source.sonar.range_bins} bins in {folder}")
+    if report.pictures:
+        say(f"pictures: {report.pictures[0]}")

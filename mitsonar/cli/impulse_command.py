@@ -1,0 +1,159 @@
+"""``mitsonar impulse``: a scene becomes complex channel impulse responses on disk."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.cli.render_command import SIX, scene_parameters
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mitsonar.instruments.channel_sonar import ChannelSonar
+    from mitsonar.motion.pose import Pose, Trajectory
+
+__all__ = ["impulse"]
+
+
+@answered
+def impulse(
+    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE-impulse).")] = None,
+    velocity: Annotated[
+        str | None,
+        typer.Option(help="vx,vy of the vehicle, starboard and forward in m/s; vx,vy,turn with deg/s to starboard."),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of pings (default: 1); with --trajectory: at even times over all of it.")
+    ] = None,
+    start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
+    trajectory: Annotated[
+        str | None, typer.Option(help="Poses to fly: a TUM file, or a course (square, stairs, zigzag, circle ...).")
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="scatterers (of the world) or rays (of the vehicle, the thesis's).")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of where scatterers lie.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: carrier_hz=160e3.")] = None,
+    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+) -> None:
+    """Measure channels: responses.npz, responses.zarr, response.png and waterfall.png in the folder OUT."""
+    from mitsonar.simulation.channel import ChannelSimulator
+    from mitsonar.simulation.impulse_run import iteration_error, run_impulse
+    from mitsonar.simulation.render_run import scene_digest
+    from mitsonar.simulation.scene import channel_sonar_in, find_scene, load_scene
+
+    if overwrite and resume:
+        raise MitsonarError("--overwrite and --resume contradict each other: give one")
+    parameters = scene_parameters(parameter or [])
+    loaded = load_scene(scene, **parameters)
+    sonar, attitude = _instrument(channel_sonar_in(loaded), model, seed, set_ or [])
+    flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory)
+    folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
+    simulator = ChannelSimulator(loaded, sonar)
+    with progress_bar("measuring", len(flown), "pings") as progress:
+        report = run_impulse(
+            simulator, flown, speeds, folder, origin=origin, overwrite=overwrite, resume=resume, progress=progress
+        )
+    for sentence in report.warnings:
+        warn(sentence)
+    names = ", ".join(receiver.name for receiver in sonar.receivers)
+    say(f"{report.pings} pings ({sonar.model} model, {sonar.name}: {names}) of {sonar.taps} taps in {folder}")
+    spread = report.spread
+    say(
+        f"spread factor {spread.factor:.3g}: delays over {1e3 * spread.delay_s:.3g} ms, Doppler shifts over "
+        f"{spread.doppler_hz:.3g} Hz"
+    )
+    still, twice = iteration_error(flown, speeds, sonar)
+    say(
+        f"motion while sound travels turns the carrier by up to {still:.3g} turns at {sonar.range_max:g} m, which is "
+        f"counted exactly (the thesis's two rounds would leave {twice:.2g})"
+    )
+    say(f"figures: {folder / 'response.png'}, {folder / 'waterfall.png'}")
+
+
+def _instrument(
+    found: tuple[ChannelSonar, Pose] | None, model: str | None, seed: int | None, changes: list[str]
+) -> tuple[ChannelSonar, Pose | None]:
+    """The instrument to use and the pose that the scene gives it; without one in the scene, the thesis's."""
+    from mitsonar.instruments.channel_sonar import ChannelSonar
+
+    sonar, attitude = found if found is not None else (ChannelSonar(name="thesis"), None)
+    fields: dict[str, Any] = {}
+    for pair in changes:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
+        if key == "transmitter":
+            raise MitsonarError(f"fields of view are set in the scene, or in Python, not by --set: got {pair!r}")
+        fields[key] = _listening(sonar, value) if key == "receivers" else value
+    fields |= {} if model is None else {"model": model}
+    fields |= {} if seed is None else {"seed": seed}
+    return sonar.replace(**fields), attitude
+
+
+def _listening(sonar: ChannelSonar, names: str) -> list[dict[str, Any]]:
+    """Some of an instrument's receivers."""
+    known = {one.name: one for one in sonar.receivers}
+    wanted = [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in known:
+            raise MitsonarError(
+                f"--set receivers=NAME,NAME chooses of the receivers {', '.join(known)}: got {name!r}; others are described "
+                "in the scene's channel_sonar"
+            )
+    return [known[name].model_dump() for name in wanted]
+
+
+def _path(
+    sonar: ChannelSonar,
+    attitude: Pose | None,
+    velocity: str | None,
+    frames: int | None,
+    start: str | None,
+    path: str | None,
+) -> tuple[Trajectory, NDArray[np.float64]]:
+    """Poses and velocities that the options say."""
+    import numpy as np
+
+    from mitsonar.motion.courses import COURSES, course
+    from mitsonar.motion.pose import Pose, Trajectory, steady, velocities
+
+    if frames is not None and frames < 1:
+        raise MitsonarError(f"--frames must be at least 1: got {frames}")
+    first = numbers(start, 6, "--from")
+    begin = Pose.from_degrees(first) if first else attitude
+    if path is not None:
+        if velocity or (start and path not in COURSES):
+            raise MitsonarError(
+                "--trajectory and --velocity contradict each other, and --from is only the middle of a course: give one"
+            )
+        named = path in COURSES or not Path(path).suffix
+        flown = course(path, begin or Pose(0.0, 0.0, 10.0)) if named else Trajectory.load_tum(path)
+        speeds = velocities(flown)
+        if frames is not None:  # fewer pings do not make the vehicle cut corners
+            few = flown.resample(frames)
+            speeds = np.stack([np.interp(few.time_s, flown.time_s, column) for column in speeds.T], axis=1)
+            flown = few
+        return flown, speeds
+    if begin is None:
+        raise MitsonarError(
+            f"the scene has no channel_sonar that gives a pose: add one, or give a pose with --from ({SIX}), or --trajectory"
+        )
+    if velocity is not None and velocity.count(",") not in (1, 2):
+        raise MitsonarError(f"--velocity takes vx,vy or vx,vy,turn (m/s, m/s, deg/s): got {velocity!r}")
+    count = 2 if velocity is None else velocity.count(",") + 1
+    speed = [*(numbers(velocity, count, "--velocity (m/s, m/s, deg/s)") or [0.0, 0.0]), 0.0][:3]
+    if velocity is None and (frames or 1) > 1:
+        warn("the vehicle stands still, so that all pings are alike: give --velocity vx,vy in m/s, or --trajectory")
+    return steady(begin, (speed[0], speed[1], math.radians(speed[2])), frames or 1, sonar.frame_rate_hz)

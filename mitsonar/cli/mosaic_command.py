@@ -1,0 +1,158 @@
+"""``mitsonar mosaic``: frames and a path become a map of the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.odometry_command import Frames, frames_from
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from mitsonar.mapping.frame_source import FrameSource
+    from mitsonar.mapping.mosaic import Mosaic
+    from mitsonar.motion.pose import Trajectory
+    from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["mosaic"]
+
+
+@answered
+def mosaic(
+    frames: Frames,
+    trajectory: Annotated[
+        str, typer.Argument(help="TUM file, the folder of an odometry, or `true`: where the frames say they were.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="OUT.png, a figure, and OUT.quality.png; or OUT.tif, a GeoTIFF.")],
+    cell_mm: Annotated[float, typer.Option(help="Edge of a cell of the map.")] = 10.0,
+    blend: Annotated[str, typer.Option(help="weighted: all beams; centre: the plain mean of the middle ones.")] = "weighted",
+    centre_beams: Annotated[int, typer.Option(help="How many, for centre.")] = 24,
+    flatten: Annotated[
+        bool, typer.Option("--flatten/--no-flatten", help="Take out how the sonar lights the ground.")
+    ] = True,
+    true: Annotated[Path | None, typer.Option(help="TUM file of the true path, to be drawn too.")] = None,
+    height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
+    pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
+    sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
+    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first).")] = None,
+    noise: Annotated[str, typer.Option(help="Added to the frames: none, low, high, m,s,g or a YAML file.")] = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+) -> None:
+    """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
+    from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
+
+    quality = _checked_out(out, true, overwrite)
+    Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
+    paths, told_height = _paths(trajectory, true)
+    source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+    if source.note:
+        say(source.note)
+    if source.height_m is None and told_height is not None:
+        source = source.with_geometry(told_height)
+    if source.height_m is None:
+        raise MitsonarError(f"{source.name} does not tell how high the sonar is over the ground: give --height")
+    if trajectory == "true":
+        if source.true is None:
+            raise MitsonarError(f"{source.name} does not tell where the sonar was: give a TUM file or an odometry's folder")
+        paths = {"true": source.true}
+    laid_along = next(iter(paths))
+    index, poses = source.along(paths[laid_along])
+    heights = source.height_m[index]
+    light = None
+    if flatten:
+        some = _spread(len(index))
+        light = illumination(source.read(index[some]), poses[some], heights[some])
+    with progress_bar("laying", len(index), "frames") as progress:
+        found = build_mosaic(
+            _counted(source.chunks(index), progress),
+            poses,
+            heights,
+            cell_m=cell_mm / 1e3,
+            blend=blend,  # type: ignore[arg-type]
+            centre_beams=centre_beams,
+            illumination=light,
+        )
+    if len(index) < len(source):
+        warn(f"{len(source) - len(index):,} of {len(source):,} frames have no pose at their time and were left out")
+    if found.frames_without_ground:
+        warn(f"{found.frames_without_ground:,} of {found.frames:,} frames show no ground and were left out")
+    if quality is None:
+        save_geotiff(out, found)
+    else:
+        _save_figures(out, quality, found, paths, source, laid_along)
+    rows, columns = found.mean.shape
+    spread = float(np.nanmedian(found.std)) if np.isfinite(found.std).any() else float("nan")
+    say(
+        f"{found.frames:,} frames along the {laid_along} path: {rows:,} x {columns:,} cells of {cell_mm:g} mm, "
+        f"{rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; median standard deviation {spread:.4f}"
+    )
+    say(f"mosaic: {out}" + (f", quality: {quality}" if quality else " (bands: mean, standard deviation, count)"))
+
+
+def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
+    """Where the quality goes, if it has a file of its own; nothing that is there is in the way."""
+    kind = out.suffix.lower()
+    if kind not in (".png", ".tif", ".tiff"):
+        raise MitsonarError(f"-o must name a .png, .tif or .tiff file: got {out}")
+    if not out.parent.is_dir():
+        raise MitsonarError(f"there is no folder {out.parent}: make it, or choose another -o")
+    if kind != ".png" and true is not None:
+        raise MitsonarError("--true is drawn into a figure: give a .png as -o, or leave it out")
+    quality = out.with_suffix(".quality.png") if kind == ".png" else None
+    for path in (out, quality):
+        if path is not None and path.exists() and not (overwrite and path.is_file()):
+            raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
+    return quality
+
+
+def _paths(trajectory: str, true: Path | None) -> tuple[dict[str, Trajectory], float | None]:
+    """Paths by name, the one to lay frames along first, and the height that an odometry was told."""
+    from mitsonar.mapping.odometry_run import OdometryFolder
+    from mitsonar.motion.pose import Trajectory
+
+    height = None
+    paths: dict[str, Trajectory] = {}
+    if Path(trajectory).is_dir():
+        folder = OdometryFolder.open(trajectory)
+        height = folder.state["recipe"]["height_m"]
+        paths["estimated"] = folder.estimated
+        if folder.true is not None:
+            paths["true"] = folder.true
+    elif trajectory != "true":
+        paths["estimated"] = Trajectory.load_tum(trajectory)
+    if true is not None:
+        if trajectory == "true":
+            raise MitsonarError("--true and TRAJECTORY true are one path: leave --true out")
+        paths["true"] = Trajectory.load_tum(true)
+    return paths, height
+
+
+def _spread(count: int) -> NDArray[np.intp]:
+    """Which frames tell the illumination."""
+    from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES
+
+    return np.unique(np.linspace(0, count - 1, min(ILLUMINATION_FRAMES, count)).astype(np.intp))
+
+
+def _counted(chunks: Iterator[SonarFrames], progress: Callable[[int], None]) -> Iterator[SonarFrames]:
+    for chunk in chunks:
+        yield chunk
+        progress(len(chunk))
+
+
+def _save_figures(
+    out: Path, quality: Path, found: Mosaic, paths: dict[str, Trajectory], source: FrameSource, along: str
+) -> None:
+    from mitsonar.plotting.map_figure import mosaic_figure, quality_figure, save_figure
+
+    name = Path(source.name).name
+    save_figure(out, mosaic_figure(found, paths, title=f"{name}, along the {along} path"))
+    save_figure(quality, quality_figure(found, title=name))

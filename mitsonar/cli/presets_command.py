@@ -1,0 +1,44 @@
+"""``mitsonar presets`` and ``mitsonar scenes``: what can be named."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from mitsonar.cli.console import answered, say
+
+__all__ = ["presets", "scenes"]
+
+
+@answered
+def presets(
+    name: Annotated[str | None, typer.Argument(help="One preset: every number with its source.")] = None,
+) -> None:
+    """Print the sonars that can be named, or one of them with the document behind each number."""
+    from mitsonar.instruments.named_sonars import PRESETS, preset, preset_sources
+
+    if name is not None:
+        sonar, sources = preset(name), preset_sources(name)
+        say(f"{name}: {PRESETS[name][0]}")
+        for key, value in sonar.model_dump(exclude={"name"}).items():
+            shown = f"{value:g}" if isinstance(value, float) else str(value)
+            say(f"  {key:18} {shown:10} {sources.get(key, 'default')}")
+        return
+    say(f"{'preset':22} {'az x el (deg)':14} {'beams':>5} {'width':>6}  {'window (m)':12} {'bins':>5}  instrument")
+    for key, (title, _) in PRESETS.items():
+        sonar = preset(key)
+        width = "-" if sonar.beam_width_deg is None else f"{sonar.beam_width_deg:g}"
+        field = f"{sonar.azimuth_fov_deg:g} x {sonar.elevation_fov_deg:g}"
+        window = f"{sonar.range_min:g}..{sonar.range_max:g}"
+        say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
+    say("`mitsonar presets NAME` prints where each number comes from; docs/sonar.md tells how to write your own.")
+
+
+@answered
+def scenes() -> None:
+    """Print the scenes that are shipped; each has a trajectory (`--trajectory shipped`)."""
+    from mitsonar.simulation.scene import shipped_scenes
+
+    for name, path in shipped_scenes().items():
+        say(f"{name:16} {path}")

@@ -1,0 +1,121 @@
+"""``mitsonar render``: a scene becomes sonar frames on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.motion.pose import Pose, Trajectory
+
+__all__ = ["SIX", "render", "scene_parameters"]
+
+SIX = "x,y,z,pitch,roll,heading in m and deg"
+
+
+@answered
+def render(
+    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE).")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of frames.")] = None,
+    start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
+    end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM file, or `shipped`.")] = None,
+    sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
+    model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
+    noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
+    labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
+    cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
+    exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
+    rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
+    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+) -> None:
+    """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
+    from mitsonar.acoustics.noise import load_noise
+    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.render_run import Outputs, run, scene_digest
+    from mitsonar.simulation.scene import find_scene, load_scene
+
+    if overwrite and resume:
+        raise MitsonarError("--overwrite and --resume contradict each other: give one")
+    outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr)
+    parameters = scene_parameters(parameter or [])
+    loaded = load_scene(scene, **parameters)
+    instrument, attitude = _instrument(loaded, sonar, model, seed)
+    path = _path(instrument, attitude, scene, frames, start, end, trajectory)
+    folder = out or Path("out") / find_scene(scene).stem
+    simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
+    origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
+    with progress_bar("rendering", len(path), "pings") as progress:
+        report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
+    for sentence in report.warnings:
+        warn(sentence)
+    say(f"{report.frames} frames ({instrument.model} model, {instrument.name}) in {folder}")
+    if report.pictures:
+        say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
+
+
+def scene_parameters(pairs: list[str]) -> dict[str, str]:
+    """What -D says."""
+    wrong = [pair for pair in pairs if "=" not in pair]
+    if wrong:
+        raise MitsonarError(f"-D takes NAME=VALUE: got {wrong[0]!r}")
+    return dict(pair.split("=", 1) for pair in pairs)
+
+
+def _instrument(scene: Any, name: str | None, model: str | None, seed: int | None) -> tuple[Sonar, Pose | None]:
+    """The sonar to use and the pose that the scene gives it."""
+    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.simulation.scene import sonar_in
+
+    found = sonar_in(scene)
+    if name is None and found is None:
+        raise MitsonarError(
+            "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300) and a pose (--from)"
+        )
+    sonar = load_sonar(name) if name is not None else found[0]  # type: ignore[index]
+    change: dict[str, Any] = {} if model is None else {"model": model}
+    change |= {} if seed is None else {"seed": seed}
+    return sonar.replace(**change), found[1] if found else None
+
+
+def _path(
+    sonar: Sonar,
+    attitude: Pose | None,
+    scene: str,
+    frames: int | None,
+    start: str | None,
+    end: str | None,
+    file: Path | None,
+) -> Trajectory:
+    """The poses that the options say."""
+    from mitsonar.motion.pose import Pose, Trajectory
+    from mitsonar.simulation.scene import shipped_trajectory
+
+    if frames is not None and frames < 1:
+        raise MitsonarError(f"--frames must be at least 1: got {frames}")
+    if file is not None:
+        if start or end:
+            raise MitsonarError("--trajectory and --from/--to contradict each other: give one")
+        flown = Trajectory.load_tum(shipped_trajectory(scene) if str(file) == "shipped" else file)
+        return flown if frames is None else flown.resample(frames)
+    first = numbers(start, 6, "--from")
+    last = numbers(end, 6, "--to")
+    begin = Pose.from_degrees(first) if first else attitude
+    if begin is None:
+        raise MitsonarError(f"the scene gives no pose: give one with --from ({SIX}), or --trajectory FILE.tum")
+    if last is None:
+        return Trajectory.between(begin, begin, frames or 1, sonar.frame_rate_hz)
+    if frames is None or frames < 2:
+        raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
+    return Trajectory.between(begin, Pose.from_degrees(last), frames, sonar.frame_rate_hz)

@@ -1,0 +1,112 @@
+"""``mitsonar reproduce``: tables of the thesis again."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say, say_stopped
+from mitsonar.cli.dataset_command import changes_of
+from mitsonar.cli.train_command import TrainingBar, asked_to_stop
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.training.training_run import Report
+
+__all__ = ["reproduce"]
+
+
+@answered
+def reproduce(
+    table: Annotated[str | None, typer.Argument(help="Number of a table, such as 3.2; without one they are listed.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder of data, trainings and tables; goes on.")] = None,
+    rows: Annotated[str | None, typer.Option(help="Only these, names with commas between them (default: all).")] = None,
+    scale: Annotated[float, typer.Option(help="Part of the thesis's data that is made, above 0 to 1.")] = 0.02,
+    minutes: Annotated[float, typer.Option(help="Of training at most, each row; 0: all epochs of the recipe.")] = 30.0,
+    batch: Annotated[
+        int | None, typer.Option(help="Pairs of a step (default: the recipe's); the rate grows with the square root.")
+    ] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="KEY=VALUE of all recipes whose row has no value of its own: precision=bf16-mixed."),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that render (default: this machine's cores).")] = None,
+    accelerator: Annotated[str, typer.Option(help="Lightning's: auto, cpu, gpu ...")] = "auto",
+    devices: Annotated[str, typer.Option(help="Lightning's: auto, how many, or which (0,1).")] = "auto",
+) -> None:
+    """Make the data of a table, train and evaluate its rows, and print it beside the thesis's numbers.
+
+    Killed at any moment, the same command goes on. Several tables may share a folder: what they share is trained once.
+    """
+    if table is None:
+        _list()
+        return
+    if out is None:
+        raise MitsonarError(f"table {table} needs a folder: give -o")
+    if workers is not None and workers < 1:
+        raise MitsonarError(f"--workers must be at least 1: got {workers}")
+    from mitsonar.training.document_tables import rows_named, table_named
+
+    wanted = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
+    rows_named(table_named(table), wanted)
+    try:
+        from mitsonar.training.reproduce import Effort
+        from mitsonar.training.reproduce import reproduce as reproduced
+    except ModuleNotFoundError as error:
+        raise MitsonarError(f"training needs torch and Lightning ({error}): pip install 'mitsonar[learn]'") from None
+    effort = Effort(scale, minutes or None, batch, changes_of(change or [], None))
+    crew = len(os.sched_getaffinity(0)) if workers is None else workers
+    words: dict[str, Any] = {"rows": wanted, "workers": crew, "accelerator": accelerator, "devices": devices}
+    try:
+        with ExitStack() as stack:
+            reproduced(table, out, effort, watch=stack.enter_context(_Console()), **words)
+    except KeyboardInterrupt:
+        say_stopped()
+        sys.stdout.flush()
+        os._exit(130)  # threads of Zarr and dask would complain one by one
+    say((out / "table.md").read_text(encoding="utf-8").rstrip())
+    say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}; figure: {out / f'table-{table}.png'}")
+
+
+def _list() -> None:
+    """All tables with their rows."""
+    from mitsonar.training.document_tables import NOISES, load_tables
+
+    say(f"RMSE in the thesis, sideways mm / forward mm / yaw deg: {', '.join(NOISES.values())}")
+    for table in load_tables().values():
+        say(f"\n{table.name}  {table.title}")
+        for row in table.rows:
+            errors = [row.said(row.printed.get(noise)) for noise in table.noises] if row.printed else []
+            say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")
+
+
+class _Console:
+    """Bars on standard error, one at a time."""
+
+    def __init__(self) -> None:
+        self.bar = ExitStack()
+
+    def __enter__(self) -> _Console:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.bar.close()
+
+    def begin(self, what: str, total: int, unit: str) -> Callable[[int], None]:
+        """The next bar."""
+        self.bar.close()
+        return self.bar.enter_context(progress_bar(what, total, unit))
+
+    @contextmanager
+    def training(self, what: str) -> Iterator[tuple[Callable[[Report], None], Callable[[], bool]]]:
+        """The bar of a training, which Ctrl-C ends after its step."""
+        self.bar.close()
+        typer.echo(f"training {what}", err=True)
+        with asked_to_stop() as stop, TrainingBar() as bar:
+            yield bar, stop

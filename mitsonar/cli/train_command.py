@@ -1,0 +1,159 @@
+"""``mitsonar train``: train a network as a recipe says."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, say
+from mitsonar.cli.dataset_command import changes_of
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.training.training_run import Report
+
+__all__ = ["TrainingBar", "asked_to_stop", "train"]
+
+
+@answered
+def train(
+    recipe: Annotated[
+        str, typer.Argument(metavar="RECIPE.yaml", help="A training recipe: a YAML file, or the name of a shipped one.")
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run: network, log, learning curve, state.")],
+    data: Annotated[str | None, typer.Option(help="Path or URL of a data set; with --render only for validation.")] = None,
+    render: Annotated[bool, typer.Option("--render", help="Render training samples while the network learns.")] = False,
+    minutes: Annotated[float | None, typer.Option(help="Stop after so many, all resumed runs together.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew where a run is.")] = False,
+    scale: Annotated[float | None, typer.Option(help="Only this part of the data, 0..1.")] = None,
+    pairs: Annotated[int | None, typer.Option(help="Train on so many samples in all, whatever epochs say.")] = None,
+    change: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the recipe: optimiser.rate=1e-3.")] = None,
+    accelerator: Annotated[str, typer.Option(help="Lightning's: auto, cpu, gpu ...")] = "auto",
+    devices: Annotated[str, typer.Option(help="Lightning's: auto, how many, or which (0,1).")] = "auto",
+    strategy: Annotated[str, typer.Option(help="Lightning's: auto, ddp ...")] = "auto",
+    precision: Annotated[
+        str | None, typer.Option(help="Lightning's: 32-true, bf16-mixed ... (default: the recipe's).")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of the CPU (default: torch's choice).")] = None,
+    workers: Annotated[int | None, typer.Option(help="Processes that read or render (default: by the machine).")] = None,
+    state_minutes: Annotated[float, typer.Option(help="Minutes between states: what a kill may cost.")] = 5.0,
+) -> None:
+    """Train a network. Killed at any moment, the same command with --resume goes on, on a CPU to the same bits."""
+    try:
+        from mitsonar.config.training_recipe import load_training_recipe
+        from mitsonar.training.training_run import leads
+        from mitsonar.training.training_run import train as train_network
+    except ModuleNotFoundError as error:
+        raise MitsonarError(f"training needs torch and Lightning ({error}): pip install 'mitsonar[learn]'") from None
+    told = load_training_recipe(recipe, changes_of(change or [], None))
+    with asked_to_stop() as stop, TrainingBar() as bar:
+        made = train_network(
+            told,
+            data,
+            out,
+            render=render,
+            minutes=minutes,
+            resume=resume,
+            overwrite=overwrite,
+            scale=scale,
+            pairs=pairs,
+            accelerator=accelerator,
+            devices=devices,
+            strategy=strategy,
+            precision=precision,
+            threads=threads,
+            workers=workers,
+            state_minutes=state_minutes,
+            progress=bar,
+            stop=stop,
+        )
+    if not leads():
+        return
+    for name, text in made.rows():
+        say(f"{name:18} {text}")
+    say(f"network: {out / 'network.ckpt'}; learning curve: {out / 'curve.png'}, {out / 'log.csv'}")
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Any]:
+    """Ctrl-C ends training after its step, with its state kept; a second one at once."""
+    asked = threading.Event()
+
+    def first(number: int, frame: Any) -> None:
+        asked.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = signal.signal(signal.SIGINT, first)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class TrainingBar:
+    """One line that changes, where there is a terminal, and a line that stays for each validation; else only lines: one a
+    validation, and one every half minute."""
+
+    def __init__(self, every_s: float = 30.0) -> None:
+        self.every_s, self.said = every_s, time.monotonic()
+        self.inner: Any = None
+
+    def __enter__(self) -> TrainingBar:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self.inner is not None:
+            self.inner.stop()
+
+    def __call__(self, report: Report) -> None:
+        if sys.stderr.isatty():
+            self._draw(report)
+        elif report.validated or time.monotonic() - self.said >= self.every_s:
+            typer.echo(progress_line(report) + (validation_text(report) if report.validated else ""), err=True)
+            self.said = time.monotonic()
+
+    def _draw(self, report: Report) -> None:
+        if self.inner is None:
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            columns = (BarColumn(bar_width=12), TextColumn("{task.fields[text]}"))
+            self.inner = Progress(*columns, console=Console(stderr=True, highlight=False))
+            self.inner.start()
+            self.task = self.inner.add_task("", total=report.steps, text="")
+        self.inner.update(self.task, completed=report.step, text=progress_line(report))
+        if report.validated:
+            self.inner.console.print(f"{report.minutes:.1f} min, {report.pairs:,} samples{validation_text(report)}")
+
+
+def progress_line(report: Report) -> str:
+    """How far a training is: ``epoch 1.26 at 18/s, 0.5 min, loss 15.3, RMSE 10.9/11.9 mm 0.232 deg``."""
+    return (
+        f"epoch {report.epoch:.2f} at {report.per_second:.3g}/s, {report.minutes:.1f} min, loss {report.loss:.3g}, "
+        f"RMSE {_rmse(report.rmse, report)}"
+    )
+
+
+def validation_text(report: Report) -> str:
+    """What the last validation found: ``; noise none 2.84/1.00 mm 0.052 deg``."""
+    return "".join(f"; noise {level} {_rmse(values, report)}" for level, values in report.validation.items())
+
+
+def _rmse(values: list[float], report: Report) -> str:
+    """Numbers with the same unit share it."""
+    texts: dict[str, list[str]] = {}
+    for value, axis in zip(values, report.axes, strict=True):
+        texts.setdefault(axis.unit, []).append(f"{value:.3g}")
+    return " ".join(f"{'/'.join(numbers)} {unit}" for unit, numbers in texts.items())

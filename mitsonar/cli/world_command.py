@@ -1,0 +1,133 @@
+"""``mitsonar world``: a seed, or a user's own model, becomes a scene and its meshes."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
+
+import typer
+from typer.core import TyperGroup
+
+from mitsonar.cli.console import answered, say, warn
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+    from mitsonar.worlds.world import Family, World
+
+__all__ = ["worlds"]
+
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make: scene.xml, meshes/, textures/.")]
+
+
+def worlds() -> typer.Typer:
+    """The group of commands: one for each family, with an option for each of its numbers."""
+    return typer.Typer(help="Make a world: a Mitsuba scene and its meshes.", no_args_is_help=True, cls=_Families)
+
+
+class _Families(TyperGroup):
+    """Asks the families what they are only when one of these commands is meant: `mitsonar --help` does not wait for them."""
+
+    @functools.cached_property
+    def known(self) -> Any:
+        from mitsonar.worlds.families import FAMILIES
+
+        app = typer.Typer()
+        for name, family in FAMILIES.items():
+            app.command(name, help=inspect.cleandoc(family.__doc__ or ""))(_command(name, family))
+        app.command("mesh")(mesh)
+        return typer.main.get_command(app)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.known.list_commands(ctx))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return self.known.get_command(ctx, cmd_name)
+
+
+def _command(name: str, family: type[Family]) -> Callable[..., None]:
+    """A command whose options are the fields of a family."""
+
+    @answered
+    def command(seed: int, out: Path, **fields: Any) -> None:
+        from mitsonar.worlds.families import create_family
+
+        if seed < 0:
+            raise MitsonarError(f"--seed must be 0 or more: got {seed}")
+        given = {key: _pair(value, family.model_fields[key], key) for key, value in fields.items() if value is not None}
+        _write(create_family(name, **given).build(seed), out)
+
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    parameters = [
+        inspect.Parameter("seed", keyword, default=0, annotation=Annotated[int, typer.Option(help="Seed: same bytes.")]),
+        inspect.Parameter("out", keyword, annotation=Out),
+    ]
+    parameters += [_option(key, field) for key, field in family.model_fields.items()]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+def _option(key: str, field: FieldInfo) -> inspect.Parameter:
+    """The option of one field; intervals and triples are numbers with commas between them."""
+    default = "drawn" if field.default is None else _shown(field.default)
+    # brackets are markup in a help text
+    text = f"{field.description} [default: {default}]".replace("[", r"\[")
+    kind = next((kind for kind in (int, float) if field.annotation in (kind, kind | None)), str)
+    places = ",".join("N" * len(get_args(field.annotation))) if get_origin(field.annotation) is tuple else None
+    option = typer.Option(f"--{key.replace('_', '-')}", help=text, show_default=False, metavar=places)
+    return inspect.Parameter(
+        key,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=Annotated[kind | None, option],  # type: ignore[valid-type]
+    )
+
+
+def _shown(value: Any) -> str:
+    return ",".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
+
+
+def _pair(value: Any, field: FieldInfo, key: str) -> Any:
+    """The numbers of an option whose field is a tuple; other values as they are."""
+    if get_origin(field.annotation) is not tuple:
+        return value
+    from mitsonar.cli.console import numbers
+
+    kinds = get_args(field.annotation)
+    given = numbers(value, len(kinds), f"--{key.replace('_', '-')}")
+    assert given is not None
+    return tuple(
+        int(number) if kind is int and number == int(number) else number for kind, number in zip(kinds, given, strict=True)
+    )
+
+
+@answered
+def mesh(
+    file: Annotated[Path, typer.Argument(help="Model: glb, gltf, obj, stl, dae or ply.")],
+    out: Out,
+    scale: Annotated[float, typer.Option(help="Metres a unit of the file (0.001 for millimetres).")] = 1.0,
+    up: Annotated[str | None, typer.Option(help="Axis that points up: x, y or z (default: y for glTF, else z).")] = None,
+    reflectivity: Annotated[str, typer.Option(help="red, luminance, or a number 0..1.")] = "luminance",
+    floor: Annotated[bool, typer.Option(help="A seabed of random cells below the model.")] = True,
+    floor_m: Annotated[
+        float | None, typer.Option(help="Edge of that seabed in m (default: 3 x the model's diagonal).")
+    ] = None,
+) -> None:
+    """Turn a model of your own, textured or not, into a scene: on a seabed, with a sonar that looks at it."""
+    from mitsonar.worlds.user_mesh import mesh_world
+
+    world = mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m)
+    if not 0.05 <= world.size_m <= 500:
+        warn(f"the model is {world.size_m:.3g} m large: --scale is metres a unit of the file, 0.001 for millimetres")
+    _write(world, out)
+
+
+def _write(world: World, out: Path) -> None:
+    scene = world.write(out)
+    say(world.about)
+    say(f"{world.faces:,} triangles in {scene}; see it with: mitsonar render {scene} --cartesian")

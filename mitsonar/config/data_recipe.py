@@ -1,0 +1,437 @@
+"""What a data set is: a small YAML file, checked; the thesis's own are shipped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import sonar_from
+from mitsonar.instruments.views import Receiver, Segment, View, Whole
+from mitsonar.motion.pose import Pose
+from mitsonar.worlds.families import create_family
+from mitsonar.worlds.world import Family, Interval
+
+__all__ = [
+    "Flight",
+    "Mount",
+    "Recipe",
+    "Scenes",
+    "Split",
+    "array_names",
+    "load_recipe",
+    "recipe_fields",
+    "set_key",
+    "shipped_recipes",
+    "split_from",
+]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+_Made = TypeVar("_Made", bound=_Part)
+
+
+class Scenes(_Part):
+    """Some scenes of one kind, each drawn from a seed of its own."""
+
+    count: int = Field(1, ge=1, le=100_000, description="how many scenes")
+    sequences: int = Field(ge=1, le=10**7, description="sequences in each")
+    world: dict[str, Any] = Field(default_factory=dict, description="numbers of the world that are these scenes' own")
+
+
+class Mount(_Part):
+    """Pose of the sonar in the vehicle's axes (starboard, forward, up); the vehicle itself is level."""
+
+    starboard_m: float = Field(0.0, allow_inf_nan=False)
+    forward_m: float = Field(0.0, allow_inf_nan=False)
+    up_m: float = Field(0.0, allow_inf_nan=False)
+    pitch_deg: float = Field(0.0, ge=-90, le=90, description="> 0 looks down")
+    roll_deg: float = Field(0.0, ge=-180, le=180, description="> 0 puts starboard down")
+    heading_deg: float = Field(0.0, ge=-360, le=360, description="> 0 looks to starboard")
+
+    @property
+    def pose(self) -> Pose:
+        """In metres and radians."""
+        return Pose(
+            self.starboard_m,
+            self.forward_m,
+            self.up_m,
+            *(math.radians(angle) for angle in (self.pitch_deg, self.roll_deg, self.heading_deg)),
+        )
+
+
+RESERVED = ("frames", "label")
+"""What samples hold beside their views."""
+
+
+def _fits_name(name: str) -> str:
+    if not name.isidentifier():
+        raise ValueError(f"a name is letters, digits and _ : got {name!r}")
+    if name in RESERVED or name.startswith("nonzero"):
+        raise ValueError(f"{name} means something else in a data set: choose another name")
+    return name
+
+
+class ReceiverSpec(Mount):
+    """A receiver beside the transmitter: its pose in the transmitter's axes, and what differs from its sonar."""
+
+    name: Annotated[str, AfterValidator(_fits_name)]
+    sonar: dict[str, Any] = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
+
+
+def _from_0(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] < 0:
+        raise ValueError(f"a jump goes either way, give its size low,high with 0 <= low: got {pair[0]:g},{pair[1]:g}")
+    return pair
+
+
+_NotBelow0 = Annotated[Interval, AfterValidator(_from_0)]
+_Angle = Annotated[float, Field(gt=0, le=180)]
+
+
+class Flight(_Part):
+    """How the vehicle moves: sequences of pings at a constant rate, with jumps between, or named runs."""
+
+    kind: Literal["random", "runs"] = Field("random", description="random sequences, or the runs of chapters 2 and 4")
+    height_m: Interval | float = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
+    pings: int = Field(5, ge=1, le=10**6, description="pings of a sequence")
+    sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
+    forward_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion ahead or back between pings [mm]")
+    yaw_deg: float = Field(0.45, ge=0, le=180, description="largest turn between pings [deg]")
+    jump_m: _NotBelow0 | None = Field((3.0, 4.0), description="jump between sequences, in x and in y [m]; null: anywhere")
+    footprint_fov_deg: tuple[_Angle, _Angle] | None = Field(
+        None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
+    )
+    runs: list[Literal["legs", "diagonal", "turn", "sideways_50", "sideways_54"]] = Field(
+        default=["legs", "diagonal", "turn"], min_length=1, description="runs of each scene"
+    )
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Lowest and highest [m]."""
+        return (self.height_m, self.height_m) if isinstance(self.height_m, float | int) else self.height_m
+
+
+class Split(_Part):
+    """Which frames are for training, validation and test, unless a reader asks for others."""
+
+    by: Literal["sequence", "scene", "sample"] = Field(
+        "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks: to show it only"
+    )
+    train: float = Field(0.95, ge=0, le=1)
+    validation: float = Field(0.05, ge=0, le=1)
+    test: float = Field(0.0, ge=0, le=1)
+    seed: int = Field(0, ge=0, lt=2**31, description="of the draw; readers of one data set must agree on it")
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if abs(self.train + self.validation + self.test - 1) > 1e-9:
+            raise ValueError(
+                f"train, validation and test must add up to 1: got {self.train + self.validation + self.test:g}"
+            )
+        return self
+
+    @property
+    def unseen(self) -> str:
+        """The part that is neither learnt from nor, where there is another, chosen by."""
+        return "test" if self.test > 0 else "validation"
+
+
+class Recipe(_Part):
+    """A data set. Angles in degrees and motions in millimetres (the edge of the program), all else SI; docs/dataset.md.
+
+    Raises:
+        MitsonarError: through :func:`load_recipe`, for an unknown key or a value outside its limits.
+    """
+
+    name: str = Field("custom", description="what the data set is called")
+    about: str = Field("", description="a sentence on it")
+    seed: int = Field(0, ge=0, lt=2**31, description="of worlds, flights and jitter")
+    world: dict[str, Any] = Field(description="family of the world, and numbers of it")
+    scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
+    sonar: dict[str, Any] | None = Field(None, description="preset and keys of docs/sonar.md")
+    channel: dict[str, Any] | None = Field(None, description="in place of sonar: keys of docs/impulse.md, for responses")
+    mount: Mount = Field(
+        default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; of a channel none"
+    )
+    flight: Flight = Field(default_factory=Flight, description="how the vehicle moves")
+    frames: int = Field(2, ge=1, le=16, description="Q: frames that make one sample, unless a reader asks for others")
+    receivers: list[ReceiverSpec] = Field(default_factory=list, description="of a bistatic sonar; the sonar transmits")
+    segments: list[str] = Field(default_factory=list, description="portions of a looking-down sonar's field of view")
+    store: Literal["images", "vectors", "both"] = Field("images", description="images, vectors (sums over beams), or both")
+    pixel: Literal["uint8", "float32"] = Field("uint8", description="type of stored pixels")
+    gain: float | None = Field(
+        None, gt=0, allow_inf_nan=False, description="of the pixels, as of another data set; null: set on the first frames"
+    )
+    labels: list[Literal["elevation_rad", "shape_id", "object_id", "shadow"]] = Field(
+        default_factory=list, description="per-pixel truth to store"
+    )
+    split: Split = Field(default_factory=Split, description="which frames are for what")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _level(cls, fields: Any) -> Any:
+        """A channel sonar stands as its vehicle does."""
+        receives = isinstance(fields, dict) and fields.get("channel") is not None
+        return {"mount": Mount(), **fields} if receives else fields
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.sonar is None) == (self.channel is None):
+            got = "neither" if self.sonar is None else "both"
+            raise ValueError(f"a data set is of a sonar (images) or a channel (impulse responses), one of them: got {got}")
+        try:
+            self._check_images() if self.channel is None else self._check_responses()
+            families = [self.family(group) for group in range(len(self.scenes))]
+        except MitsonarError as error:
+            raise ValueError(str(error)) from None
+        low, high = self.flight.heights
+        if not (low > 0 and math.isfinite(high)):
+            raise ValueError(f"flight height_m must be finite and above 0: got {low:g} m")
+        if low != high and self.flight.kind == "runs":
+            raise ValueError(f"with flight.kind runs height_m is one number: got {low:g},{high:g}")
+        if self.frames > self.flight.pings and self.flight.kind == "random":
+            raise ValueError(f"frames must be at most flight.pings, {self.flight.pings}: got {self.frames}")
+        if self.flight.kind == "runs" and any(group.sequences != len(self.flight.runs) for group in self.scenes):
+            raise ValueError(f"with flight.kind runs each scene has {len(self.flight.runs)} sequences, one a run")
+        if not all(family.half_m > 0 for family in families):
+            raise ValueError("a scene must have a size")
+        return self
+
+    def _check_images(self) -> None:
+        """What belongs to images.
+
+        Raises:
+            MitsonarError: keys that contradict each other.
+        """
+        if len({view.name for view in self.views}) < len(self.views):
+            raise MitsonarError(f"receivers and segments must have names of their own: got {[v.name for v in self.views]}")
+        if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
+            raise MitsonarError("all receivers must have the same window: range_min, range_max and range_bins")
+        if self.labels and self.store == "vectors":
+            raise MitsonarError("labels are pixels: store images or both with them")
+
+    def _check_responses(self) -> None:
+        """What belongs to responses.
+
+        Raises:
+            MitsonarError: a key of the instrument that cannot be, or keys that only images have.
+        """
+        self.channel_sonar  # noqa: B018
+        plain = {
+            "mount": Mount(),
+            "receivers": [],
+            "segments": [],
+            "labels": [],
+            "store": "images",
+            "pixel": "uint8",
+            "gain": None,
+        }
+        other = [name for name, value in plain.items() if getattr(self, name) != value]
+        other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []
+        if other:
+            raise MitsonarError(
+                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers say where they are "
+                "and look themselves"
+            )
+
+    @cached_property
+    def instrument(self) -> Sonar:
+        """The sonar (of a bistatic set: the transmitter).
+
+        Raises:
+            MitsonarError: a data set of impulse responses.
+        """
+        if self.sonar is None:
+            raise MitsonarError(
+                f"the data set {self.name} is of impulse responses, this needs one of images: `mitsonar compare` and "
+                "ImpulsePairs read it"
+            )
+        return sonar_from(dict(self.sonar)).replace(seed=self.seed)
+
+    @cached_property
+    def channel_sonar(self) -> ChannelSonar:
+        """The transmitter and receivers of a data set of impulse responses.
+
+        Raises:
+            MitsonarError: a data set of images.
+        """
+        if self.channel is None:
+            raise MitsonarError(f"the data set {self.name} is of images: read it with SonarPairs, this needs responses")
+        return ChannelSonar.create(**{"name": self.name, "seed": self.seed, **self.channel})
+
+    @cached_property
+    def views(self) -> list[View]:
+        """The images of a ping."""
+        sonar = self.instrument
+        if self.receivers and self.segments:
+            raise MitsonarError("receivers and segments exclude each other: give one")
+        if self.segments:
+            return [Segment(sonar, name) for name in self.segments]
+        made: list[View] = []
+        for spec in self.receivers:
+            own = {**(self.sonar or {}), "beams": sonar.beams, "jitter": None, **spec.sonar}
+            made.append(Receiver(sonar, sonar_from({k: v for k, v in own.items() if v is not None}), spec.pose, spec.name))
+        return made or [Whole(sonar)]
+
+    def digest(self, *more: Any) -> str:
+        """What the recipe says beside the defaults, and more, as 16 hexadecimal digits: a key that a later version adds
+        changes nothing for who does not use it."""
+        said = self.model_dump(mode="json", exclude_defaults=True)
+        return hashlib.sha256(json.dumps([said, *more]).encode()).hexdigest()[:16]
+
+    def suffix(self, view: str) -> str:
+        """What the names of a view's arrays end with: nothing where there is only one."""
+        return f"_{view}" if len(self.views) > 1 else ""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What is stored of each view: ``image``, ``vector``, or both."""
+        return {"images": ("image",), "vectors": ("vector",), "both": ("image", "vector")}[self.store]
+
+    def family(self, group: int) -> Family:
+        """The family of a group of scenes."""
+        fields = {**self.world, **self.scenes[group].world}
+        if "family" not in fields:
+            raise MitsonarError("world lacks family: give rocky-field, ship-hull, pattern, flat-objects or scene")
+        return create_family(str(fields.pop("family")), **fields)
+
+    @property
+    def sequences(self) -> int:
+        """Sequences of the whole data set."""
+        return sum(group.count * group.sequences for group in self.scenes)
+
+
+def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
+    """What is stored of each view: the array's name -> (kind, view); names end with the view's where there are several."""
+    names = {}
+    for view in recipe.views:
+        kinds = [*recipe.kinds, *(["nonzero"] if "vector" in recipe.kinds else []), *recipe.labels]
+        for kind in kinds:
+            names[f"{kind}{recipe.suffix(view.name)}"] = (kind, view.name)
+    return names
+
+
+def shipped_recipes() -> dict[str, Path]:
+    """The recipes of the package by name."""
+    folder = Path(str(files("mitsonar.config"))) / "recipes"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def load_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None) -> Recipe:
+    """The recipe in a YAML file, or the shipped one of that name.
+
+    Args:
+        name_or_file: ``rocky-field``, or ``mine.yaml``.
+        changes: keys to change, dots between the levels: ``{"sonar.range_bins": 256}``.
+
+    Raises:
+        MitsonarError: no such recipe, not YAML, an unknown key, a value outside its limits.
+    """
+    fields, path = recipe_fields(
+        name_or_file, shipped_recipes(), "recipe", Recipe, " or a name of `mitsonar dataset recipes`"
+    )
+    for key, value in (changes or {}).items():
+        set_key(fields, key, value)
+    _find_files(fields, path.parent)
+    return recipe_from({"name": path.stem, **fields})
+
+
+def recipe_fields(
+    name_or_file: str | Path, shipped: dict[str, Path], what: str, model: type[BaseModel], else_: str = ""
+) -> tuple[dict[str, Any], Path]:
+    """The keys in a YAML file, or in the shipped one of that name, and that file.
+
+    Args:
+        name_or_file: ``rocky-field``, or ``mine.yaml``.
+        shipped: files by name.
+        what: it is, for errors.
+        model: whose fields are the known keys.
+        else_: what may be given besides a YAML file, for errors.
+
+    Raises:
+        MitsonarError: no such recipe, not YAML, not a table.
+    """
+    path = Path(name_or_file)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        if str(name_or_file) not in shipped:
+            names = nearest_names(str(name_or_file), shipped)
+            raise MitsonarError(
+                f"no {what} {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
+            )
+        path = shipped[str(name_or_file)]
+    try:
+        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise MitsonarError(f"cannot read {what} {path}: {error.strerror}; give a YAML file{else_}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise MitsonarError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(fields, dict):
+        keys = ", ".join(field.alias or name for name, field in model.model_fields.items())
+        raise MitsonarError(f"{path} must hold the keys of a {what}: {keys}")
+    return fields, path
+
+
+def recipe_from(fields: dict[str, Any]) -> Recipe:
+    """The recipe with these keys.
+
+    Raises:
+        MitsonarError: an unknown key, a value outside its limits.
+    """
+    return _checked(Recipe, "recipe", fields)
+
+
+def split_from(fields: dict[str, Any]) -> Split:
+    """The split with these keys.
+
+    Raises:
+        MitsonarError: an unknown key, a value outside its limits.
+    """
+    return _checked(Split, "split", fields)
+
+
+def _checked(part: type[_Made], what: str, fields: dict[str, Any]) -> _Made:
+    try:
+        return part(**fields)
+    except ValidationError as error:
+        raise MitsonarError(complaint(error, part, what, " (see docs/dataset.md)")) from None
+    except TypeError as error:
+        raise MitsonarError(f"{what} keys must be words: {error}") from None
+
+
+def _find_files(fields: dict[str, Any], folder: Path) -> None:
+    """Scene files are named from where the recipe is."""
+    groups = fields.get("scenes")
+    for world in [
+        fields.get("world"),
+        *(g.get("world") for g in (groups if isinstance(groups, list) else []) if isinstance(g, dict)),
+    ]:
+        if isinstance(world, dict) and isinstance(world.get("file"), str):
+            world["file"] = str((folder / world["file"]).resolve())
+
+
+def set_key(fields: dict[str, Any], key: str, value: Any) -> None:
+    """Set a key of a recipe, dots between the levels.
+
+    Raises:
+        MitsonarError: a level that is no group of keys.
+    """
+    *levels, last = key.split(".")
+    for level in levels:
+        fields = fields.setdefault(level, {})
+        if not isinstance(fields, dict):
+            raise MitsonarError(f"cannot set {key}: {level} is not a group of keys; change it in a YAML file of your own")
+    fields[last] = value

@@ -1,0 +1,320 @@
+"""What a training is: a small YAML file, checked; one for every row of the thesis's tables is shipped."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from mitsonar.acoustics.noise import load_noise
+from mitsonar.acoustics.signal_to_noise import snr_of
+from mitsonar.config.data_recipe import Split, recipe_fields, set_key, split_from
+from mitsonar.errors import MitsonarError, complaint
+
+__all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
+
+Precision = Literal["32-true", "16-mixed", "bf16-mixed"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _known_noise(text: str) -> str:
+    (snr_of if text.endswith("dB") else load_noise)(text)
+    return text
+
+
+Noise = Annotated[str, AfterValidator(_known_noise)]
+
+
+class Input(_Part):
+    """How frames reach the network: words of :class:`~mitsonar.datasets.torch_pairs.SonarPairs`; of impulse responses only
+    frames
+    and leak, those of :class:`~mitsonar.datasets.response_pairs.ImpulsePairs`."""
+
+    frames: int = Field(2, ge=1, le=16, description="of a sample; 1: heights are learnt")
+    views: list[str] | None = Field(None, description="which views; null: all")
+    kind: Literal["image", "vector", "response"] = Field(
+        "image", description="images, sums over their beams, or impulse responses"
+    )
+    layout: Literal["side", "stack", "channels"] = Field("side", description="frames side by side, stacked, or channels")
+    coordinates: Literal["polar", "cartesian", "both"] = Field("polar", description="as stored, fans in metres, or both")
+    cartesian_rows: int = Field(512, ge=2, le=8192, description="pixels of a fan in the forward direction")
+    range_levels: int | None = Field(None, ge=1, description="of vectors, stored ones added up to so many; null: as stored")
+    halves: bool = Field(False, description="vectors of both halves of images (fig. 4.18)")
+    ground: bool = Field(False, description="with the geometry of the ground, for networks that know it")
+    leak: Literal["none", "one_ping", "strangers"] = Field(
+        "none", description="of impulse responses: no motion is shown, what is still learnt is a leak"
+    )
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Self:
+        plain = Input.model_construct(kind=self.kind, frames=self.frames)
+        images = ("views", "layout", "coordinates", "cartesian_rows", "range_levels", "halves", "ground")
+        other = [name for name in (images if self.kind == "response" else ("leak",)) if _differ(self, plain, name)]
+        if other:
+            raise ValueError(f"input.{other[0]} is not for kind {self.kind}: leave it out")
+        return self
+
+    def words(self) -> dict[str, Any]:
+        """For SonarPairs and RenderedPairs, or ImpulsePairs."""
+        words = self.model_dump()
+        if self.kind == "response":
+            return {"frames": self.frames, "leak": self.leak}
+        del words["leak"]
+        if not words["ground"]:
+            del words["ground"]
+        return words
+
+
+def _differ(one: BaseModel, other: BaseModel, name: str) -> bool:
+    return bool(getattr(one, name) != getattr(other, name))
+
+
+class Loss(_Part):
+    """What is made small."""
+
+    kind: Literal["mse", "likelihood"] = Field("mse", description="eq. 3.1; or the likelihood of the motion's law")
+    penalty: float = Field(0.0, ge=0, allow_inf_nan=False, description="eta of eq. 3.2 for estimates beyond the bounds")
+    bounds: tuple[float, float] | None = Field(
+        None, description="of eq. 3.2, in label units; default: what the largest motions become, +-10 for normx10"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
+            raise ValueError(f"loss bounds must be low,high with low < high: got {self.bounds[0]:g},{self.bounds[1]:g}")
+        if self.kind == "likelihood" and self.penalty:
+            raise ValueError("loss penalty belongs to kind mse: the likelihood has none")
+        return self
+
+
+class Optimiser(_Part):
+    """How weights follow the gradient."""
+
+    kind: Literal["adam", "adamw"] = "adam"
+    rate: float = Field(1e-4, gt=0, le=10, description="learning rate at the start")
+    schedule: Literal["halve", "cosine", "constant", "steps"] = Field("halve", description="of the rate")
+    steps: list[tuple[float, float]] = Field(
+        default_factory=list, description="of schedule steps: [epoch, rate from then on]"
+    )
+    halve_every: float = Field(12.0, gt=0, description="epochs after which the rate falls, again and again")
+    fall_to: float = Field(0.5, gt=0, le=1, description="part of the rate that is left then, with schedule halve")
+    warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the beginning")
+    weight_decay: float = Field(0.0, ge=0, le=1)
+    clip: float | None = Field(None, gt=0, description="largest norm of the gradient; null: any")
+
+    @model_validator(mode="after")
+    def _steps_follow(self) -> Self:
+        epochs, rates = [epoch for epoch, _ in self.steps], [rate for _, rate in self.steps]
+        follow = epochs == sorted(set(epochs)) and all(0 < rate <= 10 for rate in rates)
+        if (self.schedule == "steps") != bool(self.steps) or not follow:
+            raise ValueError(
+                "optimiser steps are [epoch, rate] of schedule steps, epochs rising, rates above 0 to 10: got "
+                f"{self.steps} with schedule {self.schedule}"
+            )
+        return self
+
+    def rate_at(self, step: int, epoch_steps: int, steps: int) -> float:
+        """The learning rate of a step, a function of the step alone.
+
+        Args:
+            step: counted from 0.
+            epoch_steps: steps of an epoch.
+            steps: of the whole training as planned.
+        """
+        rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
+        match self.schedule:
+            case "halve":
+                return self.rate * rise * self.fall_to ** math.floor(step / (self.halve_every * epoch_steps))
+            case "steps":
+                begun = [rate for epoch, rate in self.steps if step >= epoch * epoch_steps]
+                return rise * (begun[-1] if begun else self.rate)
+            case "cosine":
+                done = max(0, step - self.warmup) / max(1, steps - self.warmup)
+                return self.rate * rise * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+            case _:
+                return self.rate * rise
+
+
+class Validate(_Part):
+    """What is measured while training goes on; nothing of it touches the training."""
+
+    noise: list[Noise] = Field(default=["none", "high"], min_length=1, description="levels of noise")
+    pairs: int | None = Field(500, ge=1, description="samples, always the same; null: all of the part")
+    every_minutes: float = Field(5.0, gt=0)
+    every_steps: int | None = Field(None, ge=1, description="instead of minutes")
+
+
+class TrainingRecipe(_Part):
+    """A training; docs of each key stand beside it.
+
+    Raises:
+        MitsonarError: through :func:`load_training_recipe`, for an unknown key or a value outside its limits.
+    """
+
+    about: str = Field("", description="a sentence on it")
+    network: dict[str, Any] = Field(description="name of the network, or name and options: {name: posenet, width: 0.25}")
+    start: str | None = Field(None, description="checkpoint or run with whose weights it begins; null: drawn at random")
+    data: str = Field("rocky-field", description="data set recipe, name or file, for --render and reproduce")
+    data_changes: dict[str, Any] = Field(default_factory=dict, description="keys of it to change: {sonar.range_bins: 256}")
+    part_of_data: float = Field(1.0, gt=0, le=1, description="only samples of the first so large a part of the frames")
+    input: Input = Field(default_factory=Input)
+    labels: Literal["raw", "quantised", "normx10"] = Field("normx10", description="what the network says")
+    noise: Noise | list[Noise] = Field("none", description="in training; of a list each sample draws one")
+    augment: list[Literal["mirror", "reverse", "strangers"]] = Field(
+        default_factory=list, description="for networks that know the ground: ways in which samples are changed"
+    )
+    split: str | dict[str, Any] = Field("sequence", description="sequence, scene, or keys of a data set recipe's split")
+    loss: Loss = Field(default_factory=Loss)
+    optimiser: Optimiser = Field(default_factory=Optimiser)
+    batch: int = Field(4, ge=1, le=65_536, description="samples of a step, over all devices")
+    epochs: float | None = Field(32.0, gt=0, description="times that each sample is seen; or steps")
+    steps: int | None = Field(None, ge=1, description="of the optimiser, in place of epochs")
+    precision: Precision = Field("32-true", description="Lightning's word")
+    validate_: Validate = Field(default_factory=Validate, alias="validate")
+    seed: int = Field(0, ge=0, lt=2**31, description="of weights, order, noise, dropout")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _spelled_out(cls, fields: Any) -> Any:
+        if not isinstance(fields, dict):
+            return fields
+        named = {"network": {"name": fields["network"]}} if isinstance(fields.get("network"), str) else {}
+        kind = fields["input"].get("kind") if isinstance(fields.get("input"), dict) else None
+        if kind == "response" and isinstance(fields.get("validate", {}), dict):
+            named["validate"] = {"noise": ["none"], **fields.get("validate", {})}
+        either = {"epochs": None} if fields.get("steps") is not None and "epochs" not in fields else {}
+        return {**fields, **named, **either}
+
+    @field_validator("network")
+    @classmethod
+    def _has_a_name(cls, network: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(network.get("name"), str):
+            raise ValueError("give the name of a network, such as posenet, or name and options")
+        return network
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.epochs is None) == (self.steps is None):
+            raise ValueError(f"the length is epochs or steps, one of them: got epochs {self.epochs}, steps {self.steps}")
+        if isinstance(self.noise, list) and not self.noise:
+            raise ValueError("noise is a level or a list of levels: got an empty list; give none for no noise")
+        decibels = self.input.kind == "response"
+        for level in {*self.noises, *self.validate_.noise} - {"none"}:
+            if level.endswith("dB") != decibels:
+                allowed = "a signal to noise ratio such as '20 dB'" if decibels else "low, high, chapter2 or mean,std,scale"
+                raise ValueError(f"noise of input.kind {self.input.kind} is {allowed}, or none: got {level!r}")
+        if self.augment and not self.input.ground:
+            raise ValueError("augment is for inputs with ground: set input.ground: true, or leave augment out")
+        if isinstance(self.split, dict):
+            split_from(self.split)
+        elif self.split not in ("sequence", "scene"):
+            raise ValueError(f"split must be sequence, scene, or keys as in a data set recipe: got {self.split!r}")
+        return self
+
+    @property
+    def validation(self) -> Validate:
+        """The key ``validate``, whose name pydantic needs."""
+        return self.validate_
+
+    @property
+    def noises(self) -> list[str]:
+        """Levels of training noise."""
+        return [self.noise] if isinstance(self.noise, str) else list(self.noise)
+
+    @property
+    def noise_said(self) -> str:
+        """Training noise in words."""
+        return " or ".join(self.noises)
+
+    @cached_property
+    def split_of(self) -> str | Split:
+        """For SonarPairs."""
+        return split_from(self.split) if isinstance(self.split, dict) else self.split
+
+    def arrangement(self) -> dict[str, Any]:
+        """Words for SonarPairs and RenderedPairs of the training's samples."""
+        noise = self.noises
+        return {
+            **self.input.words(),
+            "labels": self.labels,
+            "noise": noise[0] if len(noise) == 1 else noise,
+            "seed": self.seed,
+        }
+
+    def length(self, epoch_steps: int) -> int:
+        """Steps of the whole training, one at least."""
+        return self.steps or max(1, round((self.epochs or 0) * epoch_steps))
+
+    def plain(self) -> dict[str, Any]:
+        """All keys with plain values, as the recipe file of a run holds them."""
+        return self.model_dump(mode="json", by_alias=True)
+
+    def replace(self, **fields: Any) -> TrainingRecipe:
+        """This recipe with some keys changed, checked again."""
+        return training_recipe_from({**self.plain(), **fields})
+
+    def differs(self, other: TrainingRecipe) -> str | None:
+        """The first key whose value differs, with both values in words; None where all are the same."""
+        mine, others = _flat(self.plain()), _flat(other.plain())
+        for key in mine | others:
+            if mine.get(key) != others.get(key):
+                return f"{key} {mine.get(key)!r}, not {others.get(key)!r}"
+        return None
+
+
+def shipped_training_recipes() -> dict[str, Path]:
+    """The recipes of the package by name."""
+    if find_spec("mitsonar.recipes") is None:
+        return {}
+    return {path.stem: path for path in sorted(Path(str(files("mitsonar.recipes"))).glob("*.yaml"))}
+
+
+def load_training_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None) -> TrainingRecipe:
+    """The training recipe in a YAML file, or the shipped one of that name.
+
+    Args:
+        name_or_file: ``mine.yaml``, or a shipped name.
+        changes: keys to change, dots between the levels: ``{"optimiser.rate": 1e-3}``.
+
+    Raises:
+        MitsonarError: no such recipe, not YAML, an unknown key, a value outside its limits.
+    """
+    fields, path = recipe_fields(name_or_file, shipped_training_recipes(), "training recipe", TrainingRecipe)
+    if isinstance(fields.get("network"), str):
+        fields["network"] = {"name": fields["network"]}
+    for key, value in (changes or {}).items():
+        set_key(fields, key, value)
+    if isinstance(fields.get("data"), str) and fields["data"].lower().endswith((".yaml", ".yml")):
+        fields["data"] = str((path.parent / fields["data"]).resolve())  # named from where the recipe is
+    return training_recipe_from(fields)
+
+
+def training_recipe_from(fields: dict[str, Any]) -> TrainingRecipe:
+    """The training recipe with these keys.
+
+    Raises:
+        MitsonarError: an unknown key, a value outside its limits.
+    """
+    try:
+        return TrainingRecipe(**fields)
+    except ValidationError as error:
+        said = complaint(error, TrainingRecipe, "training recipe")
+        raise MitsonarError(said.replace("validate_", "validate")) from None
+    except TypeError as error:
+        raise MitsonarError(f"training recipe keys must be words: {error}") from None
+
+
+def _flat(fields: dict[str, Any], before: str = "") -> dict[str, Any]:
+    """Keys with dots between the levels."""
+    table: dict[str, Any] = {}
+    for key, value in fields.items():
+        table |= _flat(value, f"{before}{key}.") if isinstance(value, dict) and value else {f"{before}{key}": value}
+    return table

@@ -1,0 +1,79 @@
+"""The geometry of level ground as networks take it: at a few nodes of an image, in bins and beams."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.geometry.attitude import Attitude
+from mitsonar.geometry.ground_plane import GroundGeometry, nearest_known
+from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["NODES", "ground_at", "ground_of"]
+
+NODES = (17, 9)
+"""Along range and bearing: the geometry is smooth, linear interpolation between so many errs by less than 1e-3 cells."""
+
+RISE = 0.05
+"""Part of the height by which ground is raised and lowered to see what changes."""
+
+
+def ground_at(
+    range_m: ArrayLike, bearing_rad: ArrayLike, bearing: Bearing, height_m: float, pitch_rad: float, roll_rad: float = 0.0
+) -> dict[str, NDArray[np.float32]]:
+    """Where the nodes of an image lie on the ground, and how they move with the sonar.
+
+    Args:
+        range_m: of the bins ``(bins,)`` [m], rising.
+        bearing_rad: of the beams ``(beams,)`` [rad], rising.
+        bearing: which angle that is.
+        height_m: of the sonar over what is seen.
+        pitch_rad: > 0 looks down.
+        roll_rad: > 0 puts starboard down.
+
+    Returns:
+        By name, float32: ``points (R, C, 2)`` [m], ``turn (3, 3)``, ``height ()`` [m], ``place (2, R, C)`` range [m] and
+        bearing [rad] of the nodes, ``cell (2, R, C)`` bin [m] and beam [rad] there, ``derivative (2, 3, R, C)`` in bins and
+        beams by motion [m, m, rad], ``by_relief (2, 3, R, C)`` its change where what is seen stands higher, by parts of the
+        height, ``cone ()``: 1 where the bearing is a cone's.
+    """
+    axes = [np.asarray(values, dtype=float) for values in (range_m, bearing_rad)]
+    index = [np.linspace(0, len(axis) - 1, count) for axis, count in zip(axes, NODES, strict=True)]
+    nodes = [np.interp(at, np.arange(len(axis)), axis) for at, axis in zip(index, axes, strict=True)]
+    cell = [np.interp(at, np.arange(len(axis)), np.gradient(axis)) for at, axis in zip(index, axes, strict=True)]
+    geometry = GroundGeometry(nodes[0], nodes[1], bearing, height_m, pitch_rad, roll_rad)
+    row, column = nearest_known(np.asarray(np.isfinite(geometry.points).all(axis=-1)))
+    points = np.nan_to_num(geometry.points[row, column])
+    cells = np.stack(np.meshgrid(*cell, indexing="ij"))
+
+    def derivative(part: float) -> NDArray[np.float64]:
+        """By motion, over ground at this part of the height."""
+        own = GroundGeometry(nodes[0], nodes[1], bearing, part * height_m, pitch_rad, roll_rad)
+        values = np.nan_to_num(own.derivative[row, column]) / np.moveaxis(cells, 0, -1)[..., None]
+        return np.moveaxis(values, (2, 3), (0, 1))
+
+    higher, lower = (derivative(1 - sign * RISE) for sign in (1, -1))
+    table = {
+        "points": points,
+        "turn": geometry.turn,
+        "height": np.array(height_m),
+        "place": np.stack(np.broadcast_arrays(nodes[0][row], nodes[1][column])),
+        "cell": cells,
+        "derivative": derivative(1.0),
+        "by_relief": (higher - lower) / (2 * RISE),
+        "cone": np.array(float(bearing == "cone")),
+    }
+    return {name: np.array(values, dtype=np.float32) for name, values in table.items()}
+
+
+def ground_of(frames: SonarFrames, standing: Attitude) -> dict[str, NDArray[np.float32]]:
+    """The geometry of frames, as they stand over what they see; see :func:`ground_at`."""
+    return ground_at(
+        frames.range_m,
+        frames.bearing_rad,
+        frames.sonar.bearing,
+        standing.height_m,
+        standing.pitch_rad,
+        standing.roll_rad,
+    )

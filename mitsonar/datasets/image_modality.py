@@ -1,0 +1,173 @@
+"""What an imaging sonar records of a ping: images, vectors, or both, of each view, with their labels."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.config.data_recipe import Recipe, array_names
+from mitsonar.datasets.modality import Axis, Read, Stored, ground_reach
+from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
+from mitsonar.records.sonar_frames import LABELS
+
+__all__ = ["ImageModality", "footprint"]
+
+RAYS = 61
+"""Over azimuth and over elevation, whose ends on the ground make a footprint: arcs bulge less than 0.2 mm between them."""
+
+TEXTS = {
+    "image": "{}: level times gain, 0..255 (or 0..1), row 0 nearest, column 0 most to port; zero means no echo",
+    "vector": "{}: sum over the beams of the image in 0..1",
+    "nonzero": "{}: number of beams with an echo, from which a vector's noise is drawn",
+    "elevation_rad": "{}: elevation of the strongest echo; nan without echo",
+    "shape_id": "{}: place in the scene of the shape of the strongest echo; -1 without echo",
+    "object_id": "{}: object of the strongest echo, as its mesh numbers them; 0 for none, -1 without echo",
+    "shadow": "{}: 0 not in shadow, 1 dark with sound or echoes beyond, 2 dark with all sound intercepted before",
+}
+
+PER_FRAME = {
+    "height_m": Stored(np.dtype(np.float64), "height of the sonar over what is straight below it [m]; nan where nothing is"),
+    "dropped": Stored(np.dtype(np.uint32), "returns of the frame that lie outside the window and were dropped"),
+    "saturated": Stored(np.dtype(np.uint32), "pixels of the frame at the maximum"),
+}
+
+
+class ImageModality:
+    """Images of a recipe with a sonar; see :class:`~mitsonar.datasets.modality.Modality`."""
+
+    what = "frame"
+    settled: tuple[str, ...] = ("gain", "level_scale")
+    planned: tuple[str, ...] = ()
+    decided_by: tuple[str, ...] = ()
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe, self.sonar = recipe, recipe.instrument
+
+    @property
+    def stored(self) -> dict[str, Stored]:
+        """Pixels, and what rendering tells of each frame."""
+        views = {view.name: view for view in self.recipe.views}
+        table = {}
+        for name, (kind, view_name) in array_names(self.recipe).items():
+            view, sums = views[view_name], kind in ("vector", "nonzero")
+            shape: tuple[int, ...] = (view.sonar.range_bins, *(() if sums else (len(view.bearing_rad),)))
+            dims = ("range", *(() if sums else (f"beam{self.recipe.suffix(view_name)}",)))
+            table[name] = Stored(self._type(kind), TEXTS[kind].format(view_name), shape, dims)
+        return table | PER_FRAME
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """Bearings of each view, and ranges."""
+        table = {}
+        for view in self.recipe.views:
+            suffix = self.recipe.suffix(view.name)
+            about = "bearing of each beam's axis [rad], starboard positive"
+            table[f"bearing_rad{suffix}"] = Axis(view.bearing_rad, f"beam{suffix}", about)
+        return table | {"range_m": Axis(self.recipe.views[0].sonar.range_m, "range", "centre of each range bin [m]")}
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The sonar, and that of each view."""
+        views = {view.name: view.sonar.model_dump() for view in self.recipe.views}
+        return {"sonar": self.sonar.model_dump(), "views": views, "level": "linear"}
+
+    @property
+    def ping_bytes(self) -> int:
+        """Pixels and labels of a frame; of vectors alone their sums and counts."""
+        if "image" not in self.recipe.kinds:
+            return sum(view.sonar.range_bins * 8 for view in self.recipe.views)
+        size = 1 if self.recipe.pixel == "uint8" else 4
+        each = sum(len(view.bearing_rad) * view.sonar.range_bins * size for view in self.recipe.views)
+        return each + len(self.recipe.labels) * 4 * each // size
+
+    def reach(self, height: float) -> NDArray[np.float64]:
+        """Corners of the footprint, or of that of the field of view that the flight names."""
+        return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg)
+
+    def _type(self, kind: str) -> np.dtype[Any]:
+        """The type of an array of this kind."""
+        known = {"image": self.recipe.pixel, "vector": np.float32, "nonzero": np.uint32}
+        return np.dtype(known[kind] if kind in known else LABELS[kind])
+
+    # ---------------------------------------------------------------- checks
+
+    def faults(self, read: Read, here: slice) -> list[str]:
+        """Ranges of pixels, sums and labels."""
+        wrong = []
+        beams = {view.name: len(view.bearing_rad) for view in self.recipe.views}
+        for name, (kind, view) in array_names(self.recipe).items():
+            values = read(name, here)
+            low, high = _limits(kind, values, beams[view])
+            known = values[~np.isnan(values)] if kind == "elevation_rad" else values
+            if known.size and not (known.min() >= low and known.max() <= high):
+                wrong.append(
+                    f"{name}, frames {here.start}..{here.stop - 1}: values {known.min():g}..{known.max():g}, allowed "
+                    f"{low:g}..{high:g}"
+                )
+            if kind == "nonzero":
+                vector = read(name.replace("nonzero", "vector", 1), here)
+                if ((vector > 0) != (values > 0)).any() or (vector > values * (1 + 1e-6)).any():
+                    wrong.append(
+                        f"{name}, frames {here.start}..{here.stop - 1}: sums and numbers of echoes contradict each other"
+                    )
+        return wrong
+
+    def warnings(self, read: Read) -> list[str]:
+        """Motions far below a bin, returns outside the window, a gain that is too high."""
+        sentences = []
+        flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m
+        largest_mm = max(flight.sideways_mm, flight.forward_mm)
+        if flight.kind == "random" and flight.pings > 1 and 0 < largest_mm < bin_mm / 100:
+            sentences.append(
+                f"motions of at most {largest_mm:g} mm are less than a hundredth of a range bin ({bin_mm:.2g} mm): "
+                "flight.sideways_mm and forward_mm are in millimetres"
+            )
+        dropped, saturated = (read(name).astype(np.int64) for name in ("dropped", "saturated"))
+        if dropped.any():
+            rays = self.sonar.rays
+            sentences.append(
+                f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside "
+                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped, as the window says"
+            )
+        pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.recipe.views)
+        if saturated.mean() > 0.01 * pixels:
+            sentences.append(
+                f"{100 * saturated.mean() / pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set on "
+                "the first 20 frames, is too high for the rest"
+            )
+        return sentences
+
+
+def _limits(kind: str, values: NDArray[Any], beams: int) -> tuple[float, float]:
+    match kind:
+        case "image":
+            return 0, 255 if values.dtype == np.uint8 else 1
+        case "vector" | "nonzero":
+            return 0, beams
+        case "elevation_rad":
+            return -np.pi / 2, np.pi / 2
+        case "shadow":
+            return 0, 2
+        case _:
+            return -1, np.inf
+
+
+@lru_cache(maxsize=8)
+def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None) -> NDArray[np.float64]:
+    """Corners of what a sonar can see of the ground z = 0, from a vehicle at ``height`` ``(n, 2)`` starboard, forward [m].
+
+    Raises:
+        MitsonarError: the ground is out of range.
+    """
+    azimuth, elevation = fov_deg or (sonar.azimuth_fov_deg, sonar.elevation_fov_deg)
+    outer = max(math.radians(azimuth) / 2, sonar.bearing_rad[-1] + sonar.beam_width_rad / 2 if fov_deg is None else 0)
+    b, e = np.meshgrid(np.linspace(-outer, outer, RAYS), np.radians(np.linspace(-elevation, elevation, RAYS)) / 2)
+    local = directions(sonar.bearing, b.ravel(), e.ravel())
+    eye = mounted(Pose(0, 0, height), mount)[0]
+    return ground_reach(eye[:3], vehicle_rotation(eye).apply(local), sonar.range_max)

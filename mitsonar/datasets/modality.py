@@ -1,0 +1,123 @@
+"""What the instrument of a data set records of each ping, and where it looks: all that planning and storing need of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.instruments.imaging_sonar import Instrument
+
+__all__ = ["Axis", "Modality", "Read", "Stored", "ground_reach"]
+
+Array = NDArray[np.float64]
+Read = Callable[..., NDArray[Any]]
+"""Values of an array of a store by its name, all or those of a slice of frames."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An array that is filled ping by ping.
+
+    Attributes:
+        kind: its type.
+        about: a sentence on it, kept in the store.
+        shape: of one ping's values.
+        dims: names of these dimensions.
+    """
+
+    kind: np.dtype[Any]
+    about: str
+    shape: tuple[int, ...] = ()
+    dims: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Values along a dimension, known from the start."""
+
+    values: Array
+    dim: str
+    about: str
+
+
+class Modality(Protocol):
+    """What a recipe's instrument records.
+
+    Attributes:
+        what: one ping's record is called.
+        sonar: the instrument: its name, model and frame rate are what all have.
+        stored: arrays that are filled ping by ping, those with a shape first.
+        axes: arrays along their dimensions.
+        attributes: of the store.
+        settled: names of attributes that are numbers of the whole data set, set before its first ping is recorded.
+        planned: arrays of the plan that are stored beside the poses.
+        decided_by: packages whose versions decide what is recorded, beside those that always do.
+        ping_bytes: of one ping, about.
+    """
+
+    what: str
+    settled: tuple[str, ...]
+    planned: tuple[str, ...]
+    decided_by: tuple[str, ...]
+
+    @property
+    def sonar(self) -> Instrument: ...
+    @property
+    def stored(self) -> dict[str, Stored]: ...
+    @property
+    def axes(self) -> dict[str, Axis]: ...
+    @property
+    def attributes(self) -> dict[str, Any]: ...
+    @property
+    def ping_bytes(self) -> int: ...
+
+    def reach(self, height: float) -> Array:
+        """Corners ``(n, 2)`` of what is seen of the ground z = 0, from a level vehicle so high, starboard, forward [m].
+
+        Raises:
+            MitsonarError: no ground is seen.
+        """
+
+    def faults(self, read: Read, here: slice) -> list[str]:
+        """What is wrong with the values of some frames, a sentence each."""
+
+    def warnings(self, read: Read) -> list[str]:
+        """What the user should know of a finished data set, a sentence each."""
+
+
+def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
+    """Corners ``(n, 2)`` of where rays meet the ground z = 0 [m].
+
+    Rays that meet it beyond ``range_max``, or never, count as far as that allows.
+
+    Args:
+        eye: where they start ``(3,)``.
+        directions: ``(rays, 3)``, unit.
+        range_max: of the instrument.
+
+    Raises:
+        MitsonarError: the ground is out of range.
+    """
+    above = float(eye[2])
+    if above <= 0 or above >= range_max:
+        raise MitsonarError(
+            f"the sonar sees no ground: it is {above:g} m over it, range_max is {range_max:g} m; lower height_m or "
+            "raise range_max"
+        )
+    across = math.sqrt(range_max**2 - above**2)
+    level = np.hypot(directions[:, 0], directions[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground = np.where(directions[:, 2] < 0, above * level / -directions[:, 2], np.inf)
+    distance = np.minimum(ground, across)
+    unit = directions[:, :2] / np.maximum(level, 1e-12)[:, None]
+    points = eye[:2] + unit * distance[:, None]
+    return np.asarray(points[ConvexHull(points).vertices])

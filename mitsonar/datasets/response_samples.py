@@ -1,0 +1,145 @@
+"""Impulse responses of a data set, sample by sample, as estimators and regressors take them; NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.signal_to_noise import snr_of
+from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.datasets.arrangement import Labels
+from mitsonar.datasets.response_packing import Packing, packed
+from mitsonar.datasets.sample_index import Part
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError
+from mitsonar.motion.pose import motions
+from mitsonar.records.impulse_responses import ImpulseResponses
+
+__all__ = ["ImpulseSamples", "Leak", "displacement_labels"]
+
+Leak = Literal["none", "one_ping", "strangers"]
+LEAKS = ("none", "one_ping", "strangers")
+
+
+def displacement_labels(kind: str, recipe: Recipe, pings: int) -> Labels:
+    """Labels of displacements from the first of ``pings`` pings to the last; yaw only where the recipe turns."""
+    step = Labels.of(kind, recipe, 2)
+    count = 3 if recipe.flight.yaw_deg > 0 else 2
+    return Labels(kind, (pings - 1) * step.low[:count], (pings - 1) * step.high[:count], step.names[:count])
+
+
+class ImpulseSamples:
+    """Samples of a data set of impulse responses: Q consecutive pings and the displacement from the first to the last.
+
+    Args:
+        url: path or URL of the store.
+        part: ``train``, ``validation``, ``test``, or ``all``.
+        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
+        frames: Q, pings of a sample; default: the recipe's.
+        noise: ``none``, a ratio of signal to noise as ``20 dB`` (see
+        :func:`~mitsonar.datasets.response_packing.noise_power`), or a
+            list of them, of which each sample draws one.
+        labels: ``raw`` (m, m, rad), ``quantised`` or ``normx10``.
+        seed: of the noise.
+        leak: for tests of what the motion is read from: ``one_ping`` has the first response in place of all others,
+            ``strangers`` all but the first from a sample of another scene: neither shows the motion.
+        one_a_sequence: only one sample of each sequence.
+
+    Attributes:
+        sonar: the instrument.
+        arrange: packing and noise.
+
+    Raises:
+        MitsonarError: no finished data set of responses there, words that are not known, a part without samples.
+    """
+
+    def __init__(
+        self,
+        url: str | Path,
+        *,
+        part: str = "train",
+        split: str | Split | dict[str, Any] | None = None,
+        frames: int | None = None,
+        noise: str | Sequence[str] = "none",
+        labels: str = "normx10",
+        seed: int = 0,
+        leak: Leak = "none",
+        one_a_sequence: bool = False,
+    ) -> None:
+        self.store = DataStore.open(url)
+        self.recipe = self.store.recipe
+        self.sonar = self.recipe.channel_sonar
+        self.frames = self.recipe.frames if frames is None else frames
+        if self.frames < 2:
+            raise MitsonarError(f"a sample has two pings or more, first and last: got frames {self.frames}")
+        if leak not in LEAKS:
+            raise MitsonarError(f"leak must be one of {', '.join(LEAKS)}: got {leak!r}")
+        levels = [noise] if isinstance(noise, str) else list(noise)
+        if not levels:
+            raise MitsonarError("noise is a ratio or a list of them: got an empty list; give none for no noise")
+        self.arrange = Packing(tuple(one.name for one in self.sonar.receivers), tuple(map(snr_of, levels)))
+        self.labels = displacement_labels(labels, self.recipe, self.frames)
+        self.seed, self.epoch, self.leak = seed, 0, leak
+        self.chosen = Part.of(self.store, part, split, self.frames, seed=seed, one_a_sequence=one_a_sequence)
+        self.split, self.first = self.chosen.split, self.chosen.first
+        self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
+        if leak == "strangers" and len(np.unique(self.scene[self.first])) < 2:
+            raise MitsonarError(f"strangers are of two scenes, part {part!r} has one: read another part, or make more")
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def frame_numbers(self, index: int) -> slice:
+        """The pings of a sample, as numbered in the store."""
+        return self.chosen.frame_numbers(index)
+
+    def target(self, index: int) -> NDArray[np.float64]:
+        """Displacement from the first ping to the last (eq. 3.4): sideways, forward [m], yaw [rad] if the recipe turns."""
+        here = self.frame_numbers(index)
+        ends = self.chosen.pose[[here.start, here.stop - 1]]
+        return np.asarray(motions(ends)[0, : len(self.labels.names)])
+
+    def targets(self) -> NDArray[np.float64]:
+        """Of all samples ``(samples, 2 or 3)``."""
+        return np.array([self.target(index) for index in range(len(self))])
+
+    def response(self, index: int) -> NDArray[np.complex64]:
+        """The responses of a sample ``(Q, M, taps)``, without noise, as ``leak`` has them."""
+        mine = self.store.read("response", self.frame_numbers(index))
+        if self.leak == "one_ping":
+            return np.repeat(mine[:1], self.frames, axis=0)
+        if self.leak == "strangers":
+            others = np.flatnonzero(self.scene[self.first] != self.scene[self.first[index]])
+            other = int(np.random.default_rng([self.seed, 11, int(self.first[index])]).choice(others))
+            return np.concatenate([mine[:1], self.store.read("response", self.frame_numbers(other))[1:]])
+        return mine
+
+    @property
+    def noise_seed(self) -> int:
+        """Of this epoch's noise."""
+        return self.seed
+
+    def received(self, index: int) -> NDArray[np.complexfloating]:
+        """The responses of a sample ``(Q, M, taps)``, with its noise."""
+        here = self.frame_numbers(index)
+        return self.arrange.received(self.response(index), np.arange(here.start, here.stop), self.noise_seed)
+
+    def matrix(self, index: int) -> NDArray[np.float32]:
+        """The packed matrix ``(taps, 2 M Q)`` of a sample, with its noise."""
+        return packed(self.received(index))
+
+    def responses(self, index: int) -> ImpulseResponses:
+        """A sample with its noise, for estimators."""
+        here = self.frame_numbers(index)
+        known: dict[str, Any] = {name: values[here] for name, values in self._per_ping.items()}
+        return ImpulseResponses(response=self.received(index), sonar=self.sonar, poses=self.chosen.pose[here], **known)
+
+    @cached_property
+    def _per_ping(self) -> dict[str, NDArray[np.float64]]:
+        """Small arrays of the whole store: one chunk each."""
+        return {name: self.store.read(name) for name in ("time_s", "velocity", "height_m")}

@@ -1,0 +1,108 @@
+"""The samples of a part of a data set: which frames they are, where and in which scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.config.data_recipe import Recipe, Split, split_from
+from mitsonar.datasets.split import deal, world_of
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError
+
+__all__ = ["Part", "split_for"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Samples of consecutive frames of one sequence.
+
+    Attributes:
+        split: that deals out the frames.
+        frames: of a sample.
+        first: the first frame of each sample ``(samples,)``.
+        scene, sequence: of each frame of the store ``(frames,)``.
+        pose: of the sonar ``(frames, 6)``.
+        motion: to the next frame ``(frames, 3)``.
+    """
+
+    split: Split
+    frames: int
+    first: NDArray[np.int64]
+    scene: NDArray[np.int32]
+    sequence: NDArray[np.int32]
+    pose: NDArray[np.float64]
+    motion: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        store: DataStore,
+        part: str,
+        split: str | Split | dict[str, Any] | None,
+        frames: int,
+        *,
+        seed: int = 0,
+        one_a_sequence: bool = False,
+    ) -> Part:
+        """The samples of a part.
+
+        Args:
+            store: of the data set.
+            part: ``train``, ``validation``, ``test``, or ``all``.
+            split: see :func:`split_for`.
+            frames: of a sample.
+            seed: of the choice of one a sequence.
+            one_a_sequence: only one sample of each sequence.
+
+        Raises:
+            MitsonarError: words that are not known, a part without samples.
+        """
+        dealt = split_for(split, store.recipe)
+        scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
+        first = np.arange(max(0, len(sequence) - frames + 1))
+        first = first[sequence[first] == sequence[first + frames - 1]]
+        if dealt.by == "sample":  # neighbours share frames, and a sequence has one motion: what is validated has been seen
+            number = np.arange(len(first), dtype=np.int32)
+            first = first[deal(number.astype(np.int64), number, dealt, part)]
+        else:
+            first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, dealt, part)[first]]
+        if not len(first):
+            raise MitsonarError(
+                f"{store.place.url} has no sample of {frames} frames in part {part!r}: its sequences have "
+                f"{np.bincount(sequence).max()} frames; ask for fewer frames, or another part"
+            )
+        if one_a_sequence:
+            rank = np.random.default_rng([seed, 5]).permutation(len(first))
+            order = np.lexsort((rank, sequence[first]))
+            first = np.sort(first[order][np.unique(sequence[first][order], return_index=True)[1]])
+        return cls(dealt, frames, first, scene, sequence, pose, motion)
+
+    def frame_numbers(self, index: int) -> slice:
+        """The frames of a sample, as numbered in the store."""
+        first = int(self.first[index])
+        return slice(first, first + self.frames)
+
+
+def split_for(split: str | Split | dict[str, Any] | None, recipe: Recipe) -> Split:
+    """The split that is asked for, of a data set of this recipe; see :class:`~mitsonar.datasets.torch_pairs.SonarPairs`.
+
+    Raises:
+        MitsonarError: a word or keys that are not known.
+    """
+    if isinstance(split, Split):
+        return split
+    if isinstance(split, dict):
+        return split_from(split)
+    match split:
+        case None:
+            return recipe.split
+        case "sequence":
+            return recipe.split if recipe.split.by == "sequence" else Split()
+        case "scene":
+            return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
+        case _:
+            raise MitsonarError(f"split must be sequence, scene, or keys as in a recipe: got {split!r}")

@@ -1,0 +1,130 @@
+"""A scene of a recipe becomes pixels: what both the store and training with rendered frames are filled from."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.config.data_recipe import Recipe
+from mitsonar.datasets.image_modality import ImageModality
+from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
+from mitsonar.errors import MitsonarError
+from mitsonar.motion.pose import mounted
+from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, constant_gain
+from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.variant import release_memory
+
+__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world"]
+
+FRAMES_A_SCENE = 10_000_000
+"""Pings are numbered by scene times this, plus their place in it: jitter does not depend on the size of the data set."""
+
+
+class SceneRenderer:
+    """One scene, built, loaded, and ready to render.
+
+    Args:
+        recipe: of the data set.
+        scene: which of its scenes.
+    """
+
+    def __init__(self, recipe: Recipe, scene: Scene) -> None:
+        self.recipe, self.scene = recipe, scene
+        self.simulator = Simulator(loaded_world(recipe, scene), recipe.instrument, views=recipe.views)
+
+    def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[Pings]]:
+        """Levels of frames ``first``, ``first + 1`` ... of the scene, in batches, a part for each view."""
+        return self.simulator.render_views(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)
+
+    def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, NDArray[Any]]:
+        """What is stored of frames of the scene: kind and view -> values ``(frames, ...)``; see ``array_names``.
+
+        Args:
+            poses: of the sonar ``(frames, 6)``.
+            first: number of the first in the scene.
+            gain: of the data set.
+        """
+        values = self._empty(len(poses))
+        for looks in self.render_views(poses, first, labels=bool(self.recipe.labels)):
+            start = looks[0].first - (self.scene.number * FRAMES_A_SCENE + first)
+            self._fill({name: array[start : start + len(looks[0])] for name, array in values.items()}, looks, gain)
+        return values
+
+    def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
+        """Frames where the plan has them; see :class:`~mitsonar.datasets.renderers.Renderer`."""
+        return self.frames(planned["pose"], first, float(about["gain"]))
+
+    def _empty(self, frames: int) -> dict[str, NDArray[Any]]:
+        """Arrays to fill; counts begin at 0."""
+        stored = ImageModality(self.recipe).stored
+        return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
+
+    def _fill(self, values: dict[str, NDArray[Any]], looks: list[Pings], gain: float) -> None:
+        """What is stored of one batch."""
+        values["height_m"][:] = looks[0].height_m
+        for view, pings in zip(self.simulator.views, looks, strict=True):
+            suffix = self.recipe.suffix(view.name)
+            outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
+            np.maximum(values["dropped"], outside, out=values["dropped"])  # portions overlap
+            for number, levels in enumerate(pings.levels):  # one by one: a frame fits the cache, a batch does not
+                image = np.minimum(levels * np.float32(gain), np.float32(1))
+                values["saturated"][number] += np.count_nonzero(image >= 1)
+                if f"image{suffix}" in values:
+                    values[f"image{suffix}"][number] = to_uint8(image) if self.recipe.pixel == "uint8" else image
+                if f"vector{suffix}" in values:
+                    values[f"vector{suffix}"][number] = image.sum(axis=1, dtype=np.float64)
+                    values[f"nonzero{suffix}"][number] = np.count_nonzero(image, axis=1)
+            for label in self.recipe.labels:
+                values[f"{label}{suffix}"][:] = pings.labels[label]
+
+
+def loaded_world(recipe: Recipe, scene: Scene) -> Any:
+    """A scene's world, built in a folder that is gone again once it is loaded."""
+    with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
+        path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
+        return load_scene(path, **parameters)
+
+
+def calibrate(recipe: Recipe) -> float:
+    """The gain of a data set: the 99.9th percentile of all pixels of the first 20 frames of its first scene becomes 0.9.
+
+    The frames are those of the recipe, however few of them are made. A recipe may also say the gain: that of another data
+    set, since a sonar has one.
+
+    Raises:
+        MitsonarError: these frames are empty.
+    """
+    if recipe.gain is not None:
+        return recipe.gain
+    scene = scenes_of(recipe, recipe.sequences)[0]
+    poses = []
+    for sequence in sequences_of(recipe, scene):
+        poses.append(mounted(sequence.vehicle, recipe.mount.pose))
+        if sum(map(len, poses)) >= CALIBRATION_FRAMES:
+            break
+    table = np.concatenate(poses)[:CALIBRATION_FRAMES]
+    renderer = SceneRenderer(recipe, scene)
+    batches = list(renderer.render_views(table, 0))
+    del renderer
+    release_memory()
+    if not any(pings.levels.any() for looks in batches for pings in looks):
+        raise MitsonarError(
+            "the first frames are empty: no ray met anything within the window; check height_m, mount, range_min and "
+            "range_max"
+        )
+    return constant_gain([_joined(batches)])[0]
+
+
+def _joined(batches: list[list[Pings]]) -> Pings:
+    """All views of all frames, as if they were frames of one column: the gain is one constant for all."""
+    first = batches[0][0]
+    frames = []
+    for looks in batches:
+        frames += [np.concatenate([pings.levels[k].ravel() for pings in looks]) for k in range(len(looks[0]))]
+    return Pings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)

@@ -1,0 +1,66 @@
+"""Which frames are for training, validation and test: sequences, whole worlds, or samples, dealt out at random."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.datasets.plan import Scene
+from mitsonar.errors import MitsonarError
+
+__all__ = ["PARTS", "deal", "world_of"]
+
+PARTS = ("train", "validation", "test")
+
+
+def world_of(recipe: Recipe, scenes: dict[int, Scene]) -> NDArray[np.int64]:
+    """The first scene with the same world, by number of the scene: some worlds do not depend on their seed."""
+    known: dict[Any, int] = {}
+    worlds = np.zeros(max(scenes) + 1, dtype=np.int64)
+    for number, scene in sorted(scenes.items()):
+        family = recipe.family(scene.group)
+        world = (type(family), family.model_dump_json(), scene.seed if family.seeded else 0)
+        worlds[number] = known.setdefault(world, number)
+    return worlds
+
+
+def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+    """Which frames ``(frames,)`` belong to a part; sequences, or worlds with all that is in them, are dealt out at random.
+
+    Raises:
+        MitsonarError: unknown part, a part that the split has not, fewer worlds or sequences than parts.
+    """
+    if part == "all":
+        return np.ones(len(world), dtype=bool)
+    if part not in PARTS:
+        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}")
+    shares = np.array([getattr(split, name) for name in PARTS])
+    if shares[PARTS.index(part)] == 0:
+        raise MitsonarError(f"the split by {split.by} has no {part} part: {_said(split)}; give another split")
+    owner = world if split.by == "scene" else sequence
+    numbers = np.unique(owner)
+    counts = _counts(len(numbers), shares)
+    if (counts[shares > 0] == 0).any():
+        raise MitsonarError(
+            f"the data set has {len(numbers)} different {split.by}{'s' * (len(numbers) > 1)}, too few for {_said(split)}: "
+            "make more, give another split, or read part 'all'"
+        )
+    dealt = numbers[np.random.default_rng([split.seed, 6]).permutation(len(numbers))]
+    ends = np.cumsum(counts)
+    place = PARTS.index(part)
+    return np.isin(owner, dealt[ends[place] - counts[place] : ends[place]])
+
+
+def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:
+    """How many of ``total`` each part gets: by its share, at least one where it has any."""
+    counts = np.maximum(np.rint(shares * total).astype(np.int64), (shares > 0).astype(np.int64))
+    largest = int(shares.argmax())
+    counts[largest] = total - (counts.sum() - counts[largest])
+    return np.maximum(counts, 0)
+
+
+def _said(split: Split) -> str:
+    return ", ".join(f"{name} {getattr(split, name):.0%}" for name in PARTS)

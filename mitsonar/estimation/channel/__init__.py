@@ -1,0 +1,1 @@
+"""Estimators of motion from impulse responses, without training."""

@@ -1,0 +1,164 @@
+"""The estimator ``correlation``: the expert's, as correlation velocity logs and displaced-phase-centre navigation do it.
+
+An echo from the level ground at incidence theta comes earlier by 2 d sin(theta) / c once the vehicle has moved d towards it:
+taps of one receiver turn against each other by 4 pi d sin(theta) / lambda from ping to ping, the more the later they are.
+Coarse: of all motions the one after which the products of both pings' taps add up best, all receivers together; the slope
+over delay is what tells turns apart. Fine: the phases that remain in short windows along delay, by weighted least squares.
+Motions across a receiver's look count for nothing here, though they cost likeness.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from mitsonar.estimation.channel.channel_estimator import assumed_height, pings_of, reach_of
+from mitsonar.estimation.estimator import Estimate, rejected
+from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.motion.pose import Motion
+from mitsonar.records.impulse_responses import ImpulseResponses
+
+__all__ = ["Correlation"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+ACROSS = 41
+"""Angles across a beam that are averaged over."""
+
+STEP = 1 / 16
+"""Of the motions that are tried, in wavelengths."""
+
+WINDOW = 8
+"""Taps whose products are averaged."""
+
+MOST_WAVES = 50.0
+"""Motions between pings that are tried, either way."""
+
+LEAST = 4.0
+"""By which the best sum must exceed what pings with nothing in common sum up to, in its standard deviations."""
+
+CLOSE = 0.9
+"""A second motion that sums up to this part of the best leaves open which it is."""
+
+
+class Products(NamedTuple):
+    """What one receiver's neighbouring pings share.
+
+    Attributes:
+        product: of each tap of a ping with that of the next, conjugate, over all pairs ``(taps,)``.
+        energy: of both ``(taps,)``.
+        turn: radians a metre by which taps turn with a motion along the look ``(taps,)``.
+        look: its direction: to starboard, forward ``(2,)``.
+    """
+
+    product: Complex
+    energy: Array
+    turn: Array
+    look: Array
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Ping-to-ping correlation, coarse to fine; two degrees of freedom, the heading is taken to stay.
+
+    Args:
+        height_m: of the transmitter over the ground; default: what the responses say.
+        speed: the fastest that is looked for along an axis [m/s].
+    """
+
+    height_m: float | None = None
+    speed: float = 2.1
+
+    inputs = "height"
+
+    def estimate(self, responses: ImpulseResponses) -> Estimate:
+        """The motion, and whether to believe it."""
+        pings = pings_of(responses)
+        height = assumed_height(responses, "correlation", self.height_m)
+        received = [_products(responses.sonar, z, number, height) for number, z in enumerate(pings.response.swapaxes(0, 1))]
+        received = [one for one in received if one.energy.any()]
+        if not received:
+            return rejected("no receiver heard anything")
+        if np.linalg.matrix_rank(np.array([one.look for one in received]), tol=0.1) < 2:
+            deaf = f" (nothing heard: {', '.join(pings.silent)})" if pings.silent else ""
+            return rejected(f"receivers that hear look along one line{deaf}: motions across it do not show")
+        reach = reach_of(pings.interval_s, self.speed, responses.sonar.wavelength_m, MOST_WAVES)
+        coarse, reason = _coarse(received, reach, responses.sonar.wavelength_m * STEP)
+        motion = (len(responses) - 1) * _fine(received, coarse)
+        return Estimate(Motion(float(motion[0]), float(motion[1]), 0.0), None, not reason, reason)
+
+
+def _products(sonar: ChannelSonar, response: Complex, number: int, height_m: float) -> Products:
+    """Of one receiver's pings ``(pings, taps)``; taps before the first echo and outside its look count nothing."""
+    field = sonar.receivers[number].field
+    cosine = height_m / np.maximum(sonar.delay_s * sonar.sound_speed / 2, height_m)
+    sine = _along(field, cosine)
+    widest = math.radians(field.tilt_deg + field.along_deg / 2) if field.shape == "rectangular" else math.pi / 2
+    inside = (cosine < 1) & (cosine > math.cos(min(widest, math.pi / 2)))
+    product = np.where(inside, (response[:-1] * response[1:].conj()).sum(axis=0), 0)
+    energy = np.where(inside, np.sqrt((np.abs(response[:-1]) ** 2).sum(axis=0) * (np.abs(response[1:]) ** 2).sum(axis=0)), 0)
+    heading = math.radians(field.heading_deg)
+    return Products(product, energy, 4 * np.pi / sonar.wavelength_m * sine, np.array([math.sin(heading), math.cos(heading)]))
+
+
+def _along(field: FieldOfView, cosine: Array) -> Array:
+    """How far along its look a receiver's echoes come from, of a unit way ``(taps,)``: the sine of their incidence less what
+    the beam's width takes, mean by energy.
+
+    At a slant range R and an angle psi aside, sin^2 psi + along^2 + (height / R)^2 = 1.
+    """
+    aside = np.linspace(-0.5, 0.5, ACROSS) * math.radians(min(field.across_deg, 90.0))
+    energy = field.sensitivity(np.cos(aside), np.sin(aside), 0 * aside) ** 2 if field.shape != "all" else np.ones(ACROSS)
+    along = np.sqrt(np.maximum(np.cos(aside)[:, None] ** 2 - cosine**2, 0))
+    return np.asarray((energy[:, None] * along).sum(axis=0) / energy.sum())
+
+
+def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array, str]:
+    """The motion whose turned products add up best ``(2,)`` [m], and what speaks against it."""
+    line = np.linspace(-reach, reach, 2 * math.ceil(reach / step) + 1)
+    sideways, forward = np.meshgrid(line, line, indexing="ij")
+    total, spread = np.zeros(sideways.shape), 0.0
+    far = np.linspace(-1.5 * reach, 1.5 * reach, 6 * math.ceil(reach / step) + 1)
+    for one in received:
+        weight = one.product / max(float(one.energy.sum()), 1e-300)
+        sums = (np.exp(1j * far[:, None] * one.turn) @ weight).real
+        total += np.interp(one.look[0] * sideways + one.look[1] * forward, far, sums)
+        spread += float((np.abs(weight) ** 2).sum()) / 2
+    peaks = np.argwhere((total == maximum_filter(total, size=5)) & (total > 0))
+    if not len(peaks):
+        return np.zeros(2), "the pings have nothing in common"
+    peaks = peaks[np.argsort(-total[tuple(peaks.T)])]
+    best = total[tuple(peaks[0])]
+    reason = "" if best > LEAST * math.sqrt(spread) else "the pings have nothing in common"
+    if not reason and len(peaks) > 1 and total[tuple(peaks[1])] > CLOSE * best:
+        reason = "two motions fit alike"
+    return line[peaks[0]], reason
+
+
+def _fine(received: list[Products], motion: Array) -> Array:
+    """The motion ``(2,)`` from the phases that remain after a coarse one."""
+    for _ in range(3):
+        information, pull = np.zeros((2, 2)), np.zeros(2)
+        for one in received:
+            product = _windows(one.product * np.exp(1j * (one.look @ motion) * one.turn))
+            energy = _windows(one.energy)
+            turn = _windows(one.turn * one.energy) / np.maximum(energy, 1e-300)
+            likeness = np.minimum(np.abs(product) / np.maximum(energy, 1e-300), 0.999)
+            # variance of the phase of the mean of n products (Rodriguez and Martin, 1992)
+            weight = np.where(energy > 0, 2 * WINDOW * likeness**2 / (1 - likeness**2), 0)
+            information += (weight * turn**2).sum() * np.outer(one.look, one.look)
+            pull += (weight * turn * -np.angle(product)).sum() * one.look
+        motion = motion + np.linalg.lstsq(information, pull, rcond=None)[0]
+    return motion
+
+
+def _windows(taps: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    """Sums over neighbouring taps."""
+    whole = len(taps) // WINDOW * WINDOW
+    return np.asarray(taps[:whole].reshape(-1, WINDOW).sum(axis=1))

@@ -1,0 +1,294 @@
+"""The law of impulse responses over a level ground of unknown scatterers: their covariance, for any motion between pings.
+
+Scatterers that nothing is known of, one independent of the next, make the taps of all pings together a complex Gaussian
+vector of mean 0. All it tells of the motion is its covariance, an integral over the ground P of what both pings make of a
+scatterer there (Almanza-Medina, eq. 5.15, for both):
+
+    E[h_i(t) h_j(s)*] = S int a_i a_j exp(-j 2 pi f_c (D_i - D_j)) p(t - D_i) p(s - D_j) dP
+
+with delays D that count the receiver's own way while sound travels (5.14, its exact root), amplitudes a by spreading,
+cosines and fields of view, and the pulse p. The ground is the same everywhere: only how one ping lies to the other matters.
+Poses are therefore counted from the middle between both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar, Hydrophone
+from mitsonar.simulation.propagation_delay import delay_exact
+
+__all__ = ["LinkResponse", "ResponseCovariance", "block_toeplitz", "link_response"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+TAILS = 1.0
+"""Taps before the first echo that count, in pulses 1 / F_d long."""
+
+FAINTEST = 1e-4
+"""Power of the last taps that count, as a part of the largest."""
+
+QUIET = 24.0
+"""Length of silence after which a response may repeat, in pulses: their tails are then below 1e-5."""
+
+NODES = 4.0
+"""Points of the ground for each period of what is integrated."""
+
+PANEL = 12
+"""Points of a panel of Gauss-Legendre along the look."""
+
+MARGIN_M = 0.25
+"""By which the ground reaches beyond what a receiver in the middle hears: it moves, and does not sit in the middle."""
+
+MOST_POINTS = 400_000
+
+STEP = 1e-4
+"""Of the differences that slopes are [m, rad]."""
+
+PRECISION = 1e-7
+"""Of the non-uniform Fourier transform."""
+
+
+class LinkResponse(NamedTuple):
+    """What a ping makes of each point of the ground.
+
+    Attributes:
+        delay: from the transmitter by the point to the receiver ``(points,)`` [s].
+        amplitude: of an echo whose strength is 1 ``(points,)``.
+    """
+
+    delay: Array
+    amplitude: Array
+
+
+def link_response(
+    sonar: ChannelSonar, receiver: Hydrophone, height_m: float, points: Array, pose: ArrayLike, velocity: ArrayLike
+) -> LinkResponse:
+    """What a ping makes of points of the level ground.
+
+    Args:
+        sonar: the instrument; its transmitter's field of view counts too.
+        receiver: one of its receivers.
+        height_m: of the transmitter over the ground.
+        points: x, y ``(n, 2)`` [m].
+        pose: x, y [m] and heading [rad] of the level vehicle when the ping was sent.
+        velocity: over ground along x and y [m/s].
+    """
+    x, y, heading = np.asarray(pose, dtype=float)
+    cos, sin = math.cos(heading), math.sin(heading)
+    to_starboard, forward, up = receiver.position
+    east, north = points[:, 0] - x, points[:, 1] - y
+    starboard, ahead = east * cos - north * sin, east * sin + north * cos
+    sent = np.stack([starboard, ahead, np.full_like(east, -height_m)])
+    received = sent - np.array([[to_starboard], [forward], [up]])
+    there, back = np.sqrt((sent**2).sum(axis=0)), np.sqrt((received**2).sum(axis=0))
+    speed = np.asarray(velocity, dtype=float)
+    own = np.array([speed[0] * cos - speed[1] * sin, speed[0] * sin + speed[1] * cos, 0.0])
+    delay = np.asarray(delay_exact(list(sent), list(received), list(own), sonar.sound_speed))
+    amplitude = _sensitivity(sonar, None, sent / there) * _sensitivity(sonar, receiver, received / back)
+    amplitude *= np.sqrt(height_m / there * (height_m + up) / back)
+    if sonar.spreads:
+        amplitude /= there * back
+    return LinkResponse(delay, amplitude)
+
+
+def _sensitivity(sonar: ChannelSonar, receiver: Hydrophone | None, direction: Array) -> Array:
+    """Of the transmitter, or of a receiver, to unit directions ``(3, n)`` in the vehicle's axes."""
+    field = sonar.transmitter if receiver is None else sonar.field_of_view[receiver.name]
+    return np.asarray(field.sensitivity(*(field.axes @ direction)), dtype=float)
+
+
+class Nodes(NamedTuple):
+    """Points of the ground ``(n, 2)`` [m] with the area that each stands for ``(n,)`` [m2]."""
+
+    points: Array
+    area: Array
+
+
+@dataclass(frozen=True)
+class ResponseCovariance:
+    """Covariances of one receiver's responses.
+
+    Args:
+        sonar: the instrument.
+        receiver: one of its receivers.
+        height_m: of the transmitter over the ground.
+        interval_s: from ping to ping, in which the vehicle makes the motion.
+        reach_m: the longest motion to be asked for, which the points of the ground must be dense enough for.
+    """
+
+    sonar: ChannelSonar
+    receiver: Hydrophone
+    height_m: float
+    interval_s: float
+    reach_m: float = 0.12
+
+    @cached_property
+    def nodes(self) -> Nodes:
+        """Points for the integral over the ground, about the middle between the pings."""
+        along, across = _extent(self.sonar, self.receiver, self.height_m)
+        steep = np.abs(along).max() + MARGIN_M
+        sine = steep / math.hypot(steep, self.height_m)
+        band = (1 + self.sonar.rolloff) * self.sonar.bandwidth_hz
+        moves = 2 * self.reach_m / (self.sonar.wavelength_m * self.height_m)
+        panels = math.ceil((along[-1] - along[0]) * (band * 2 * sine / self.sonar.sound_speed + moves) * NODES / PANEL)
+        u, du = _panels(along[0], along[-1], panels, PANEL)
+        low, high = (np.interp(u, along, edge) for edge in across)
+        wide = (high - low).max()
+        cycles = wide * (band * wide / (self.sonar.sound_speed * self.height_m) + moves)
+        count = math.ceil(8 + NODES * cycles)
+        if len(u) * count > MOST_POINTS:
+            raise MitsonarError(
+                f"receiver {self.receiver.name} sees more ground than its law can be computed for: {len(u)} x {count} "
+                f"points; give it a field of view narrower than {wide:.0f} m on the ground"
+            )
+        w, dw = np.polynomial.legendre.leggauss(count)
+        side = (low + high)[:, None] / 2 + (high - low)[:, None] / 2 * w
+        area = du[:, None] * (high - low)[:, None] / 2 * dw
+        turn = math.radians(self.receiver.field.heading_deg)
+        u = np.broadcast_to(u[:, None], side.shape)
+        x, y = u * math.sin(turn) + side * math.cos(turn), u * math.cos(turn) - side * math.sin(turn)
+        points = np.stack([x.ravel(), y.ravel()], axis=1)
+        received = np.zeros(len(points), dtype=bool)
+        for place in self.reach_m / 2 * np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]):
+            received |= link_response(self.sonar, self.receiver, self.height_m, points, (*place, 0), (0, 0)).amplitude > 0
+        return Nodes(points[received], area.ravel()[received])
+
+    @cached_property
+    def taps(self) -> slice:
+        """Taps that hold echoes."""
+        look = link_response(self.sonar, self.receiver, self.height_m, self.nodes.points, (0, 0, 0), (0, 0))
+        tap = np.rint(look.delay * self.sonar.sampling_hz).astype(int)
+        power = np.bincount(tap, look.amplitude**2 * self.nodes.area)
+        loud = np.flatnonzero(power > FAINTEST * power.max())
+        tail = math.ceil(TAILS / self.sonar.bandwidth_hz * self.sonar.sampling_hz)
+        return slice(max(0, int(loud[0]) - tail), min(self.sonar.taps, int(loud[-1]) + 1))
+
+    @cached_property
+    def synthesis(self) -> tuple[float, float, Complex]:
+        """Middle of the delays and period [s] of the frequencies, and what makes taps of them ``(taps, frequencies)``."""
+        delay = self.sonar.delay_s[self.taps]
+        middle = (delay[0] + delay[-1]) / 2
+        period = delay[-1] - delay[0] + QUIET / self.sonar.bandwidth_hz
+        count = 2 * math.ceil((1 + self.sonar.rolloff) * self.sonar.bandwidth_hz / 2 * period) + 2
+        frequency = np.arange(-count // 2, count - count // 2) / period
+        level = self.sonar.raised_cosine(frequency) / (self.sonar.sampling_hz * period)
+        return middle, period, np.exp(2j * np.pi * np.outer(delay - middle, frequency)) * level
+
+    def link_responses(self, motion: ArrayLike, lag: float = 1.0) -> tuple[LinkResponse, LinkResponse]:
+        """What both pings make of the ground, ``lag`` intervals apart.
+
+        Args:
+            motion: sideways, forward [m], yaw [rad] in one interval (eq. 3.4), and by how much the vehicle rises [m].
+            lag: intervals between the pings.
+        """
+        sideways, forward, yaw, heave = _four(motion)
+        # eq. 3.4 counts along the new heading, which lies half the turn from that in the middle
+        cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
+        way = np.array([sideways * cos + forward * sin, forward * cos - sideways * sin])
+        found = []
+        for half in (-lag / 2, lag / 2):
+            pose, height = (*(half * way), half * yaw), self.height_m + half * heave
+            velocity = _clockwise(way, half * yaw) / self.interval_s  # along the arc, whose chord the way is
+            found.append(link_response(self.sonar, self.receiver, height, self.nodes.points, pose, velocity))
+        return found[0], found[1]
+
+    def covariance(self, motion: ArrayLike, lag: float = 1.0) -> Complex:
+        """E[h_i h_j*] of the earlier ping's taps i and the later one's j ``(taps, taps)``, for scatterers of strength 1 a
+        square metre. ``lag`` 0: of a ping with itself."""
+        first, second = self.link_responses(motion, lag)
+        weight = self.nodes.area * first.amplitude * second.amplitude
+        return self._taps_of(self._spectra(first, second, weight[None]))[0]
+
+    def slopes(self, motion: ArrayLike, lag: float, free: Sequence[int]) -> Complex:
+        """:meth:`covariance`, and how it changes with some of the motion's four numbers ``(1 + free, taps, taps)``.
+
+        Carrier phase and amplitude change, and the pulses stay where they are: they tell the less the narrower the band.
+        """
+        first, second = self.link_responses(motion, lag)
+        weight = first.amplitude * second.amplitude
+        weights = [weight.astype(complex)]
+        for number in free:
+            step = np.zeros(4)
+            step[number] = STEP
+            (low_i, low_j), (high_i, high_j) = (self.link_responses(_four(motion) + sign * step, lag) for sign in (-1, 1))
+            amplitude = high_i.amplitude * high_j.amplitude - low_i.amplitude * low_j.amplitude
+            way = (high_i.delay - high_j.delay) - (low_i.delay - low_j.delay)
+            weights.append((amplitude - 2j * np.pi * self.sonar.carrier_hz * weight * way) / (2 * STEP))
+        return self._taps_of(self._spectra(first, second, self.nodes.area * np.array(weights)))
+
+    def _spectra(self, first: LinkResponse, second: LinkResponse, weight: NDArray[Any]) -> Complex:
+        """Integrals over the ground at the frequencies of both pings ``(n, frequencies, frequencies)``, of n weights."""
+        import finufft
+
+        middle, period, made = self.synthesis
+        x = 2 * np.pi / period * (first.delay - middle)
+        y = -2 * np.pi / period * (second.delay - middle)
+        turned = weight * np.exp(-2j * np.pi * self.sonar.carrier_hz * (first.delay - second.delay))
+        count = made.shape[1]
+        found = finufft.nufft2d1(x, y, turned, (count, count), eps=PRECISION, isign=-1, nthreads=1)
+        return np.asarray(found).reshape(len(weight), count, count)
+
+    def _taps_of(self, spectra: Complex) -> Complex:
+        """Taps of both pings ``(n, taps, taps)`` of spectra ``(n, frequencies, frequencies)``."""
+        made = self.synthesis[2]
+        return np.asarray(made @ spectra @ made.conj().T)
+
+
+def _clockwise(way: Array, turn: float) -> Array:
+    """A level way, turned."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    return np.array([way[0] * cos + way[1] * sin, way[1] * cos - way[0] * sin])
+
+
+def _four(motion: ArrayLike) -> Array:
+    """Sideways, forward, yaw, rise of a motion that may be without the last."""
+    given = np.asarray(motion, dtype=float)
+    return np.append(given, 0.0) if len(given) == 3 else given
+
+
+def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, Array]:
+    """Nodes and weights of Gauss-Legendre in ``panels`` parts."""
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    edge = np.linspace(start, end, panels + 1)
+    half = np.diff(edge)[:, None] / 2
+    return (edge[:-1, None] + half * (1 + x)).ravel(), (half * weight).ravel()
+
+
+def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple[Array, tuple[Array, Array]]:
+    """The ground that a receiver hears: places along its look ``(n,)``, and there its edges across ``(n,)`` each [m]."""
+    far = math.sqrt(max(sonar.range_max**2 - height_m**2, 0.0))
+    step = height_m / 200
+    line = np.arange(-far - step, far + 2 * step, step)
+    turn = math.radians(receiver.field.heading_deg)
+    u, w = np.meshgrid(line, line, indexing="ij")
+    x, y = u * math.sin(turn) + w * math.cos(turn), u * math.cos(turn) - w * math.sin(turn)
+    look = link_response(sonar, receiver, height_m, np.stack([x.ravel(), y.ravel()], axis=1), (0, 0, 0), (0, 0))
+    received = (look.amplitude > 0).reshape(u.shape) & (np.hypot(u, w) <= far)
+    if not received.any():
+        raise MitsonarError(
+            f"receiver {receiver.name} hears no level ground {height_m:g} m below within {sonar.range_max:g} m: "
+            "tilt it down, or raise range_max"
+        )
+    rows = np.flatnonzero(received.any(axis=1))
+    low = np.array([line[np.flatnonzero(received[row])[0]] for row in rows]) - MARGIN_M - step
+    high = np.array([line[np.flatnonzero(received[row])[-1]] for row in rows]) + MARGIN_M + step
+    along = line[rows]
+    ends = np.r_[along[0] - MARGIN_M - step, along, along[-1] + MARGIN_M + step]
+    return ends, (np.r_[low[0], low, low[-1]], np.r_[high[0], high, high[-1]])
+
+
+def block_toeplitz(blocks: Sequence[Complex]) -> Complex:
+    """The covariance of pings from those by lag, the earlier ping first."""
+    count = range(len(blocks))
+    whole = np.block([[blocks[j - i] if j >= i else blocks[i - j].conj().T for j in count] for i in count])
+    return np.asarray((whole + whole.conj().T) / 2)

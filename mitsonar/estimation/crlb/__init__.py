@@ -1,0 +1,1 @@
+"""The Cramer-Rao lower bound of motion."""

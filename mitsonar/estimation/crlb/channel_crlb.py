@@ -1,0 +1,108 @@
+"""The limit of motion from impulse responses of an unknown ground: the Cramer-Rao bound of its law.
+
+Pings of a ground of which nothing is known are Gaussian with the covariance R of
+:mod:`mitsonar.estimation.channel.response_covariance`. The
+Fisher information of the motion is tr(R^-1 R_a R^-1 R_b), added over receivers, whose fields of view hardly overlap. No
+unbiased estimator errs less. It is a *local* limit: it does not know that another motion may fit as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.channel.motion_search import ReceiverBand, receiver_bands_of
+from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz
+from mitsonar.estimation.channel.sub_bands import bands_of
+from mitsonar.instruments.channel_sonar import ChannelSonar
+
+__all__ = ["NOISELESS_DB", "channel_crlb", "impulse_information"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+NOISELESS_DB = 60.0
+"""What "without noise" counts as: below lies the error of the integral over the ground."""
+
+STEP = 2e-4
+"""Of the differences over the whole motion [m, rad]."""
+
+UNKNOWN = 1e-9
+"""Axes whose information is so small a part of the other axes' cannot be observed."""
+
+
+def channel_crlb(
+    sonar: ChannelSonar,
+    height_m: float,
+    motion: ArrayLike,
+    *,
+    pings: int = 2,
+    span_s: float = 0.05,
+    snr_db: float = NOISELESS_DB,
+    free: Sequence[int] = (0, 1),
+) -> Array:
+    """Least standard deviations of the free ones of sideways, forward [m], yaw [rad], rise [m] from first to last ping.
+
+    Args:
+        sonar: the instrument.
+        height_m: of the transmitter over the ground.
+        motion: sideways, forward, yaw (and rise) from the first to the last ping.
+        pings: how many, at equal times.
+        span_s: from the first to the last [s].
+        snr_db: mean power of the taps that hold echoes over the variance of a tap's noise.
+        free: which of the four are not known.
+    """
+    found = impulse_information(sonar, height_m, motion, pings=pings, span_s=span_s, snr_db=snr_db, free=free)
+    scale = 1 / np.sqrt(np.maximum(np.diag(found), 1e-300))
+    size, axes = np.linalg.eigh(found * np.outer(scale, scale))
+    lost = (axes[:, size < UNKNOWN] ** 2).sum(axis=1) > 1e-3
+    variance = ((axes[:, size >= UNKNOWN] ** 2) / size[size >= UNKNOWN]).sum(axis=1) * scale**2
+    return np.asarray(np.where(lost, np.inf, np.sqrt(variance)))
+
+
+def impulse_information(
+    sonar: ChannelSonar,
+    height_m: float,
+    motion: ArrayLike,
+    *,
+    pings: int = 2,
+    span_s: float = 0.05,
+    snr_db: float = NOISELESS_DB,
+    free: Sequence[int] = (0, 1),
+) -> Array:
+    """Fisher information of the free ones of the motion's four numbers ``(k, k)``; arguments of :func:`channel_crlb`.
+
+    Raises:
+        MitsonarError: fewer than two pings.
+    """
+    if pings < 2:
+        raise MitsonarError(f"a motion shows in two pings or more: got {pings}")
+    given = np.zeros(4)
+    given[: len(np.atleast_1d(motion))] = motion
+    reach = 1.2 * max(float(np.abs(given[:2]).max()) / (pings - 1), 0.1 * sonar.wavelength_m)
+    total = np.zeros((len(free), len(free)))
+    for band in bands_of(sonar):
+        for receiver_band in receiver_bands_of(band.sonar, height_m, span_s / (pings - 1), reach):
+            total += _told(receiver_band, given, pings, 10 ** (-snr_db / 10), free)
+    return total
+
+
+def _told(receiver_band: ReceiverBand, motion: Array, pings: int, noise: float, free: Sequence[int]) -> Array:
+    """By one receiver."""
+    whole = _covariance(receiver_band.law, receiver_band.turn @ motion, pings)
+    power = float(np.diag(whole).real.mean())
+    inverse = np.linalg.inv(whole + noise * power * np.eye(len(whole)))
+    turned = []
+    for number in free:
+        step = receiver_band.turn[:, number] * STEP
+        high, low = (_covariance(receiver_band.law, receiver_band.turn @ motion + sign * step, pings) for sign in (1, -1))
+        turned.append(inverse @ (high - low) / (2 * STEP))
+    return np.array([[float(np.sum(one * two.T).real) for two in turned] for one in turned])
+
+
+def _covariance(law: ResponseCovariance, motion: Array, pings: int) -> Complex:
+    """Of all pings' taps, for a motion over all of them."""
+    return block_toeplitz([law.covariance(motion / (pings - 1), lag) for lag in range(pings)])

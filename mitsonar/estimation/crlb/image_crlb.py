@@ -1,0 +1,377 @@
+"""The physical limit of motion estimation: the Cramer-Rao bound of a known scene, sonar and noise.
+
+No unbiased estimator of the motion (sideways, forward, yaw) has a covariance below the inverse of the Fisher information
+F = J' W J: J how pixels change with the motion, W what a noisy pixel tells of itself (:mod:`mitsonar.acoustics.noise`). The
+bound is
+that of an oracle: who owns the renderer, and knows the scene, its height and what the sonar would see without noise.
+
+*One frame* is registered with that oracle: covariance 1 / F. *Two frames*, both noisy, of a known relief: twice that. It is
+optimistic, since a real estimator has to find the relief and the reflectivity of every cell in the same two frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.views import Segment
+from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, differentiate, jittered
+from mitsonar.simulation.imaging import Simulator
+
+__all__ = [
+    *("ALL", "KINDS", "LAWS", "VARIABLES", "Bound", "bound", "cramer_rao_bound", "bounds_at", "bounds_of_views"),
+    *("fisher", "floor_ranges", "overall", "together", "varied"),
+]
+
+KINDS: dict[str, str] = {"image": "all pixels", "vector": "sums over the beams"}
+LAWS: dict[str, str] = {
+    "pixel": "the exact law of the noisy pixel: clipped, rounded to grey values",
+    "gaussian": "a Gaussian of the same mean and variance: the limit of least squares",
+    "rays": "the same, with the noise of the rays of a single ping as further variance",
+}
+
+ALL = "all views"
+
+VARIABLES = {
+    "height_m": "of the sonar over the ground",
+    "pitch_deg": "of the sonar",
+    "azimuth_fov_deg": "beams stay as many, and as wide as their spacing",
+    "elevation_fov_deg": "rays over it stay as many",
+    "beams": "the field of view stays, beams are as wide as their spacing",
+    "range_bins": "the window stays",
+    "window": "both ends [m], 3.2..5.6; bins stay as many",
+}
+"""Numbers that a bound may be asked for many values of, and what stays the same."""
+
+MOVING = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
+"""Those that move the floor out of the window."""
+
+SURE = 3.0
+"""A direction is observable in which the information exceeds so many of its standard errors."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Fisher information of the motion in one frame.
+
+    Attributes:
+        information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
+        doubt: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
+    """
+
+    information: NDArray[np.float64]
+    reason: NDArray[np.float64]
+
+    def __add__(self, other: Bound) -> Bound:
+        """Of two independent images."""
+        return Bound(self.information + other.information, self.reason + other.reason)
+
+    def covariance(self, frames: int = 1) -> NDArray[np.float64]:
+        """The least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
+
+        The pseudo-inverse where not all can be observed: the variance of an axis with a part in what cannot be is inf.
+        """
+        if frames not in (1, 2):
+            raise MitsonarError(f"a bound is that of 1 or 2 noisy frames: got {frames}")
+        diagonal = np.diag(self.information)
+        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
+        size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
+        known = size > np.maximum(SURE * self._error(axes * scale[:, None]), 1e-9)
+        inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
+        lost = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
+        inverse[lost, :] = inverse[:, lost] = 0
+        inverse[lost, lost] = np.inf
+        return np.asarray(frames * inverse)
+
+    def std(self, frames: int = 1) -> NDArray[np.float64]:
+        """The least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
+        return np.asarray(np.sqrt(np.diag(self.covariance(frames))))
+
+    @property
+    def relative_error(self) -> NDArray[np.float64]:
+        """Standard error of :meth:`std` as a part of it ``(3,)``; nan where an axis cannot be observed."""
+        covariance = self.covariance()
+        variance = np.diag(covariance)
+        finite = np.where(np.isfinite(covariance), covariance, 0)
+        return np.asarray(np.where(np.isfinite(variance), self._error(finite) / (2 * variance), np.nan))
+
+    def _error(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard error of v' F v for each column v ``(3, n)``."""
+        v = directions
+        variance: NDArray[np.float64] = np.einsum("ijkl,in,jn,kn,ln->n", self.reason, v, v, v, v)
+        return np.sqrt(np.maximum(variance, 0))
+
+
+class InformationTerms(NamedTuple):
+    """What values that change with the motion tell.
+
+    Attributes:
+        information: of each ``(n, ...)``.
+        jacobian: two estimates of what they depend on ``(2, n, 2, 3)``.
+        rays: variance of each by the rays of a ping, beyond what its law holds ``(n,)``.
+    """
+
+    information: Information
+    jacobian: NDArray[np.float64]
+    rays: NDArray[np.float64]
+
+    def bound(self, law: str) -> Bound | None:
+        """By one of :data:`LAWS`."""
+        if law == "pixel":
+            weight = self.information.law
+        else:
+            more = self.rays if law == "rays" else np.zeros_like(self.rays)
+            weight = self.information.matched(more) if (self.information.variance + more > 0).all() else None
+        return None if weight is None else fisher(self.jacobian, weight)
+
+
+def bound(
+    derivative: Derivative, noise: NoiseModel, *, kind: str = "image", law: str = "pixel", greys: int = 255
+) -> Bound | None:
+    """The bound of one view.
+
+    Without noise nothing but rounding stands between a pixel and its level. The exact law then tells the motion without
+    limit, and the answer is None; ``gaussian`` counts rounding as a variance of 1 / (12 255^2), as for pixels that noise of
+    their own dithers; ``rays`` adds the noise of the rays, from which no single ping is free. Vectors are not rounded, and
+    have no ``gaussian`` bound without noise either.
+
+    Args:
+        derivative: of the view at a pose.
+        noise: of its pixels.
+        kind: of :data:`KINDS`.
+        law: of :data:`LAWS`.
+        greys: the largest grey value that pixels are stored with.
+
+    Raises:
+        MitsonarError: unknown words.
+    """
+    _check(kind, law)
+    return _terms(derivative, noise, kind, greys).bound(law)
+
+
+def _check(kind: str, law: str) -> None:
+    for what, word, known in (("kind", kind, KINDS), ("law", law, LAWS)):
+        if word not in known:
+            raise MitsonarError(f"unknown {what} {word!r}: {nearest_names(word, known)}")
+
+
+def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 255) -> InformationTerms:
+    return _by_pixels(derivative, noise, greys) if kind == "image" else _by_sums(derivative, noise)
+
+
+def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> InformationTerms:
+    """What pixels tell."""
+    changing = derivative.jacobian.any(axis=(0, 3, 4))
+    level, filled = derivative.level[changing], derivative.filled[changing]
+    told = information(noise, level, filled, greys=greys)
+    switching = level**2 * (1 / filled - 1)  # of echoes that are there or not: the law holds it
+    rays = np.maximum(derivative.variance[changing] - switching, 0.0) * told.slope[:, 0] ** 2
+    return InformationTerms(told, derivative.jacobian[:, changing].astype(float), rays)
+
+
+def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
+    """What sums over the beams tell."""
+    jacobian = derivative.jacobian.sum(axis=2, dtype=float)
+    changing = jacobian.any(axis=(0, 2, 3))
+    level, filled = derivative.level[changing], derivative.filled[changing]
+    told = information_of_sums(noise, filled.sum(axis=1), filled.shape[1])
+    by_filled = told.slope[:, 1:]
+    # no ray falls into two beams: variances of a row's pixels add up
+    rays = derivative.variance[changing] + (2 * by_filled * level + by_filled**2 * filled) * (1 - filled)
+    return InformationTerms(told, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
+
+
+def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
+    """J1' W J2, made symmetric, and its doubt.
+
+    Args:
+        jacobian: two independent estimates of how k numbers of n independent values change with the motion ``(2, n, k, 3)``.
+        weight: information of each value about its numbers ``(n, k, k)``.
+
+    With M the mean and D half the difference of both it is M' W M - D' W D, and the noise of M is as large as D.
+    """
+    mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
+    weighted = weight @ half
+    own = mean.transpose(0, 2, 1) @ weight @ mean
+    noise = half.transpose(0, 2, 1) @ weighted
+    mixed = mean.transpose(0, 2, 1) @ weighted
+    parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, 9)
+    return Bound((own - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
+
+
+def bounds_of_views(
+    names: Sequence[str], views: Sequence[Derivative], noise: NoiseModel, *, apart: bool = True
+) -> dict[tuple[str, str, str], Bound | None]:
+    """All bounds at one pose: (portion, kind, law) -> bound; of several views their sum too, as ``all views``.
+
+    Args:
+        names: of the views.
+        views: their derivatives.
+        noise: of their pixels.
+        apart: whether no two views hear the same rays; those that do have no sum.
+    """
+    found: dict[tuple[str, str, str], Bound | None] = {}
+    for kind in KINDS:
+        told = [_terms(view, noise, kind) for view in views]
+        for law in LAWS:
+            parts = [one.bound(law) for one in told]
+            if len(parts) > 1 and apart:
+                found[ALL, kind, law] = together(parts)
+            found |= {(name, kind, law): part for name, part in zip(names, parts, strict=True)}
+    return found
+
+
+def together(parts: Sequence[Bound | None]) -> Bound | None:
+    """The bound of several views, whose noise is independent; None where one alone tells everything."""
+    known = [part for part in parts if part is not None]
+    return sum(known[1:], known[0]) if len(known) == len(parts) else None
+
+
+def bounds_at(
+    simulator: Simulator, poses: ArrayLike, noise: NoiseModel, gain: float, *, pings: int | None = None
+) -> Iterator[dict[tuple[str, str, str], Bound | None]]:
+    """:func:`bounds_of_views` at each pose.
+
+    Args:
+        simulator: of the scene that the poses are in (of a data set: ``SceneRenderer(recipe, scene).simulator``).
+        poses: of the sonar ``(n, 6)``.
+        noise: of the pixels.
+        gain: that of the frames.
+        pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
+            an axis can be observed.
+    """
+    source, names = jittered(simulator), [view.name for view in simulator.views]
+    portions = [view.member for view in simulator.views if isinstance(view, Segment)]
+    apart = not portions or bool(np.sum(portions, axis=0).max() <= 1)
+    for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
+        for count in (PINGS, 4 * PINGS, 16 * PINGS) if pings is None else (pings,):
+            first = FIRST_PING + 32 * PINGS * number
+            views = next(differentiate(source, pose, gain, pings=count, first=first))
+            found = bounds_of_views(names, views, noise, apart=apart)
+            images = [one for (_, kind, _), one in found.items() if kind == "image" and one is not None]
+            if all(np.isfinite(one.std()).all() for one in images):
+                break
+        yield found
+
+
+def cramer_rao_bound(
+    simulator: Simulator,
+    poses: ArrayLike,
+    noise: NoiseModel,
+    gain: float,
+    *,
+    view: str | None = None,
+    kind: str = "image",
+    law: str = "pixel",
+    frames: int = 2,
+    pings: int | None = None,
+) -> NDArray[np.float64]:
+    """Least standard deviations at each pose ``(n, 3)`` [m, m, rad]; 0 where :func:`bound` is None, inf where an axis cannot
+    be observed.
+
+    Args:
+        simulator: as for :func:`bounds_at`, with its poses and gain.
+        poses: of the sonar ``(n, 6)``.
+        noise: of the pixels; without noise ask for the law ``rays``.
+        gain: that of the frames.
+        view: which one; default: the only one, or all together where no two hear the same rays.
+        kind: of :data:`KINDS`.
+        law: of :data:`LAWS`.
+        frames: noisy ones, 1 or 2.
+        pings: as for :func:`bounds_at`.
+
+    Raises:
+        MitsonarError: unknown words; several portions that overlap, and none named.
+    """
+    _check(kind, law)
+    portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
+    found = []
+    for one in bounds_at(simulator, poses, noise, gain, pings=pings):
+        if (portion, kind, law) not in one:
+            names = ", ".join(known.name for known in simulator.views)
+            raise MitsonarError(f"portions that overlap have no bound together: got view {view!r}; name one of {names}")
+        found.append(one[portion, kind, law])
+    return np.array([np.zeros(3) if one is None else one.std(frames) for one in found]).reshape(-1, 3)
+
+
+def overall(stds: Iterable[ArrayLike]) -> NDArray[np.float64]:
+    """One number an axis for many poses ``(3,)``: the root of the mean variance, which an RMSE is to be compared with."""
+    return np.asarray(np.sqrt(np.mean(np.square(np.array(list(stds), dtype=float)), axis=0)))
+
+
+# ---------------------------------------------------------------- what if
+
+
+def varied(
+    sonar: Sonar, poses: NDArray[np.float64], heights: NDArray[np.float64], name: str, value: float | tuple[float, float]
+) -> tuple[Sonar, NDArray[np.float64]]:
+    """Sonar and poses with one number of :data:`VARIABLES` changed.
+
+    The floor stays in the window: where height, pitch or a field of view change, both ends of the window move in the
+    proportion in which the nearest and the farthest range of the level floor in view do, and its bins become longer or
+    shorter with it. A window that is given itself stays as it is.
+
+    Args:
+        sonar: the instrument.
+        poses: of the sonar ``(n, 6)``.
+        heights: over the ground ``(n,)`` [m].
+        name: of the number.
+        value: in the unit that its name says; of ``window`` both ends [m].
+
+    Raises:
+        MitsonarError: unknown name, a value outside its limits, a sonar that looks past the floor to the horizon.
+    """
+    if name not in VARIABLES:
+        raise MitsonarError(f"unknown variable {name!r}: {nearest_names(name, VARIABLES)}")
+    if name == "window":
+        near, far = value  # type: ignore[misc]
+        return sonar.replace(range_min=near, range_max=far), poses
+    changed, number = poses.copy(), float(value)  # type: ignore[arg-type]
+    before = floor_ranges(sonar, float(heights.mean()), float(poses[:, 3].mean())) if name in MOVING else None
+    height, other = heights, sonar
+    if name == "height_m":
+        if not number > 0:
+            raise MitsonarError(f"height_m must be above 0: got {number:g}")
+        changed[:, 2] += number - heights
+        height = np.full_like(heights, number)
+    elif name == "pitch_deg":
+        changed[:, 3] = np.radians(number)
+    else:
+        whole = name in ("beams", "range_bins", "rays_per_beam")
+        if whole and number != round(number):
+            raise MitsonarError(f"{name} must be a whole number: got {number:g}")
+        width = {"beam_width_deg": None} if name in ("azimuth_fov_deg", "beams") else {}
+        other = sonar.replace(**{name: round(number) if whole else number}, **width)
+    if before is None:
+        return other, changed
+    after = floor_ranges(other, float(height.mean()), float(changed[:, 3].mean()))
+    near, far = (end * new / old for end, new, old in zip((sonar.range_min, sonar.range_max), after, before, strict=True))
+    return other.replace(range_min=near, range_max=far), changed
+
+
+def floor_ranges(sonar: Sonar, height_m: float, pitch_rad: float) -> tuple[float, float]:
+    """Nearest and farthest range of a level floor in the field of view [m].
+
+    Raises:
+        MitsonarError: part of it looks to the horizon.
+    """
+    half = sonar.bearing_rad[-1] + sonar.beam_width_rad / 2
+    elevation = np.radians(sonar.elevation_fov_deg) / 2
+    b, e = np.meshgrid(np.linspace(-half, half, 181), np.linspace(-elevation, elevation, 181))
+    turn = vehicle_rotation(Pose(0, 0, 0, pitch_rad, 0, 0))
+    down = -turn.apply(directions(sonar.bearing, b.ravel(), e.ravel()))[:, 2]
+    if down.min() < 1e-3:
+        raise MitsonarError(
+            f"at pitch {np.degrees(pitch_rad):.3g} deg the field of view of {sonar.elevation_fov_deg:g} deg reaches the "
+            "horizon, no window holds that floor: raise pitch_deg or lower elevation_fov_deg"
+        )
+    return height_m / float(down.max()), height_m / float(down.min())

@@ -1,0 +1,1 @@
+"""Estimators of motion from two sonar images, without training."""

@@ -1,0 +1,77 @@
+"""The estimator ``ecc``: OpenCV's enhanced correlation coefficient (Evangelidis and Psarakis, 2008) on the ground plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_rejection, rejected, two_frames
+from mitsonar.estimation.image.ground_view import GroundView
+from mitsonar.geometry.attitude import attitude_of
+from mitsonar.motion.pose import Motion
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["Ecc"]
+
+LEVELS = ((0.04, 9), (0.01, 5))
+"""Edge of a pixel [m] and size of OpenCV's Gaussian filter, coarse to fine."""
+
+SETTLED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-5)
+
+
+@dataclass(frozen=True)
+class Ecc:
+    """Rigid registration of the frames as seen from above.
+
+    Args:
+        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
+        pitch_rad: default: what the frames say.
+    """
+
+    height_m: float | None = None
+    pitch_rad: float | None = None
+
+    inputs = INPUTS
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        """The motion, and whether to believe it; zero motion where OpenCV finds none."""
+        images = two_frames(frames)
+        attitude = attitude_of(frames, "ecc", self.height_m, self.pitch_rad)
+        if attitude.reason or any(blank(image) for image in images):
+            return rejected(attitude.reason or "nothing in the frames to match")
+        motion = Motion(0.0, 0.0, 0.0)
+        for cell_m, size in LEVELS:
+            view = GroundView(frames, attitude, cell_m)
+            first, second = (view.draw(image) for image in images)
+            warp = view.warp(motion)
+            mask = (view.inside * np.uint8(255)).astype(np.uint8)
+            if min(first.shape) < 4 * size:
+                return rejected("the fan meets too little ground")
+            try:
+                words = (warp, cv2.MOTION_EUCLIDEAN, SETTLED, size)
+                warp = np.asarray(cv2.findTransformECCWithMask(first, second, mask, mask, *words)[1], dtype=np.float32)
+            except cv2.error:
+                return rejected("the correlation has no maximum nearby")
+            motion = view.motion(warp)
+        reason = self._rejection(first, second, warp, view.inside, size)
+        return Estimate(motion, None, not reason, reason)
+
+    @staticmethod
+    def _rejection(
+        first: NDArray[np.float32],
+        second: NDArray[np.float32],
+        warp: NDArray[np.float32],
+        inside: NDArray[np.bool_],
+        size: int,
+    ) -> str:
+        """Why not to believe the match, both smoothed as OpenCV did; empty where nothing speaks against it."""
+        smooth = [cv2.GaussianBlur(image, (size, size), 0) for image in (first, second)]
+        back = cv2.warpAffine(smooth[1], warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        seen = cv2.warpAffine(
+            inside.astype(np.float32), warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        edge = cv2.erode((inside & (seen > 0.99)).astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+        return matching_rejection(smooth[0], back, edge, alike=4 * np.pi * (0.3 * ((size - 1) / 2 - 1) + 0.8) ** 2)

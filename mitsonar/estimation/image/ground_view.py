@@ -1,0 +1,109 @@
+"""Frames as seen from above: projected to the level ground, for methods that register maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.geometry.attitude import Attitude
+from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.motion.pose import Motion
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["GroundView"]
+
+Floats = NDArray[np.float32]
+
+MOST_CELLS = 2**20
+"""Of a view: a window of many metres gets larger cells."""
+
+
+@dataclass(frozen=True)
+class GroundView:
+    """The part of the ground that a fan shows, as an image: row 0 farthest forward, column 0 most to port.
+
+    Args:
+        frames: whose cells are projected.
+        standing: height over what is seen, pitch, roll.
+        cell_m: edge of a pixel; larger where the view would have more than a million.
+    """
+
+    frames: SonarFrames
+    attitude: Attitude
+    cell_m: float
+
+    @cached_property
+    def _geometry(self) -> GroundGeometry:
+        f, s = self.frames, self.attitude
+        return GroundGeometry(f.range_m, f.bearing_rad, f.sonar.bearing, s.height_m, s.pitch_rad, s.roll_rad)
+
+    @cached_property
+    def edge(self) -> float:
+        """Edge of a pixel [m]."""
+        left, right, near, far = self.reach
+        return max(self.cell_m, float(np.sqrt((right - left) * (far - near) / MOST_CELLS)))
+
+    @cached_property
+    def reach(self) -> tuple[float, float, float, float]:
+        """Ground seen: starboard from, to, forward from, to [m]; all 0 where the fan meets no ground."""
+        points = self._geometry.points[::8, ::4]
+        points = np.concatenate([points.reshape(-1, 2), self._geometry.points[[0, -1]].reshape(-1, 2)])
+        points = points[np.isfinite(points).all(axis=1)]
+        if not len(points):
+            return 0.0, 0.0, 0.0, 0.0
+        (left, near), (right, far) = points.min(axis=0), points.max(axis=0)
+        return float(left), float(right), float(near), float(far)
+
+    @cached_property
+    def _places(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Row and column in the frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
+        left, right, near, far = self.reach
+        x = np.arange(left, right, self.edge) + self.edge / 2
+        y = np.arange(far, near, -self.edge) - self.edge / 2
+        points = np.stack(np.meshgrid(x, y), axis=-1)
+        radius, bearing = self._geometry.to_polar(points)
+        f = self.frames
+        row = np.interp(radius, f.range_m, np.arange(len(f.range_m)), left=-1, right=-1)
+        column = np.interp(bearing, f.bearing_rad, np.arange(len(f.bearing_rad)), left=-1, right=-1)
+        lit = np.abs(self._geometry.elevation(points)) <= np.radians(f.sonar.elevation_fov_deg) / 2
+        return row.astype(np.float32), column.astype(np.float32), (row >= 0) & (column >= 0) & lit
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Pixels within the fan that the sonar can light, were the ground level ``(rows, columns)``.
+
+        What lies around them is dark in every frame: an outline that moves with the sonar.
+        """
+        return self._places[2]
+
+    def draw(self, image: Floats) -> Floats:
+        """A frame's image ``(bins, beams)`` seen from above ``(rows, columns)``; 0 outside the fan."""
+        row, column, _ = self._places
+        if not row.size:
+            return np.zeros((0, 0), dtype=np.float32)
+        finer = self.edge / float(np.median(np.diff(self.frames.range_m)))
+        if finer > 1:  # bins are finer than pixels
+            border = cv2.BORDER_REPLICATE
+            image = np.asarray(
+                cv2.GaussianBlur(image, (1, 0), sigmaX=1e-3, sigmaY=0.4 * finer, borderType=border), np.float32
+            )
+        return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.float32)
+
+    def warp(self, motion: Motion) -> NDArray[np.float32]:
+        """Where a motion takes a pixel (column, row) of the first frame, as a matrix ``(2, 3)``."""
+        corner = np.array([self.reach[0], self.reach[3]]) + self.edge / 2 * np.array([1, -1])
+        pixels = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        there = moved(corner + pixels * [self.edge, -self.edge], motion)
+        there = (there - corner) / [self.edge, -self.edge]
+        return np.column_stack([there[1] - there[0], there[2] - there[0], there[0]]).astype(np.float32)
+
+    def motion(self, warp: NDArray[np.floating]) -> Motion:
+        """The motion behind a warp; :meth:`warp` goes the other way."""
+        yaw = float(np.arctan2(warp[0, 1], warp[0, 0]))
+        still = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
+        step = (warp[:, 2] - still[:, 2]) * self.edge
+        return Motion(float(-step[0]), float(step[1]), yaw)

@@ -1,0 +1,1 @@
+"""Estimators that a training made."""

@@ -1,0 +1,67 @@
+"""Several networks, each trained at a height of its own: the one that was trained nearest to the measured height answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.learned.image_network import Network
+from mitsonar.estimation.learned.view_network import ViewNetwork
+
+__all__ = ["HeightEnsemble"]
+
+
+@dataclass(eq=False)
+class HeightEnsemble:
+    """The network trained nearest to the height of the frames.
+
+    Args:
+        networks: two or more, all of one image or all of the same views.
+
+    Attributes:
+        inputs: what it is given beside the images.
+        views: that all of them read; None: a single image.
+        kind: ``image`` or ``vector``.
+
+    Raises:
+        MitsonarError: networks that read different things.
+    """
+
+    networks: list[Any]
+    inputs: str = field(default="height, which chooses the network", init=False)
+
+    def __post_init__(self) -> None:
+        reads = {(type(one), getattr(one, "views", None), one.kind) for one in self.networks}
+        if len(reads) != 1 or not all(isinstance(one, Network | ViewNetwork) for one in self.networks):
+            said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
+            raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
+        ((_, self.views, self.kind),) = reads
+
+    def estimate(self, frames: Any) -> Estimate:
+        """What the chosen network says.
+
+        Raises:
+            MitsonarError: frames without a height; as the network does.
+        """
+        known = None if frames.height_m is None else frames.height_m[np.isfinite(frames.height_m)]
+        if known is None or not len(known):
+            raise MitsonarError(
+                "the height chooses the network, and the frames tell none: measure it with --height-by direct"
+            )
+        height = float(known.mean())
+        estimate: Estimate = self.chosen(height).estimate(frames)
+        return estimate
+
+    def chosen(self, height_m: float) -> Any:
+        """The network whose heights of training are nearest, in ratio; of several, that with its middle nearest."""
+
+        def away(network: Any) -> tuple[float, float]:
+            low, high = network.heights
+            outside = max(np.log(low / height_m), np.log(height_m / high), 0.0)
+            return float(outside), float(abs(np.log(height_m / np.sqrt(low * high))))
+
+        return min(self.networks, key=away)

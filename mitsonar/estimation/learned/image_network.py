@@ -1,0 +1,174 @@
+"""The estimator that a checkpoint is: a trained network between two frames and a motion, with doubts where they are due."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mitsonar.datasets.arrangement import Arrangement
+from mitsonar.datasets.ground_nodes import ground_of
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, rejected, two_frames
+from mitsonar.estimation.learned.trained_network import BEYOND, Instrument, Trained, answer_of, one_thread
+from mitsonar.geometry.attitude import Attitude, attitude_of
+from mitsonar.motion.pose import Motion
+from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.warp_grid import Ground, WarpGrid
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["Network"]
+
+Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
+
+SMOOTH = (2.0, 0.8)
+"""Standard deviations of the filter before frames are matched [bins, beams]."""
+
+CELL = 4
+"""Bins of the cells in which frames are compared that an answer has brought together."""
+
+BLOCK = 16
+"""Such cells and beams of the blocks over which what is matched must be spread."""
+
+
+@dataclass(init=False, eq=False)
+class Network(Trained):
+    """A trained network.
+
+    Args:
+        checkpoint: of it; it must take two frames of one view.
+        force: go on with another sonar than that of training.
+        height_m: over the ground, where the window shows no first echoes; only for networks that know the geometry, as
+        pitch_rad: is, and
+        relief_m: mean height over the ground of what is seen.
+
+    Raises:
+        MitsonarError: a checkpoint that needs something else than two frames of one view, that does not fit its network, or
+            whose geometry is fixed by training but given here.
+    """
+
+    height_m: float | None
+    pitch_rad: float | None
+    relief_m: float | None
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        *,
+        force: bool = False,
+        height_m: float | None = None,
+        pitch_rad: float | None = None,
+        relief_m: float | None = None,
+    ) -> None:
+        self._check_input(checkpoint)
+        if not checkpoint.arrangement["ground"] and any(value is not None for value in (height_m, pitch_rad, relief_m)):
+            raise MitsonarError(f"this {checkpoint.network} is given no geometry: {checkpoint.fixed} are fixed by training")
+        self.force, self.height_m, self.pitch_rad, self.relief_m = force, height_m, pitch_rad, relief_m
+        self._take(checkpoint)
+
+    def _check_input(self, checkpoint: Checkpoint) -> None:
+        """Whether the network reads what an estimator has."""
+        words = checkpoint.arrangement
+        if words["frames"] != 2 or len(words["views"]) != 1:
+            raise MitsonarError(
+                f"an estimator has two frames of one view: this {checkpoint.network} is given {words['frames']} frames of "
+                f"{', '.join(words['views'])} as {words['kind']}s; use `mitsonar odometry` on a data set that holds them, "
+                "`mitsonar evaluate`, or another checkpoint"
+            )
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        """The motion that the network says, its covariance, and whether to believe it.
+
+        Raises:
+            MitsonarError: not two frames, another sonar than that of training, frames without what the network needs.
+        """
+        images = two_frames(frames)
+        for view in self._trained:
+            self._check_instrument(view, Instrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad))
+        if any(blank(image) for image in images):
+            return rejected("nothing in the frames to match")
+        attitude = self._standing(frames)
+        if attitude is not None and attitude.reason:
+            return rejected(attitude.reason)
+        ground = {} if attitude is None else _batch(ground_of(frames, attitude))
+        with torch.inference_mode(), one_thread():
+            targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground))
+        if not np.isfinite(targets).all():
+            return rejected("the network's answer is not finite")
+        motion = Motion(*targets[0].tolist())
+        covariance = self._checkpoint.covariance if covariances is None else covariances[0]
+        reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion)
+        if not reason:
+            reason = _rejection_of_answer(images, ground, motion) if ground else self._rejection_of_match(frames, images)
+        return Estimate(motion, covariance, not reason, reason)
+
+    def _standing(self, frames: SonarFrames) -> Attitude | None:
+        """Height and pitch, for a network that is given them."""
+        if not self._checkpoint.arrangement["ground"]:
+            return None
+        return attitude_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
+
+    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Any:
+        """What the network says of the frames, as a batch of one."""
+        (view,) = self._checkpoint.arrangement["views"]
+        inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
+        return answer_of(self._network, (inputs, ground) if ground else inputs)
+
+    def _arrangement(self, frames: SonarFrames) -> Arrangement:
+        """From the frames to the network's input."""
+        (view,) = self._checkpoint.arrangement["views"]
+        return self._arranged({view: (frames.range_m, frames.bearing_rad)})
+
+    # ---------------------------------------------------------------- doubts
+
+    def _rejection_of_match(self, frames: SonarFrames, images: Pair) -> str:
+        """Whether the frames show one place at all: they must be alike once shifted, as far as training's motions go."""
+        first, second = (smooth(image) for image in images)
+        size = first.shape
+        rows, columns = (min(reach, length // 3) for reach, length in zip(self._reach(frames), size, strict=True))
+        middle = second[rows : size[0] - rows, columns : size[1] - columns]
+        found = cv2.matchTemplate(without_slow(first), without_slow(middle), cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(int(found.argmax()), found.shape)
+        there = first[row : row + middle.shape[0], column : column + middle.shape[1]]
+        inside = np.ones(middle.shape, dtype=bool)
+        return matching_rejection(there, middle, inside, alike=4 * math.pi * SMOOTH[0] * SMOOTH[1])
+
+    def _reach(self, frames: SonarFrames) -> tuple[int, int]:
+        """How far an echo can move between frames in bins and in beams, by the motions of training."""
+        coder = self._checkpoint.coder
+        sideways, forward, yaw = BEYOND * np.maximum(np.abs(coder.low), np.abs(coder.high))
+        bin_m, beam_rad = (float(np.median(np.diff(axis))) for axis in (frames.range_m, frames.bearing_rad))
+        outward = forward + sideways * math.sin(min(math.pi / 2, np.abs(frames.bearing_rad).max()))
+        across = yaw + sideways / frames.range_m[0]
+        return 2 + int(outward / bin_m), 2 + int(across / beam_rad)
+
+
+def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
+    """A batch of one."""
+    return {name: torch.from_numpy(values)[None] for name, values in table.items()}
+
+
+def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
+    """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
+    rows, beams = images[0].shape[0] // CELL, images[0].shape[1]
+    means = (image[: rows * CELL].reshape(rows, CELL, beams).mean(axis=1) for image in images)
+    first, second = (smooth(mean, CELL) for mean in means)
+    warp_grid = WarpGrid(ground, torch.ones(1, 3), (CELL, 1), images[0].shape, first.shape, None)
+    back, inside = warp_grid.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
+    alike = 4 * math.pi * math.hypot(SMOOTH[0] / CELL, 12**-0.5) * SMOOTH[1]
+    return matching_rejection(first, back[0, 0].numpy(), inside[0].numpy() > 0, alike=alike, block=BLOCK)
+
+
+def smooth(image: NDArray[np.float32], step: int = 1) -> NDArray[np.float32]:
+    """With less noise; ``step`` bins are a cell."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=SMOOTH[1], sigmaY=SMOOTH[0] / step), dtype=np.float32)
+
+
+def without_slow(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What is slow belongs to the sonar's lighting, not to the ground."""
+    return np.asarray(image - cv2.blur(image, (16, 16)), dtype=np.float32)

@@ -1,0 +1,163 @@
+"""All estimators by name."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.estimation.estimator import Estimator
+from mitsonar.estimation.image.direct import Direct
+from mitsonar.estimation.image.ecc import Ecc
+from mitsonar.estimation.image.flow import Flow
+from mitsonar.estimation.image.phase import Phase
+from mitsonar.estimation.image.zero import Zero
+from mitsonar.networks.shipped import SHIPPED, shipped_path
+
+if TYPE_CHECKING:
+    from mitsonar.networks.checkpoint import Checkpoint
+
+__all__ = [
+    "ESTIMATORS",
+    "NAMES",
+    "create_estimator",
+    "estimator_from",
+    "load_checkpoint",
+    "names_checkpoint",
+    "options_from",
+]
+
+ESTIMATORS: dict[str, Callable[..., Estimator]] = {
+    "zero": Zero,
+    "ecc": Ecc,
+    "flow": Flow,
+    "phase": Phase,
+    "direct": Direct,
+}
+"""Those that nothing was trained for."""
+
+NAMES = (*ESTIMATORS, *SHIPPED)
+
+
+def create_estimator(name: str, **options: Any) -> Estimator:
+    """The estimator of that name.
+
+    Raises:
+        MitsonarError: unknown name or option; no torch for a trained one.
+    """
+    if name not in NAMES:
+        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, NAMES)}")
+    try:
+        return _maker(name)(**options)
+    except TypeError as error:
+        raise MitsonarError(f"estimator {name}: {error}") from None
+
+
+def estimator_from(text: str) -> Estimator:
+    """What the command line says: ``NAME``, a checkpoint or the folder of a training run, or either with options,
+    ``NAME:key=value:key=value``; angles as ``..._deg``. Several checkpoints with commas between them: the one trained
+    nearest to the height of the frames answers.
+
+    Raises:
+        MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
+    """
+    if "," in text and not Path(text).exists():
+        return _nearest([part.strip() for part in text.split(",") if part.strip()])
+    name, *words = text.split(":")
+    if name in NAMES:
+        return create_estimator(name, **options_from(name, words, _maker(name)))
+    if not names_checkpoint(name):
+        names = nearest_names(name, NAMES)
+        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
+    made = _trained(name)
+    return made(**options_from(name, words, made))
+
+
+def _nearest(texts: list[str]) -> Estimator:
+    """Of several checkpoints.
+
+    Raises:
+        MitsonarError: none of them, or estimators that are no networks.
+    """
+    made = [estimator_from(text) for text in texts]
+    plain = [text for text, one in zip(texts, made, strict=True) if not hasattr(one, "heights")]
+    if plain or len(made) < 2:
+        said = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
+        raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {said}")
+    from mitsonar.estimation.learned.height_ensemble import HeightEnsemble
+
+    return HeightEnsemble(made)
+
+
+def _maker(name: str) -> Callable[..., Estimator]:
+    """What makes the estimator of that name, from options."""
+    return ESTIMATORS[name] if name in ESTIMATORS else _trained(shipped_path(name))
+
+
+def _trained(path: str | Path) -> Callable[..., Estimator]:
+    """What makes an estimator of a checkpoint, from options.
+
+    Raises:
+        MitsonarError: no torch, no such checkpoint or one that cannot be used.
+    """
+    checkpoint = load_checkpoint(path)
+    from mitsonar.estimation.learned.image_network import Network
+    from mitsonar.estimation.learned.view_network import ViewNetwork, reads_views
+
+    return partial(ViewNetwork if reads_views(checkpoint) else Network, checkpoint)
+
+
+def names_checkpoint(name: str) -> bool:
+    """Whether a word of the command line is a path, and no name."""
+    return "/" in name or "." in name or Path(name).is_dir()
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """A checkpoint.
+
+    Raises:
+        MitsonarError: no torch, no such checkpoint or one that cannot be used.
+    """
+    try:
+        from mitsonar.networks.checkpoint import Checkpoint
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "torch":
+            raise
+        raise MitsonarError("a network computes with torch: pip install 'mitsonar[learn]'") from None
+    return Checkpoint.load(path)
+
+
+def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[str, Any]:
+    """Options of what makes an estimator, from words as the command line gives them.
+
+    Raises:
+        MitsonarError: unknown option, not a number.
+    """
+    known, options = _numbers(made), {}
+    for word in words:
+        key, _, value = word.partition("=")
+        if not value:
+            raise MitsonarError(f"an estimator is NAME or NAME:key=value:key=value: got {':'.join([name, *words])!r}")
+        if key not in known:
+            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}")
+        try:
+            number = float(value)
+        except ValueError:
+            raise MitsonarError(f"{name}: {key} must be a number: got {value!r}") from None
+        option, kind = known[key]
+        if "bool" in kind and number not in (0, 1):
+            raise MitsonarError(f"{name}: {key} must be 0 or 1: got {value!r}")
+        options[option] = bool(number) if "bool" in kind else math.radians(number) if key.endswith("_deg") else number
+    return options
+
+
+def _numbers(made: Callable[..., Any]) -> dict[str, tuple[str, str]]:
+    """Options that are numbers or yes and no, as the command line names them, with their own name and type."""
+    parameters = inspect.signature(made).parameters.values()
+    kinds = {one.name: str(one.annotation) for one in parameters}
+    numbers = {name: kind for name, kind in kinds.items() if ("float" in kind or kind == "bool") and "tuple" not in kind}
+    return {name.replace("_rad", "_deg") if name.endswith("_rad") else name: (name, kind) for name, kind in numbers.items()}

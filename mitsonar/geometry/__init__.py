@@ -1,0 +1,1 @@
+"""Where a cell of an image lies, and how it moves with the sonar."""

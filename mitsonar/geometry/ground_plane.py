@@ -1,0 +1,140 @@
+"""Level ground: which point of it a cell of a sonar image shows, and how the cell moves with the sonar."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace, is_array_api_obj
+from numpy.typing import NDArray
+
+from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.motion.pose import Pose, vehicle_rotation
+
+__all__ = ["GroundGeometry", "moved", "nearest_known"]
+
+
+@dataclass(frozen=True)
+class GroundGeometry:
+    """A sonar over level ground. Ground points are (starboard, forward) [m] in level axes that turn with its heading.
+
+    Attributes:
+        range_m: of the cells ``(bins,)`` [m].
+        bearing_rad: of the cells ``(beams,)`` [rad].
+        bearing: which angle that is.
+        height_m: of the sonar over the ground.
+        pitch_rad: > 0 looks down.
+        roll_rad: > 0 puts starboard down.
+    """
+
+    range_m: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    bearing: Bearing
+    height_m: float
+    pitch_rad: float
+    roll_rad: float = 0.0
+
+    @cached_property
+    def turn(self) -> NDArray[np.float64]:
+        """The sonar's starboard, forward and up in level axes, as columns ``(3, 3)``."""
+        return np.asarray(vehicle_rotation(Pose(0, 0, 0, self.pitch_rad, self.roll_rad, 0)).as_matrix()[0])
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Ground points of the cells ``(bins, beams, 2)``; nan where a cell's arc does not meet the ground.
+
+        Of the two places where an arc can meet it, the one nearer to the sonar's axis in elevation.
+        """
+        radius, b = np.meshgrid(self.range_m, self.bearing_rad, indexing="ij")
+        starboard, forward, up = self.turn[2]  # how much of each points up
+        if self.bearing == "azimuth":
+            fixed, ahead, upward = 0.0, starboard * np.sin(b) + forward * np.cos(b), np.broadcast_to(up, b.shape)
+        else:
+            fixed, ahead, upward = starboard * np.sin(b), forward * np.cos(b), up * np.cos(b)
+        # fixed + ahead cos e + upward sin e = -height / radius
+        lean = np.arctan2(upward, ahead)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            swing = np.arccos((-self.height_m / radius - fixed) / np.hypot(ahead, upward))
+        one, other = (_within_pi(lean + sign * swing) for sign in (-1, 1))
+        e = np.where(np.abs(one) <= np.abs(other), one, other)
+        return np.asarray((directions(self.bearing, b, e) * radius[..., None] @ self.turn.T)[..., :2])
+
+    def to_polar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Range [m] and bearing [rad] of ground points ``(..., 2)``."""
+        s, f, u = self._in_sonar(points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
+
+    def elevation(self, points: NDArray[np.floating]) -> NDArray[Any]:
+        """Elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
+        s, f, u = self._in_sonar(points)
+        return np.asarray(np.arctan2(u, np.hypot(s, f) if self.bearing == "azimuth" else f))
+
+    @cached_property
+    def derivative(self) -> NDArray[np.float64]:
+        """How range [m] and bearing [rad] of each cell's ground point change with the motion (sideways, forward [m], yaw
+        [rad]; eq. 3.4), at rest ``(bins, beams, 2, 3)``."""
+        x, y = np.moveaxis(self.points, -1, 0)
+        s, f, u = self._in_sonar(self.points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        along = np.stack([x, y], axis=-1) / radius[..., None]
+        aside, ahead = self.turn[:2, 0], self.turn[:2, 1]
+        if self.bearing == "azimuth":
+            turning = (f[..., None] * aside - s[..., None] * ahead) / (s * s + f * f)[..., None]
+        else:
+            turning = (aside - (s / radius)[..., None] * along) / np.sqrt(radius * radius - s * s)[..., None]
+        one, none = np.ones_like(x), np.zeros_like(x)
+        point = np.stack([np.stack([-one, none, -y], axis=-1), np.stack([none, -one, x], axis=-1)], axis=-2)
+        return np.asarray(np.stack([along, turning], axis=-2) @ point)
+
+    @cached_property
+    def derivative_by_height(self) -> NDArray[np.float64]:
+        """How range [m] and bearing [rad] of each cell's ground point change as the sonar rises [m] ``(bins, beams, 2)``."""
+        s, f, u = self._in_sonar(self.points)
+        radius = np.sqrt(s * s + f * f + u * u)
+        along = self.height_m / radius
+        aside, ahead = -self.turn[2, 0], -self.turn[2, 1]
+        if self.bearing == "azimuth":
+            turning = (f * aside - s * ahead) / (s * s + f * f)
+        else:
+            turning = (aside - (s / radius) * along) / np.sqrt(radius * radius - s * s)
+        return np.stack([along, turning], axis=-1)
+
+    def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], ...]:
+        """Starboard, forward, up of ground points in the sonar's own axes."""
+        x, y, turn = points[..., 0], points[..., 1], self.turn.astype(points.dtype)
+        below = points.dtype.type(self.height_m)
+        starboard, forward, up = (x * turn[0, k] + y * turn[1, k] - below * turn[2, k] for k in range(3))
+        return starboard, forward, up
+
+
+def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """For each node the row and column of the one whose values it takes: its own where it meets the ground, else the first
+    farther out, in the nearest column that has one ``(ranges, bearings)``."""
+    rows, columns = known.shape
+    having = np.flatnonzero(known.any(axis=0))
+    if not having.size:
+        return np.zeros_like(known, dtype=np.intp), np.zeros_like(known, dtype=np.intp)
+    column = having[np.abs(np.arange(columns)[:, None] - having).argmin(axis=1)]
+    row = np.maximum(np.arange(rows)[:, None], known.argmax(axis=0)[column])
+    return row, np.broadcast_to(column, row.shape)
+
+
+def moved(points: Any, motion: Any) -> Any:
+    """Where ground points ``(..., 2)`` lie for a sonar that has moved by (sideways, forward [m], yaw [rad]; eq. 3.4).
+
+    NumPy or torch; the motion is three numbers, or an array like the points whose leading axes go with theirs.
+    """
+    xp = array_namespace(points)
+    motion = xp.astype(motion if is_array_api_obj(motion) else xp.asarray(motion), points.dtype, copy=False)
+    sideways, forward, yaw = (motion[..., k] for k in range(3))
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    x, y = points[..., 0], points[..., 1]
+    return xp.stack([x * cos - y * sin - sideways, x * sin + y * cos - forward], axis=-1)
+
+
+def _within_pi(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -1,0 +1,132 @@
+"""Scan conversion: from (range, bearing) to metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace, device
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError
+
+__all__ = ["CartesianImage", "CartesianMap", "cartesian_map", "to_cartesian"]
+
+
+@dataclass(frozen=True)
+class CartesianImage:
+    """A fan in metres.
+
+    Attributes:
+        image: ``(rows, columns)`` float32, row 0 the farthest forward, column 0 most to port; nan outside the fan.
+        extent: starboard from, to, forward from, to [m] of the image's edges (as matplotlib's ``extent``).
+    """
+
+    image: NDArray[np.float32]
+    extent: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class CartesianMap:
+    """Which cells make each pixel of a fan: bilinear between the cells' centres, for many images of one sonar.
+
+    Attributes:
+        index: of four cells in the flattened image ``(4, rows, columns)`` int64.
+        weight: of each, adding up to 1; all 0 outside the fan ``(4, rows, columns)`` float32.
+        extent: as in :class:`CartesianImage`.
+    """
+
+    index: NDArray[np.int64]
+    weight: NDArray[np.float32]
+    extent: tuple[float, float, float, float]
+    _kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def apply(self, image: Any) -> Any:
+        """Fans ``(..., rows, columns)`` of images ``(..., bins, beams)``, NumPy or torch; 0 outside the fan."""
+        xp = array_namespace(image)
+        flat = xp.reshape(image, (-1, image.shape[-2] * image.shape[-1]))
+        where = f"{xp.__name__} {device(image)}"
+        if where not in self._kept:  # once on each device
+            self._kept[where] = [xp.asarray(table, device=device(image)) for table in (self.index, self.weight)]
+        index, weight = self._kept[where]
+        fan = None
+        for corner in range(4):
+            part = xp.take(flat, xp.reshape(index[corner], (-1,)), axis=1) * xp.reshape(weight[corner], (-1,))
+            fan = part if fan is None else fan + part
+        return xp.reshape(fan, (*image.shape[:-2], *self.index.shape[1:]))
+
+
+def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianMap:
+    """The map of scan conversion: x = r sin b to starboard, y = r cos b forward.
+
+    Args:
+        range_m: centres of the bins [m], rising.
+        bearing_rad: axes of the beams [rad], rising, not necessarily even.
+        rows: pixels in the forward direction; pixels are square.
+
+    Raises:
+        MitsonarError: ranges or bearings that do not rise.
+    """
+    range_m, bearing_rad = (np.asarray(a, dtype=float) for a in (range_m, bearing_rad))
+    if (np.diff(range_m) <= 0).any() or (np.diff(bearing_rad) <= 0).any():
+        raise MitsonarError("range_m and bearing_rad must rise: sort the image's rows and columns")
+    range_edges, bearing_edges = _edges(range_m), _edges(bearing_rad)
+    near, far = range_edges[[0, -1]]
+    port, starboard = bearing_edges[[0, -1]]
+    turns = np.clip([port, starboard, 0.0, -np.pi / 2, np.pi / 2], port, starboard)
+    corners = np.array([near, far])[:, None]
+    x, y = corners * np.sin(turns), corners * np.cos(turns)
+    left, right, low, high = x.min(), x.max(), y.min(), y.max()
+    pixel = (high - low) / rows
+    columns = max(1, round((right - left) / pixel))
+    forward = high - (np.arange(rows)[:, None] + 0.5) * pixel
+    across = left + (np.arange(columns) + 0.5) * (right - left) / columns
+    radius, angle = np.hypot(across, forward), np.arctan2(across, forward)
+    inside = (radius >= near) & (radius <= far) & (angle >= port) & (angle <= starboard)
+    bin_, over_bin = _cell(_place(radius, range_m, range_edges), range_m.size)
+    beam, over_beam = _cell(_place(angle, bearing_rad, bearing_edges), bearing_rad.size)
+    index, weight = [], []
+    for next_bin in (0, 1):
+        for next_beam in (0, 1):
+            row, column = np.minimum(bin_ + next_bin, range_m.size - 1), np.minimum(beam + next_beam, bearing_rad.size - 1)
+            index.append(row * bearing_rad.size + column)
+            weight.append((over_bin if next_bin else 1 - over_bin) * (over_beam if next_beam else 1 - over_beam) * inside)
+    extent = (float(left), float(right), float(low), float(high))
+    return CartesianMap(np.stack(index), np.stack(weight).astype(np.float32), extent)
+
+
+def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianImage:
+    """One image ``(bins, beams)`` as a fan in metres; see :func:`cartesian_map`.
+
+    Raises:
+        MitsonarError: shapes that do not fit, or ranges or bearings that do not rise.
+    """
+    image = np.asarray(image, dtype=float)
+    wanted = np.size(range_m), np.size(bearing_rad)
+    if image.shape != wanted:
+        raise MitsonarError(f"image must be (bins, beams) = {wanted}: got {image.shape}")
+    conversion = cartesian_map(range_m, bearing_rad, rows)
+    fan = np.where(conversion.weight.any(axis=0), conversion.apply(image), np.nan).astype(np.float32)
+    return CartesianImage(fan, conversion.extent)
+
+
+def _cell(place: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The cell before a fractional index, and how far beyond it; the border cells' values hold beyond their centres."""
+    held = np.clip(place, 0, count - 1)
+    whole = np.minimum(held.astype(np.int64), max(count - 2, 0))
+    return whole, held - whole
+
+
+def _edges(centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Borders half-way between centres, and as far out at both ends."""
+    if centres.size == 1:
+        return np.array([centres[0] * 0.99 - 1e-3, centres[0] * 1.01 + 1e-3])
+    middle = (centres[1:] + centres[:-1]) / 2
+    return np.concatenate([[2 * centres[0] - middle[0]], middle, [2 * centres[-1] - middle[-1]]])
+
+
+def _place(value: NDArray[np.float64], centres: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Fractional index of a value among the centres."""
+    known = np.concatenate([edges[:1], centres, edges[-1:]])
+    return np.interp(value, known, np.concatenate([[-0.5], np.arange(centres.size), [centres.size - 0.5]]))

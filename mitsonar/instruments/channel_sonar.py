@@ -1,0 +1,256 @@
+"""What the instrument of impulse responses is: a transmitter and receivers, where they look, and the band of the signal."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from mitsonar.instruments.imaging_sonar import Instrument
+
+__all__ = [
+    *("LOOKS", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
+    *("FieldOfView", "Hydrophone", "Maths", "four_receivers"),
+]
+
+ChannelModel = Literal["scatterers", "rays"]
+SEE = " (see docs/impulse.md)"
+
+PADDING = 2
+"""The frequency response is taken so many times finer than asked: tails of pulses before t = 0 wrap into what is cropped."""
+
+
+class Maths(NamedTuple):
+    """The functions of an array library that fields of view are computed with."""
+
+    asin: Any
+    atan2: Any
+    cos: Any
+    clip: Any
+    where: Any
+
+
+NUMPY = Maths(np.arcsin, np.arctan2, np.cos, np.clip, np.where)
+
+
+class FieldOfView(BaseModel):
+    """Where a transducer looks, in the vehicle's axes (starboard, forward, up), and how its sensitivity falls off.
+
+    ``rectangular``: ``across_deg`` to both sides of a vertical plane and ``along_deg`` in it; ``circular``: a cone of
+    ``across_deg``; ``all``: everywhere. Its middle looks ``tilt_deg`` away from straight down, towards ``heading_deg``.
+    Sensitivity (of amplitudes) is 1 in the middle and falls to 0 at the edges as half a period of a cosine over the outer
+    part ``taper`` of each half width: an edge would be an echo that moves with the vehicle. ``taper`` 0 is a hard edge.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    shape: Literal["rectangular", "circular", "all"] = Field("rectangular", description="of the field of view")
+    heading_deg: float = Field(0.0, ge=-360, le=360, description="where it looks: 0 forward, 90 to starboard [deg]")
+    tilt_deg: float = Field(25.0, ge=0, le=180, description="of its middle, from straight down [deg]")
+    across_deg: float = Field(10.0, gt=0, le=180, description="whole width across; of a circle its diameter [deg]")
+    along_deg: float = Field(50.0, gt=0, le=180, description="whole width in the vertical plane [deg]")
+    taper: float = Field(0.5, ge=0, le=1, description="part of each half width over which sensitivity falls to 0")
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        """Its middle, to the side (clockwise seen from above), and upwards: rows of ``(3, 3)`` in the vehicle's axes."""
+        turn, tilt = math.radians(self.heading_deg), math.radians(self.tilt_deg)
+        level = np.array([math.sin(turn), math.cos(turn), 0.0])
+        side = np.array([math.cos(turn), -math.sin(turn), 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        return np.stack([math.sin(tilt) * level - math.cos(tilt) * up, side, math.cos(tilt) * level + math.sin(tilt) * up])
+
+    def sensitivity(self, ahead: Any, aside: Any, above: Any, maths: Maths = NUMPY) -> Any:
+        """Sensitivity 0..1 to sound from a unit direction, given along :attr:`axes`."""
+        if self.shape == "all":
+            return ahead * 0 + 1
+        half_across = math.radians(self.across_deg) / 2
+        if self.shape == "circular":
+            off = maths.atan2((aside * aside + above * above) ** 0.5, ahead)
+            return self._fall(off / half_across, maths)
+        across = maths.asin(maths.clip(aside, -1, 1))
+        along = maths.atan2(above, ahead)
+        return self._fall(abs(across) / half_across, maths) * self._fall(
+            abs(along) / (math.radians(self.along_deg) / 2), maths
+        )
+
+    def may_see(self, ahead: Any, aside: Any, above: Any, margin: Any) -> NDArray[np.bool_]:
+        """Whether anything within ``margin`` [rad] of a unit direction, given along :attr:`axes`, may lie in it."""
+        if self.shape == "all":
+            return np.ones(np.shape(ahead), dtype=bool)
+        half_across = math.radians(self.across_deg) / 2
+        if self.shape == "circular":
+            return np.asarray(np.arctan2(np.hypot(aside, above), ahead) <= half_across + margin)
+        across = np.abs(np.arcsin(np.clip(aside, -1, 1)))
+        # a degree sideways counts for more degrees along, the farther aside it is
+        level = np.cos(np.minimum(across + margin, np.pi / 2))
+        wider = np.where(level > np.sin(margin), np.arcsin(np.minimum(np.sin(margin) / np.maximum(level, 1e-9), 1)), np.pi)
+        along = np.abs(np.arctan2(above, ahead))
+        return np.asarray((across <= half_across + margin) & (along <= math.radians(self.along_deg) / 2 + wider))
+
+    def _fall(self, place: Any, maths: Maths) -> Any:
+        """From 1 to 0 at ``place`` 1, the half width."""
+        if self.taper == 0:
+            return maths.where(place <= 1, place * 0 + 1, 0)
+        ramp = maths.clip((place - (1 - self.taper)) * (1 / self.taper), 0, 1)
+        return 0.5 + 0.5 * maths.cos(ramp * math.pi)
+
+
+class Hydrophone(BaseModel):
+    """A receiver: its name, its place from the transmitter in the vehicle's axes, and where it looks."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1, description="of the receiver")
+    position: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="starboard, forward, up [m]")
+    field: FieldOfView = Field(default_factory=FieldOfView, description="where it looks")
+
+    @model_validator(mode="after")
+    def _near(self) -> Self:
+        if not (np.isfinite(self.position).all() and math.dist(self.position, (0, 0, 0)) <= 100):
+            raise ValueError(f"receiver {self.name}: position must be finite and within 100 m: got {self.position}")
+        if not self.name.isidentifier():
+            raise ValueError(f"a receiver's name is letters, digits and _ : got {self.name!r}")
+        return self
+
+
+LOOKS = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
+"""Receivers 1 to 4 of Almanza-Medina, 5.4, and where they look [deg]."""
+
+
+def four_receivers(distance_m: float = 0.1, **field: Any) -> tuple[Hydrophone, ...]:
+    """The thesis's receivers (5.4): forward, left, back and right of the transmitter, each looking away from it."""
+    made = []
+    for name, heading in LOOKS.items():
+        turn = math.radians(heading)
+        place = (round(distance_m * math.sin(turn), 12), round(distance_m * math.cos(turn), 12), 0.0)
+        made.append(Hydrophone(name=name, position=place, field=FieldOfView(heading_deg=heading, **field)))
+    return tuple(made)
+
+
+def _few_digits(sampling_hz: float, taps: int) -> int:
+    """So many taps or some more that their frequency step is written in few digits."""
+    for digits in (1, 2, 3):
+        for more in range(taps, taps + taps // 3 + 1):
+            step = sampling_hz / more
+            if float(f"{step:.{digits}g}") == step:
+                return more
+    return taps
+
+
+class ChannelSonar(Instrument):
+    """A transmitter that sends all the time, and receivers whose channels are measured all the time (Almanza-Medina, ch. 5).
+
+    All SI but for angles in degrees (the edge of the program). The same names are the XML properties of the sensor
+    ``channel_sonar`` (docs/impulse.md).
+
+    Raises:
+        MitsonarError: through :meth:`create` and :meth:`replace`, for an unknown key or a value outside its limits.
+    """
+
+    called: ClassVar[str] = "channel sonar"
+    see: ClassVar[str] = SEE
+
+    carrier_hz: float = Field(80e3, le=1e9, description="carrier f_c [Hz]")
+    bandwidth_hz: float = Field(4.8e3, gt=0, le=1e9, description="bandwidth F_d [Hz]")
+    sampling_hz: float = Field(8e3, gt=0, le=1e9, description="sampling rate f_d of the complex baseband [Hz]")
+    frequency_step_hz: float = Field(10.0, gt=0, le=1e9, description="step of the frequency response [Hz]")
+    rolloff: float = Field(0.5, ge=0, le=1, description="roll-off alpha of the raised cosine")
+    range_max: float = Field(25.0, gt=0, le=1e5, description="echoes from farther away are dropped and counted [m]")
+    sound_speed: float = Field(1500.0, ge=100, le=1e4, description="sound speed [m/s]")
+    frame_rate_hz: float = Field(20.0, gt=0, le=1e6, description="responses a second [Hz]")
+    model: ChannelModel = Field("scatterers", description="scatterers of the world, or rays of the vehicle (the thesis's)")
+    spreading: bool | None = Field(None, description="amplitudes fall with distance; default: scatterers yes, rays no")
+    points_per_m2: float = Field(
+        1700.0, gt=0, le=1e7, description="scatterers of surfaces without cells of their own [1/m2]"
+    )
+    rays: int = Field(50_000, ge=1, le=10**8, description="rays within each receiver's field of view, model rays")
+    seed: int = Field(0, ge=0, lt=2**31, description="of where scatterers lie")
+    transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="where it sends")
+    receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        half_band = (1 + self.rolloff) * self.bandwidth_hz / 2
+        if not self.carrier_hz > half_band:
+            raise ValueError(
+                f"carrier_hz must exceed half the band, (1 + rolloff) bandwidth_hz / 2 = {half_band:g} Hz: got "
+                f"{self.carrier_hz:g} Hz; raise the carrier or narrow the band"
+            )
+        if 2 * half_band > self.sampling_hz * (1 + 1e-12):
+            raise ValueError(
+                f"sampling_hz must be at least (1 + rolloff) bandwidth_hz = {2 * half_band:g} Hz: got "
+                f"{self.sampling_hz:g} Hz; raise it, or narrow the band"
+            )
+        longest = 2 * self.range_max / self.sound_speed
+        if not self.frequency_step_hz < 1 / (2 * longest):
+            enough = _few_digits(self.sampling_hz, math.floor(2 * longest * self.sampling_hz) + 1)
+            raise ValueError(
+                f"frequency_step_hz must be below 1 / (2 tau_max) = {1 / (2 * longest):.6g} Hz, tau_max being the delay "
+                f"from range_max {self.range_max:g} m: got {self.frequency_step_hz:g} Hz; give "
+                f"{self.sampling_hz / enough:.9g} Hz, or lower range_max"
+            )
+        taps = self.sampling_hz / self.frequency_step_hz
+        if abs(taps - round(taps)) > 1e-6 * taps:
+            raise ValueError(
+                f"sampling_hz must be a whole number of frequency_step_hz: got {self.sampling_hz:g} / "
+                f"{self.frequency_step_hz:g}; give {self.sampling_hz / math.ceil(taps):.9g} Hz"
+            )
+        names = [receiver.name for receiver in self.receivers]
+        if len(set(names)) < len(names):
+            raise ValueError(f"receivers must have names of their own: got {', '.join(names)}")
+        if round(taps) * len(names) > 2**24:
+            raise ValueError(f"a measurement has at most {2**24:,} taps: got {round(taps) * len(names):,}")
+        return self
+
+    @property
+    def taps(self) -> int:
+        """Length of a response."""
+        return round(self.sampling_hz / self.frequency_step_hz)
+
+    @property
+    def delay_s(self) -> NDArray[np.float64]:
+        """Delay of each tap ``(taps,)`` [s]."""
+        return np.arange(self.taps) / self.sampling_hz
+
+    @property
+    def wavelength_m(self) -> float:
+        """Of the carrier [m]."""
+        return self.sound_speed / self.carrier_hz
+
+    @property
+    def spreads(self) -> bool:
+        """Whether amplitudes fall with distance."""
+        return self.model == "scatterers" if self.spreading is None else self.spreading
+
+    @property
+    def field_of_view(self) -> dict[str, FieldOfView]:
+        """Where each receiver looks; in ``rays`` without taper, as the thesis has it."""
+        hard = {"taper": 0.0} if self.model == "rays" else {}
+        return {one.name: one.field.model_copy(update=hard) for one in self.receivers}
+
+    @property
+    def offsets(self) -> NDArray[np.float64]:
+        """Places of the receivers in the vehicle's axes ``(receivers, 3)`` [m]."""
+        return np.array([receiver.position for receiver in self.receivers], dtype=float)
+
+    def raised_cosine(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """X_R at baseband frequencies (Almanza-Medina, eq. 5.16, mended): 1 to c = (1 - alpha) F_d / 2, 0 from
+        a = (1 + alpha) F_d / 2 on, half a period of a cosine between."""
+        flat = (1 - self.rolloff) * self.bandwidth_hz / 2
+        width = self.rolloff * self.bandwidth_hz
+        beyond = np.abs(np.asarray(frequency_hz, dtype=float)) - flat
+        if width == 0:
+            return np.where(beyond <= 0, 1.0, 0.0)
+        return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip(beyond / width, 0, 1)))
+
+    def pulse(self, delay_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What one echo of amplitude 1 at delay 0 gives at these delays: the transform of X_R, over the sampling rate."""
+        t = np.asarray(delay_s, dtype=float) * self.bandwidth_hz
+        edge = 1 - (2 * self.rolloff * t) ** 2
+        near = np.abs(edge) < 1e-9
+        shape = np.where(near, np.pi / 4, np.cos(np.pi * self.rolloff * t) / np.where(near, 1.0, edge))
+        return np.asarray(np.sinc(t) * shape * self.bandwidth_hz / self.sampling_hz)

@@ -1,0 +1,168 @@
+"""Views: which image is made of a ping, of its whole field of view, of a portion of it, or at a receiver elsewhere.
+
+Portions (Almanza-Medina, 4.3) are those of a sonar that looks straight down. Its bearing runs fore-aft (positive forward),
+its elevation across (negative to starboard): a mount of pitch 90 and heading -90 deg.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose
+
+__all__ = ["SEGMENTS", "Receiver", "Segment", "View", "Whole"]
+
+SEGMENTS = {
+    "whole": (None, None),
+    "starboard": (None, -1),
+    "port": (None, +1),
+    "q1": (+1, -1),
+    "q2": (-1, -1),
+    "q3": (-1, +1),
+    "q4": (+1, +1),
+    "c1": (+1, -1),
+    "c2": (-1, -1),
+    "c3": (-1, +1),
+    "c4": (+1, +1),
+}
+"""Signs of bearing and elevation. Quadrants from fore-starboard clockwise; c1 to c4, the cone inscribed in each."""
+
+FEWEST_ACROSS = 8
+"""Jittered rays of the transmitter across a receiver's beam, below which images have stripes."""
+
+
+class View(Protocol):
+    """One image of a ping; all views of a simulator are made from one trace.
+
+    Attributes:
+        name: of the view.
+        sonar: whose range bins, model and gain law the image has.
+        bearing_rad: axes of its beams ``(beams,)`` [rad].
+        rays_a_beam: rays that belong to each beam ``(beams,)``; None where that differs from ping to ping.
+    """
+
+    name: str
+    sonar: Sonar
+    bearing_rad: NDArray[np.float64]
+    rays_a_beam: NDArray[np.int64] | None
+
+
+class Whole:
+    """The whole field of view, in the sonar's own beams."""
+
+    name = "image"
+
+    def __init__(self, sonar: Sonar) -> None:
+        self.sonar = sonar
+        self.bearing_rad = sonar.bearing_rad
+        self.rays_a_beam: NDArray[np.int64] | None = np.full(sonar.beams, sonar.rays // sonar.beams)
+
+
+class Segment:
+    """One portion; rays belong to it by the middle of their cell, so that it is the same in every ping.
+
+    Args:
+        sonar: the looking-down sonar, with an even number of beams and of rays a beam.
+        name: of :data:`SEGMENTS`.
+
+    Raises:
+        MitsonarError: unknown name; odd beams or rays, which a quadrant would have to halve.
+    """
+
+    def __init__(self, sonar: Sonar, name: str) -> None:
+        if name not in SEGMENTS:
+            raise MitsonarError(f"unknown segment {name!r}: {nearest_names(name, SEGMENTS)}")
+        if sonar.beams % 2 or sonar.rays_per_beam % 2:
+            raise MitsonarError(
+                f"segments halve the field of view: beams and rays_per_beam must be even, got {sonar.beams} and "
+                f"{sonar.rays_per_beam}"
+            )
+        self.sonar, self.name = sonar, name
+        self.fore, self.up = SEGMENTS[name]
+        self.first_beam = sonar.beams // 2 if self.fore == 1 else 0
+        beams = slice(self.first_beam, self.first_beam + sonar.beams // (1 if self.fore is None else 2))
+        member = self._member()
+        counts = member.reshape(sonar.rays_per_beam, sonar.beams, sonar.across).sum(axis=(0, 2))
+        self.bearing_rad = sonar.bearing_rad[beams]
+        self.rays_a_beam: NDArray[np.int64] | None = counts[beams].astype(np.int64)
+        self.member = member
+
+    def _member(self) -> NDArray[np.bool_]:
+        """Which pixels of the film belong to it ``(rays_per_beam * columns,)``."""
+        sonar = self.sonar
+        beam = np.repeat(np.arange(sonar.beams), sonar.across)[None, :]
+        row = np.arange(sonar.rays_per_beam)[:, None]
+        member = np.ones((sonar.rays_per_beam, sonar.columns), dtype=bool)
+        if self.fore is not None:
+            member &= (beam >= sonar.beams // 2) == (self.fore > 0)
+        if self.up is not None:
+            member &= (row < sonar.rays_per_beam // 2) == (self.up > 0)
+        if self.fore is not None and self.up is not None and self.name.startswith("c"):
+            member &= self._inside_cone(self.fore, self.up)
+        return member.ravel()
+
+    def _inside_cone(self, fore: int, up: int) -> NDArray[np.bool_]:
+        """Directions no farther from the quadrant's middle than its nearest border."""
+        sonar = self.sonar
+        inner = (np.arange(sonar.across) + 0.5) / sonar.across - 0.5
+        bearing = (sonar.bearing_rad[:, None] + inner * sonar.beam_width_rad).ravel()[None, :]
+        rows = (np.arange(sonar.rays_per_beam)[:, None] + 0.5) / sonar.rays_per_beam
+        elevation = (0.5 - rows) * np.radians(sonar.elevation_fov_deg)
+        quarter = np.radians([sonar.azimuth_fov_deg, sonar.elevation_fov_deg]) / 4
+        b, e = fore * quarter[0], up * quarter[1]
+        axis = directions(sonar.bearing, b, e)
+        along = np.linspace(0, 2, 2001)
+        border = [directions(sonar.bearing, b * along, e * side) for side in (0, 2)]
+        border += [directions(sonar.bearing, b * side, e * along) for side in (0, 2)]
+        nearest = max(float((edge @ axis).max()) for edge in border)
+        return np.asarray(directions(sonar.bearing, bearing, elevation) @ axis >= nearest)
+
+
+class Receiver:
+    """One receiver of a bistatic sonar.
+
+    A ray of the transmitter A hits P. The image's range is half of |P - A| + |B - P|, its beam the bearing of P in B's
+    frame; P outside B's field of view, hidden from B, or lit on its other side does not count. Level, ``thesis``: C times
+    the transmitter's cosine, as its rays know it. ``physical``: C cos(theta_B) dOmega r^g / R_B^2, the cosine the
+    receiver's, since the transmitter's cancels in the lit area dA = R_A^2 dOmega / cos(theta_A); it becomes the monostatic
+    law where B is A. The ground point of a cell lies on an ellipsoid with A and B as its foci.
+
+    Args:
+        transmitter: whose rays are traced: at least eight jittered columns across one of the receiver's beams.
+        sonar: of the receiver: its field of view, beams and range bins; model and gain as the transmitter's.
+        offset: pose of the receiver in the transmitter's axes (starboard, forward, up).
+        name: of the view.
+
+    Raises:
+        MitsonarError: too few columns, beams that overlap, another model or gain than the transmitter's, a window that
+            begins nearer than half the distance between transmitter and receiver.
+    """
+
+    rays_a_beam: NDArray[np.int64] | None = None
+
+    def __init__(self, transmitter: Sonar, sonar: Sonar, offset: Pose, name: str) -> None:
+        self.transmitter, self.sonar, self.offset, self.name = transmitter, sonar, offset, name
+        self.bearing_rad = sonar.bearing_rad
+        self._check(transmitter)
+
+    def _check(self, transmitter: Sonar) -> None:
+        sonar, name = self.sonar, self.name
+        if (sonar.model, sonar.gain_exponent) != (transmitter.model, transmitter.gain_exponent):
+            raise MitsonarError(f"receiver {name} must have the transmitter's model and gain_exponent")
+        if sonar.beam_width_deg is not None and sonar.beam_width_rad > sonar.beam_spacing_rad * (1 + 1e-9):
+            raise MitsonarError(f"receiver {name}: beams may not overlap; leave beam_width_deg out")
+        across = transmitter.columns / transmitter.azimuth_fov_deg * sonar.azimuth_fov_deg / sonar.beams
+        if across < FEWEST_ACROSS * (1 - 1e-9) or not transmitter.jittered:
+            raise MitsonarError(
+                f"receiver {name}: the transmitter needs {FEWEST_ACROSS} jittered columns of rays across a receiver's beam, "
+                f"or stripes appear: got {across:.3g}, jitter {transmitter.jittered}; raise beams (thesis) or rays_across"
+            )
+        if math.dist(self.offset[:3], (0, 0, 0)) / 2 >= max(sonar.range_min, sonar.bin_m) and sonar.model == "physical":
+            raise MitsonarError(f"receiver {name}: range_min must exceed half its distance from the transmitter")

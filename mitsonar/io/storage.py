@@ -1,0 +1,188 @@
+"""Where a store lies: a folder, or an object storage by its URL (``s3://bucket/data.zarr``), through fsspec."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import zarr
+from fsspec.core import url_to_fs
+from fsspec.implementations.local import LocalFileSystem
+from zarr.abc.store import Store
+
+from mitsonar.errors import MitsonarError
+
+__all__ = ["Storage"]
+
+LOCK = "writer.json"
+LOCK_FILE = "writer.lock"
+"""The file whose lock is held on a file system; not the folder's own, since network file systems lock only files."""
+
+HEARTBEAT_S = 20.0
+"""An object storage has no locks that end with their owner: its writer says every so often that it lives."""
+
+STALE_S = 90.0
+"""A writer that was silent for so long is gone."""
+
+
+class Storage:
+    """A folder of a file system.
+
+    Args:
+        url: path or URL.
+
+    Raises:
+        MitsonarError: no such kind of storage, or the package for it is not installed.
+    """
+
+    def __init__(self, url: str | Path) -> None:
+        self.url = str(url).rstrip("/")
+        try:
+            self.fs, self.root = url_to_fs(self.url)
+        except (ValueError, ImportError) as error:
+            raise MitsonarError(
+                f"cannot use {self.url}: {error}; give a folder, or a URL that fsspec knows (pip install s3fs for s3://)"
+            ) from None
+        self.local = isinstance(self.fs, LocalFileSystem)
+
+    def store(self, *, write: bool = False) -> Store:
+        """The Zarr store here."""
+        if self.local:
+            return zarr.storage.LocalStore(self.root, read_only=not write)
+        return zarr.storage.FsspecStore.from_url(self.url, read_only=not write)
+
+    def sizes(self) -> dict[str, int]:
+        """Sizes in bytes of all files, by their path here; without those that say who writes.
+
+        Raises:
+            MitsonarError: the storage does not answer, or not to us.
+        """
+        if self.local and os.path.isfile(self.root):
+            raise MitsonarError(f"{self.url} is a file: give a folder, or a URL")
+        try:
+            self.fs.invalidate_cache()
+            found = self.fs.find(self.root, detail=True)
+        except FileNotFoundError:
+            return {}
+        except Exception as error:  # whatever a storage's library raises
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise MitsonarError(
+                f"cannot list {self.url}: {reason}; check the address, and for object storage its endpoint and credentials"
+            ) from None
+        files = {name[len(self.root) + 1 :]: int(entry["size"] or 0) for name, entry in found.items()}
+        return {name: size for name, size in files.items() if name not in (LOCK, LOCK_FILE)}
+
+    def read(self, name: str) -> bytes:
+        """The bytes of a file."""
+        return bytes(self.fs.cat_file(f"{self.root}/{name}"))
+
+    def write(self, name: str, content: bytes) -> None:
+        """Write a small file."""
+        self.fs.pipe_file(f"{self.root}/{name}", content)
+
+    def remove(self, name: str) -> None:
+        """Remove a file; it may be gone already."""
+        with contextlib.suppress(FileNotFoundError):
+            self.fs.rm_file(f"{self.root}/{name}")
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[Callable[[], None]]:
+        """Be the only one who writes here; yields what to call now and then: it raises when that is no longer so.
+
+        Raises:
+            MitsonarError: somebody else writes.
+        """
+        with self._locked_folder() if self.local else self._locked_objects() as still_ours:
+            yield still_ours
+
+    @contextlib.contextmanager
+    def _locked_folder(self) -> Iterator[Callable[[], None]]:
+        """The kernel's lock on a file: it ends with the process, however that ends."""
+        new = not os.path.exists(self.root)
+        os.makedirs(self.root, exist_ok=True)
+        path = os.path.join(self.root, LOCK_FILE)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if not (os.path.exists(path) and os.path.samestat(os.fstat(handle), os.stat(path))):
+                    raise BlockingIOError  # its last owner has just removed it, or another has made a new one
+            except BlockingIOError:
+                raise MitsonarError(
+                    f"another process is writing {self.url}: wait for it to end, or choose another -o; nothing was changed"
+                ) from None
+            try:
+                yield lambda: None
+            finally:
+                with contextlib.suppress(OSError):
+                    os.unlink(path)
+                    if new:
+                        os.rmdir(self.root)  # only if nothing was written
+        finally:
+            os.close(handle)
+
+    @contextlib.contextmanager
+    def _locked_objects(self) -> Iterator[Callable[[], None]]:
+        """A file that its owner renews; whoever finds a silent one takes it over."""
+        owner = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex}"
+        self._refuse_if_written()
+        self._say(owner)
+        time.sleep(0.5)  # two that began at the same moment: the one that wrote last stays
+        self._refuse_if_written(besides=owner)
+        done = threading.Event()
+        lost = threading.Event()
+
+        def renew() -> None:
+            while not done.wait(HEARTBEAT_S):
+                with contextlib.suppress(Exception):  # the storage may be away for a while
+                    if self._owner() != owner:
+                        return lost.set()
+                    self._say(owner)
+
+        def still_ours() -> None:
+            if lost.is_set():
+                raise MitsonarError(
+                    f"another process took {self.url} over, since this one had been silent for {STALE_S:.0f} s: it goes on "
+                    "there; what this one wrote is whole"
+                )
+
+        thread = threading.Thread(target=renew, daemon=True)
+        thread.start()
+        try:
+            yield still_ours
+        finally:
+            done.set()
+            thread.join()
+            with contextlib.suppress(Exception):
+                if self._owner() == owner:
+                    self.remove(LOCK)
+
+    def _owner(self) -> str:
+        """Who says that it writes here."""
+        return str(json.loads(self.read(LOCK))["owner"])
+
+    def _say(self, owner: str) -> None:
+        self.write(LOCK, json.dumps({"owner": owner, "time": time.time()}).encode())
+
+    def _refuse_if_written(self, besides: str = "") -> None:
+        try:
+            found: dict[str, Any] = json.loads(self.read(LOCK))
+            age = time.time() - float(found["time"])
+            owner = str(found["owner"])
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return
+        if owner != besides and age < STALE_S:
+            host, process, *_ = [*owner.split(), "?"]
+            raise MitsonarError(
+                f"{self.url} is being written by process {process} on {host} (last sign {age:.0f} s ago): wait for it to "
+                f"end, or, if it was killed, {STALE_S - age:.0f} s; nothing was changed"
+            )

@@ -1,0 +1,352 @@
+"""The folder of an odometry: estimates are kept as they come, so that a killed one goes on; then path, table and figure."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import time
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.io.whole_files import read_json, write_json, write_whole
+from mitsonar.mapping.odometry import Method, Odometry, Row, Smoothing, Source, odometry
+from mitsonar.motion.motion_errors import AXES, in_units
+from mitsonar.motion.pose import Motion, Pose, Trajectory
+from mitsonar.plotting.map_figure import path_figure, save_figure
+
+__all__ = ["OdometryFolder", "run_odometry", "table_lines"]
+
+KIND = "mitsonar odometry"
+
+FILES = (
+    *("run.json", "estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
+    *("table.md", "table.json", "path.png"),
+)
+"""All that a folder may hold; nothing else is ever removed."""
+
+
+class OdometryFolder:
+    """A folder that an odometry is written to, or lies in.
+
+    Attributes:
+        path: where.
+        state: what ``run.json`` holds.
+    """
+
+    def __init__(self, path: str | Path, state: dict[str, Any]) -> None:
+        self.path, self.state = Path(path), state
+
+    @classmethod
+    def open(cls, path: str | Path) -> OdometryFolder:
+        """A finished odometry.
+
+        Raises:
+            MitsonarError: none, or not finished.
+        """
+        folder = cls(path, read_json(Path(path) / "run.json"))
+        if folder.state.get("kind") != KIND:
+            raise MitsonarError(f"{path} is no odometry: give the folder that `mitsonar odometry` made")
+        if not folder.state.get("finished"):
+            raise MitsonarError(f"{path} is not finished: run the same `mitsonar odometry` with --resume")
+        return folder
+
+    @property
+    def estimated(self) -> Trajectory:
+        """The path."""
+        return Trajectory.load_tum(self.path / "estimated.tum")
+
+    @property
+    def true(self) -> Trajectory | None:
+        """The true path, where it was known."""
+        there = self.path / "true.tum"
+        return Trajectory.load_tum(there) if there.exists() else None
+
+    # ---------------------------------------------------------------- beginning
+
+    @classmethod
+    def begin(cls, path: str | Path, state: dict[str, Any], *, overwrite: bool, resume: bool) -> OdometryFolder:
+        """A place for a new odometry, or the one that is there and goes on; nothing is written yet.
+
+        ``state["recipe"]`` decides the estimates: one that goes on must have the same.
+
+        Raises:
+            MitsonarError: something else is there; the one to resume was another one.
+        """
+        folder = cls(path, json.loads(json.dumps(state, default=_plain)))
+        there = folder.path
+        if not there.exists() or (there.is_dir() and not any(not one.name.endswith(".part") for one in there.iterdir())):
+            return folder
+        if not (overwrite or resume):
+            raise MitsonarError(f"{there} exists and is kept as it is: choose another -o, or --resume, or --overwrite")
+        had = read_json(there / "run.json") if (there / "run.json").is_file() else {}
+        if had.get("kind") != KIND:
+            raise MitsonarError(f"{there} is no odometry of mitsonar and is kept as it is: choose another -o")
+        if overwrite:
+            for name in FILES:
+                (there / name).unlink(missing_ok=True)
+            return folder
+        old, new = had.get("recipe", {}), folder.state["recipe"]
+        other = [key for key in new if new[key] != old.get(key)]
+        if other:
+            raise MitsonarError(
+                f"{there} holds another odometry, it differs in {', '.join(other)}: resume with the options it was begun "
+                "with (run.json has them), or choose another -o"
+            )
+        return folder
+
+    def kept(self) -> dict[int, Estimate]:
+        """Estimates of an earlier try, by the number of their pair; a line that a kill left half written is cut off.
+
+        Raises:
+            MitsonarError: the journal is damaged.
+        """
+        journal = self.path / "estimates.jsonl"
+        if not journal.exists():
+            return {}
+        content = journal.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        if len(whole) < len(content):
+            with journal.open("r+b") as file:
+                file.truncate(len(whole))
+        estimates = {}
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                pair, estimate = _estimate_in(line)
+            except (ValueError, KeyError, TypeError):
+                raise MitsonarError(f"{journal}, line {number} is damaged: begin again with --overwrite") from None
+            estimates[pair] = estimate
+        return estimates
+
+    def keep(self, pair: int, estimate: Estimate) -> None:
+        """Add an estimate to the journal; the folder is made with the first one.
+
+        Raises:
+            MitsonarError: it cannot be made.
+        """
+        if not (self.path / "run.json").exists():
+            try:
+                self.path.mkdir(parents=True, exist_ok=True)
+                write_json(self.path / "run.json", self.state)
+            except OSError as error:
+                raise MitsonarError(f"cannot write {self.path}: {error.strerror}; choose another -o") from None
+        with (self.path / "estimates.jsonl").open("a", encoding="utf-8") as file:
+            file.write(_line_of(pair, estimate))
+
+    # ---------------------------------------------------------------- results
+
+    def write(self, found: Odometry, more: dict[str, Any]) -> None:
+        """All results; the last one is run.json, which says that they are whole."""
+        self.state |= more | {"finished": False}
+        write_json(self.path / "run.json", self.state)
+        _save_tum(self.path / "estimated.tum", found.path)
+        if found.true is not None:
+            _save_tum(self.path / "true.tum", found.true)
+        write_whole(self.path / "motions.csv", _motions_csv(found).encode())
+        write_whole(self.path / "covariances.npz", _covariances(found))
+        rows = found.rows()
+        write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
+        table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
+        write_json(self.path / "table.json", {"rows": table})
+        save_figure(self.path / "path.png", _figure(found, str(self.state["title"])))
+        self.state["finished"] = True
+        write_json(self.path / "run.json", self.state)
+
+
+def run_odometry(
+    source: Source,
+    name: str,
+    estimator: Method,
+    out: str | Path,
+    *,
+    smooth: Smoothing = "none",
+    scale: ArrayLike | Literal["fit"] | None = None,
+    start: Pose | None = None,
+    every: int = 1,
+    workers: int = 1,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Callable[[int], None] = lambda pairs: None,
+) -> Odometry:
+    """:func:`mitsonar.mapping.odometry.odometry` into a folder, which holds:
+
+    ``estimated.tum``, and ``true.tum`` where poses are known; ``motions.csv``; ``covariances.npz``; ``table.md`` and
+    ``table.json``; ``path.png``; ``run.json``, the settings; and ``estimates.jsonl``, what the estimator said, a line a
+    pair, from which a killed one goes on; that may be with another ``smooth``, ``scale``, ``start`` and ``workers``.
+
+    Args:
+        source: of the frames.
+        name: of the estimator, as it was asked for.
+        estimator: what tells the motions.
+        out: the folder; made.
+        smooth: see :func:`~mitsonar.mapping.odometry.odometry`.
+        scale: see there.
+        start: see there.
+        every: see there.
+        workers: see there.
+        overwrite: replace an odometry that is there.
+        resume: go on with one that was broken off.
+        progress: called with the number of pairs that were added.
+
+    Raises:
+        MitsonarError: as there; the folder holds something else, or cannot be written.
+    """
+    if overwrite and resume:
+        raise MitsonarError("--overwrite and --resume contradict each other: give one")
+    recipe = {
+        "estimator": name,
+        "options": dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {},  # type: ignore[arg-type]
+        "frames": len(source),
+        "frames_sha256": source.digest(),
+        "every": every,
+        "height_m": source.told_height_m,
+        "pitch_deg": None if source.pitch_rad is None else float(np.degrees(source.pitch_rad)),
+        "noise": None if source.noise is None else {**source.noise.model_dump(), "seed": source.seed},
+        "mitsonar": _version("mitsonar"),
+    }
+    state = {
+        "kind": KIND,
+        "finished": False,
+        "title": f"{Path(source.name).name}, {name}",
+        "source": source.name,
+        "inputs": estimator.inputs,
+        "recipe": recipe,
+        "versions": {package: _version(package) for package in ("numpy", "scipy", "opencv-python-headless")},
+    }
+    folder = OdometryFolder.begin(out, state, overwrite=overwrite, resume=resume)
+    kept = folder.kept() if resume else {}
+    begun = time.perf_counter()
+    found = odometry(
+        source,
+        estimator,
+        smooth=smooth,
+        scale=scale,
+        start=start,
+        every=every,
+        workers=workers,
+        known=kept,
+        keep=folder.keep,
+        progress=progress,
+    )
+    settings = {
+        "smooth": smooth,
+        "scale": scale if isinstance(scale, str) else None if scale is None else np.asarray(scale, dtype=float).tolist(),
+        "factors": found.factors.tolist(),
+        "from": list(found.path.poses[0]),
+        "not_believed": int((~found.believed).sum()),
+        "warnings": found.warnings(),
+        "seconds": time.perf_counter() - begun,
+        "pairs_in_these_seconds": len(found.estimates) - len(kept),
+        "workers": workers,
+    }
+    folder.write(found, settings)
+    return found
+
+
+# ---------------------------------------------------------------- files
+
+
+def _line_of(pair: int, estimate: Estimate) -> str:
+    covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
+    motion = [float(value) for value in estimate.motion]
+    said = {"pair": pair, "motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
+    alike = {name: estimate.about[name] for name in ("modes", "spreads") if name in estimate.about}
+    return json.dumps(said | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
+
+
+def _estimate_in(line: bytes) -> tuple[int, Estimate]:
+    said = json.loads(line)
+    covariance = None if said["covariance"] is None else np.array(said["covariance"], dtype=float).reshape(3, 3)
+    motion = Motion(*(float(value) for value in said["motion"]))
+    about = dict(said.get("about", {}))
+    return int(said["pair"]), Estimate(motion, covariance, bool(said["valid"]), str(said["reason"]), about)
+
+
+def _save_tum(path: Path, trajectory: Trajectory) -> None:
+    part = path.with_name(f".{path.name}.part")
+    trajectory.save_tum(part)
+    part.replace(path)
+
+
+def _motions_csv(found: Odometry) -> str:
+    """A line a motion: mm and deg, standard deviations empty where unknown."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    names = [f"{axis.name}_{axis.unit}" for axis in AXES]
+    stds = [f"{axis.name}_std_{axis.unit}" for axis in AXES]
+    table.writerow(["from_frame", "frame", "time_s", *names, *stds, "believed", "reason"])
+    moved = in_units(found.series.motions)
+    std = _std(found.series.covariances)
+    for k, estimate in enumerate(found.estimates):
+        told = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
+        numbers = [f"{value:.6f}" for value in moved[k]]
+        frames = [int(found.frames[k]), int(found.frames[k + 1]), f"{found.series.time_s[k + 1]:.9g}"]
+        table.writerow([*frames, *numbers, *told, int(estimate.valid), estimate.reason])
+    return text.getvalue()
+
+
+def _std(covariances: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    return None if covariances is None else in_units(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
+
+
+def _covariances(found: Odometry) -> bytes:
+    """Times, motions and covariances in m and rad; covariances nan where unknown."""
+    count = len(found.estimates)
+    motions, poses = found.series.covariances, found.pose_covariances
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        time_s=found.series.time_s,
+        frames=found.frames,
+        motions=found.series.motions,
+        believed=found.believed,
+        motion_covariances=np.full((count, 3, 3), np.nan) if motions is None else motions,
+        pose_covariances=np.full((count + 1, 3, 3), np.nan) if poses is None else poses,
+    )
+    return buffer.getvalue()
+
+
+def table_lines(rows: list[Row]) -> list[str]:
+    """Rows as Markdown that reads well as it is."""
+    cells = [("", "value", "unit"), *((name, _number(value, unit), unit) for name, value, unit in rows)]
+    width = [max(len(line[k]) for line in cells) for k in range(3)]
+    lines = [f"| {name.ljust(width[0])} | {value.rjust(width[1])} | {unit.ljust(width[2])} |" for name, value, unit in cells]
+    return [lines[0], f"| {'-' * width[0]} | {'-' * (width[1] - 1)}: | {'-' * width[2]} |", *lines[1:]]
+
+
+def _number(value: float, unit: str) -> str:
+    if not np.isfinite(value):
+        return "-"
+    return f"{value:,.0f}" if unit == "" and float(value).is_integer() else f"{value:.4g}"
+
+
+def _figure(found: Odometry, title: str) -> Any:
+    true = found.true_at_frames
+    paths = {"estimated": found.path} | ({} if true is None else {"true": true})
+    motions, poses = found.series.covariances, found.pose_covariances
+    return path_figure(
+        paths,
+        motion_covariances=None if motions is None else {"estimated": motions},
+        pose_covariances=None if poses is None else {"estimated": poses},
+        title=title,
+    )
+
+
+def _plain(value: Any) -> Any:
+    """What JSON does not know."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed as a package"

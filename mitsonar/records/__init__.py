@@ -1,0 +1,1 @@
+"""What a ray or a ping brought back, in the one form that everything downstream reads."""

@@ -1,0 +1,103 @@
+"""Echoes: the record of every ray, the one currency between tracing and whatever is computed from it; EXR in and out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+
+__all__ = ["CHANNELS", "Echoes", "load_exr", "save_exr"]
+
+
+@dataclass
+class Echoes:
+    """One value a ray, Dr.Jit arrays that are not evaluated yet, or NumPy arrays.
+
+    Attributes:
+        hit: 1 where the ray met a surface, else 0 and all else 0 (``shape_id`` -1).
+        range_m: distance from the sonar to the point hit [m].
+        near_m: range where the ray's elevation cell begins on the surface (its tangent plane) [m].
+        far_m: range where it ends [m].
+        reflectivity: 0..1.
+        cosine: |cos(angle of incidence)|.
+        solid_angle_sr: of the ray's cell [sr].
+        x, y, z: point hit in the world [m].
+        nx, ny, nz: geometric normal there.
+        shape_id: place of the shape in the scene.
+        object_id: number of the object within its mesh (the mesh's attribute ``face_id``), 0 where it has none.
+    """
+
+    hit: Any
+    range_m: Any
+    near_m: Any
+    far_m: Any
+    reflectivity: Any
+    cosine: Any
+    solid_angle_sr: Any
+    x: Any
+    y: Any
+    z: Any
+    nx: Any
+    ny: Any
+    nz: Any
+    shape_id: Any
+    object_id: Any
+
+    def outside(self, sonar: Sonar) -> tuple[float, float] | None:
+        """Nearest and farthest return outside the sonar's window [m]; None where all lie inside. NumPy arrays only."""
+        near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)
+        missed = (far < sonar.range_min) | (near >= sonar.range_max)
+        found = self.range_m[(self.hit > 0) & missed]
+        return (float(found.min()), float(found.max())) if found.size else None
+
+
+CHANNELS = tuple(field.name for field in fields(Echoes))
+"""Channels of the integrator ``echo`` and of an EXR of ``echoes/``, in this order; EXR files sort them by name."""
+
+
+def save_exr(path: str | Path, echoes: Echoes, sonar: Sonar) -> None:
+    """Write one frame's echoes ``(rays_per_beam, columns)``, float32, one channel each."""
+    import OpenEXR
+
+    shape = (sonar.rays_per_beam, sonar.columns)
+    channels = {name: np.asarray(getattr(echoes, name), np.float32).reshape(shape) for name in CHANNELS}
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+
+
+def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
+    """Read one frame's echoes, film order, as flat float32 arrays.
+
+    Raises:
+        MitsonarError: not an EXR file, channels missing, another size than the sonar's, values out of bounds.
+    """
+    import OpenEXR
+
+    shape = (sonar.rays_per_beam, sonar.columns)
+    if not Path(path).is_file():
+        raise MitsonarError(f"no such echo file: {path}")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # OpenEXR raises bare exceptions of several kinds
+        raise MitsonarError(f"cannot read echoes {path}: {error}; render them again with --exr") from None
+    values: dict[str, NDArray[np.float32]] = {}
+    for name in CHANNELS:
+        if name not in channels:
+            raise MitsonarError(f"{path} lacks the channel {name}: has {', '.join(sorted(channels))}")
+        if channels[name].shape != shape:
+            raise MitsonarError(f"{path} must be {shape[1]} x {shape[0]} rays as its sonar: got {channels[name].shape}")
+        values[name] = np.ascontiguousarray(channels[name], dtype=np.float32).ravel()
+        if not np.isfinite(values[name]).all():
+            raise MitsonarError(f"{path}: channel {name} holds inf or nan; render the echoes again with --exr")
+    for name, low, high in (("hit", 0, 1), ("reflectivity", 0, 1), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13)):
+        if values[name].min() < low or values[name].max() > high:
+            raise MitsonarError(f"{path}: channel {name} must lie in {low}..{high}; render the echoes again with --exr")
+    return Echoes(**values)

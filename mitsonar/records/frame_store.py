@@ -1,0 +1,113 @@
+"""Frames written as they are made, in constant memory: a Zarr group while a run goes on, ``frames.npz`` when it is short."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.records.sonar_frames import PER_FRAME, SonarFrames
+
+__all__ = ["LONGEST_NPZ", "FrameStore"]
+
+LONGEST_NPZ = 1000
+"""Frames up to which a run ends as one ``frames.npz``; longer ones stay ``frames.zarr``."""
+
+
+class FrameStore:
+    """The frames of one run, on disk as ``frames.zarr`` (Zarr v3, one chunk a frame).
+
+    The group holds what ``frames.npz`` holds, by the same names; ``sonar``, ``level``, ``level_scale`` and ``about`` are
+    attributes, and so is ``frames_done``: frames from there on are not written yet.
+    """
+
+    def __init__(self, group: zarr.Group, path: Path) -> None:
+        self.group, self.path = group, path
+
+    @classmethod
+    def create(cls, path: Path, frames: int, like: SonarFrames) -> FrameStore:
+        """An empty store for ``frames`` frames that look like the ones in ``like``."""
+        group = zarr.open_group(path, mode="w", zarr_format=3)
+        table = like.arrays()
+        for name in ("level", "level_scale", "sonar", "about"):
+            group.attrs[name] = table.pop(name).item()
+        for name, values in table.items():
+            each = name in PER_FRAME or name == "pitch_rad"
+            shape = (frames, *values.shape[1:]) if each else values.shape
+            chunks = (1, *shape[1:]) if len(shape) == 3 else shape
+            array = group.create_array(name, shape=shape, chunks=chunks, dtype=values.dtype, fill_value=0)
+            if not each:
+                array[...] = values
+        group.attrs["frames_done"] = 0
+        return cls(group, path)
+
+    @classmethod
+    def open(cls, path: Path) -> FrameStore:
+        """A store that was begun.
+
+        Raises:
+            MitsonarError: there is none, or it is damaged.
+        """
+        try:
+            store = cls(zarr.open_group(path, mode="r+"), path)
+            store.frames, store.done  # noqa: B018
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
+        return store
+
+    @property
+    def frames(self) -> int:
+        """Frames of the whole run."""
+        return int(self.group["image"].shape[0])  # type: ignore[union-attr]
+
+    @property
+    def done(self) -> int:
+        """Frames that are written."""
+        return int(self.group.attrs["frames_done"])  # type: ignore[arg-type]
+
+    def write(self, first: int, frames: SonarFrames) -> None:
+        """Write consecutive frames; they count as done once all of them are on disk."""
+        table = frames.arrays()
+        for name in [*PER_FRAME, "pitch_rad"]:
+            if name in table:
+                self.group[name][first : first + len(frames)] = table[name]  # type: ignore[index]
+        self.group.attrs["frames_done"] = first + len(frames)
+
+    def pack(self, path: Path) -> None:
+        """Turn a finished store into ``frames.npz``, frame by frame, and remove it."""
+        part = path.with_name(f".{path.name}.part")
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1, allowZip64=True) as file:
+            for name, array in self.group.arrays():
+                with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    _write_npy(entry, array)
+            for name, value in self.group.attrs.items():
+                if name != "frames_done":
+                    buffer = io.BytesIO()
+                    np.save(buffer, np.array(value))
+                    file.writestr(f"{name}.npy", buffer.getvalue())
+        part.replace(path)
+        shutil.rmtree(self.path)
+
+
+def _write_npy(entry: Any, array: zarr.Array) -> None:
+    """An array as .npy, a frame at a time."""
+    header = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
+    np.lib.format.write_array_header_2_0(entry, header)
+    for piece in _pieces(array):
+        entry.write(np.ascontiguousarray(piece).tobytes())
+
+
+def _pieces(array: zarr.Array) -> Iterator[NDArray[Any]]:
+    if array.ndim < 3:
+        yield np.asarray(array[...])
+        return
+    for index in range(array.shape[0]):
+        yield np.asarray(array[index])

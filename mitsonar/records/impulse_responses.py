@@ -1,0 +1,139 @@
+"""Complex channel impulse responses in the one form that everything downstream reads; ``responses.npz`` holds exactly it."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.io.whole_files import read_npz, write_whole
+
+__all__ = ["ImpulseResponses"]
+
+PER_PING = ("response", "time_s", "poses", "velocity", "height_m", "echoes", "dropped")
+
+
+@dataclass
+class ImpulseResponses:
+    """Responses of one instrument.
+
+    Attributes:
+        response: complex baseband ``(pings, receivers, taps)`` complex64; receivers in the order of ``sonar.receivers``.
+        time_s: when each ping was sent ``(pings,)`` [s].
+        sonar: the instrument.
+        poses: x, y, z [m], pitch, roll, heading [rad] of the transmitter when it was sent ``(pings, 6)``, where known.
+        velocity: of the vehicle in its own axes, starboard, forward, up [m/s], and its turn to starboard [rad/s]
+            ``(pings, 4)``, where known.
+        height_m: of the transmitter over the ground below ``(pings,)``, where known.
+        echoes: how many made each response ``(pings, receivers)``, where known.
+        dropped: how many more came from beyond ``range_max`` ``(pings, receivers)``, where known.
+        about: what else a file should say.
+    """
+
+    response: NDArray[np.complex64]
+    time_s: NDArray[np.float64]
+    sonar: ChannelSonar
+    poses: NDArray[np.float64] | None = None
+    velocity: NDArray[np.float64] | None = None
+    height_m: NDArray[np.float64] | None = None
+    echoes: NDArray[np.int64] | None = None
+    dropped: NDArray[np.int64] | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        wanted = (len(self.time_s), len(self.sonar.receivers), self.sonar.taps)
+        if self.response.shape != wanted:
+            raise MitsonarError(
+                f"response must be (pings, receivers, taps) = {wanted} after time_s and sonar: got {self.response.shape}"
+            )
+        for name in PER_PING:
+            values = getattr(self, name)
+            if values is not None and len(values) != wanted[0]:
+                raise MitsonarError(f"{name} must hold {wanted[0]} pings: got {len(values)}")
+
+    def __len__(self) -> int:
+        return len(self.response)
+
+    def __repr__(self) -> str:
+        names = ", ".join(one.name for one in self.sonar.receivers)
+        known = ", ".join(name for name in PER_PING[2:] if getattr(self, name) is not None)
+        return (
+            f"ImpulseResponses({len(self)} pings, {self.response.shape[1]} receivers ({names}), {self.sonar.taps} taps at "
+            f"{self.sonar.sampling_hz:g} Hz; {known})"
+        )
+
+    @property
+    def delay_s(self) -> NDArray[np.float64]:
+        """Delay of each tap ``(taps,)`` [s]."""
+        return self.sonar.delay_s
+
+    def select(self, index: slice | NDArray[Any]) -> ImpulseResponses:
+        """Some of the pings."""
+        picked = {name: getattr(self, name)[index] for name in PER_PING if getattr(self, name) is not None}
+        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
+        return ImpulseResponses(**picked, **rest)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What ``responses.npz`` holds, by name; ``sonar`` and ``about`` are JSON texts."""
+        table: dict[str, NDArray[Any]] = {"delay_s": self.delay_s}
+        table |= {name: getattr(self, name) for name in PER_PING if getattr(self, name) is not None}
+        return table | {
+            "sonar": np.array(self.sonar.model_dump_json()),
+            "about": np.array(json.dumps(self.about)),
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write ``.npz``, or a Zarr v3 group where the name ends with ``.zarr``; the npz is whole or absent."""
+        path = Path(path)
+        if path.suffix == ".zarr":
+            import zarr
+
+            group = zarr.open_group(path, mode="w", zarr_format=3)
+            for name, values in self.arrays().items():
+                if values.ndim:
+                    group.create_array(name, data=values, chunks=(1, *values.shape[1:]) if values.ndim > 2 else values.shape)
+                else:
+                    group.attrs[name] = values.item()
+        else:
+            buffer = io.BytesIO()
+            table: dict[str, Any] = self.arrays()
+            np.savez_compressed(buffer, **table)
+            write_whole(path, buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: str | Path) -> ImpulseResponses:
+        """Read what :meth:`save` wrote, or the folder that ``mitsonar impulse`` made.
+
+        Raises:
+            MitsonarError: no such file, damaged, or not responses.
+        """
+        path = Path(path)
+        if path.is_dir() and path.suffix != ".zarr":
+            path = path / "responses.npz"
+        try:
+            if path.is_dir():
+                import zarr
+
+                group = zarr.open_group(path, mode="r")
+                table: dict[str, Any] = {name: array[...] for name, array in group.arrays()}
+                table |= {name: np.array(value) for name, value in group.attrs.items()}
+            else:
+                table = read_npz(path)
+        except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
+            raise MitsonarError(f"cannot read responses {path}: {error}; give what `mitsonar impulse` wrote") from None
+        missing = [name for name in ("response", "time_s", "sonar") if name not in table]
+        if missing:
+            raise MitsonarError(f"{path} lacks {', '.join(missing)}: it holds no impulse responses of mitsonar")
+        try:
+            sonar = ChannelSonar.create(**json.loads(str(table["sonar"])))
+            about = json.loads(str(table.get("about", "{}")))
+        except (json.JSONDecodeError, TypeError):
+            raise MitsonarError(f"{path}: the field sonar is not JSON; the file is damaged") from None
+        return cls(**{name: table[name] for name in PER_PING if name in table}, sonar=sonar, about=about)

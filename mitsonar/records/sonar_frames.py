@@ -1,0 +1,160 @@
+"""Sonar images in the one form that everything downstream reads, simulated or real; ``frames.npz`` holds exactly it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.whole_files import read_npz
+
+__all__ = ["LABELS", "SonarFrames", "to_uint8"]
+
+LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
+"""Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
+
+PER_FRAME = ("image", "time_s", "poses", "height_m", *LABELS)
+
+
+@dataclass
+class SonarFrames:
+    """Frames of one sonar.
+
+    Attributes:
+        image: ``(frames, bins, beams)`` float32 in 0..1 (or uint8 in 0..255); row 0 nearest, column 0 most to port;
+            zero means no echo.
+        range_m: centres of the bins ``(bins,)`` [m].
+        bearing_rad: axes of the beams ``(beams,)`` [rad], starboard positive, not necessarily even.
+        time_s: time of each frame ``(frames,)``, or of each beam ``(frames, beams)`` [s].
+        poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
+        height_m: height over the ground below, measured straight down ``(frames,)``; nan where nothing is below.
+        level: how image values stand for level: ``linear`` (level = value * level_scale), ``dB`` or ``gamma``.
+        level_scale: what undoes the constant gain.
+        sonar: the instrument.
+        elevation_rad: elevation of the strongest echo of each pixel, like ``image``, float32.
+        shape_id: the shape of that echo (its place in the scene), int32.
+        object_id: the object of that echo, as its mesh numbers them (attribute ``face_id``; 0 without it), int32.
+        shadow: 0 not in shadow; 1 no echo here, but echoes before and sound or echoes beyond; 2 no echo here and all
+            sound of the beam was intercepted before (an object's shadow that nothing ends, or past the lit floor).
+    """
+
+    image: NDArray[Any]
+    range_m: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    time_s: NDArray[np.float64]
+    sonar: Sonar
+    poses: NDArray[np.float64] | None = None
+    height_m: NDArray[np.float64] | None = None
+    level: str = "linear"
+    level_scale: float = 1.0
+    elevation_rad: NDArray[np.float32] | None = None
+    shape_id: NDArray[np.int32] | None = None
+    object_id: NDArray[np.int32] | None = None
+    shadow: NDArray[np.uint8] | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        frames, bins, beams = self.image.shape if self.image.ndim == 3 else (0, 0, 0)
+        if (bins, beams) != (len(self.range_m), len(self.bearing_rad)) or len(self.time_s) != frames:
+            raise MitsonarError(
+                f"image must be (frames, bins, beams) = ({len(self.time_s)}, {len(self.range_m)}, "
+                f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
+            )
+        if self.level not in ("linear", "dB", "gamma"):
+            raise MitsonarError(f"level must be linear, dB or gamma: got {self.level!r}")
+        for name in PER_FRAME:
+            values = getattr(self, name)
+            if values is not None and len(values) != frames:
+                raise MitsonarError(f"{name} must hold {frames} frames: got {len(values)}")
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @property
+    def pitch_rad(self) -> NDArray[np.float64] | None:
+        """Pitch of each frame ``(frames,)`` [rad], where poses are known."""
+        return None if self.poses is None else self.poses[:, 3]
+
+    def select(self, index: slice | NDArray[Any]) -> SonarFrames:
+        """Some of the frames."""
+        picked = {name: getattr(self, name)[index] for name in PER_FRAME if getattr(self, name) is not None}
+        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
+        return SonarFrames(**picked, **rest)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What ``frames.npz`` holds, by name; ``sonar`` and ``about`` are JSON texts."""
+        table = {
+            "image": self.image,
+            "range_m": self.range_m,
+            "bearing_rad": self.bearing_rad,
+            "time_s": self.time_s,
+            "level": np.array(self.level),
+            "level_scale": np.array(self.level_scale),
+            "sonar": np.array(self.sonar.model_dump_json()),
+            "about": np.array(json.dumps(self.about)),
+        }
+        optional = ("poses", "height_m", *LABELS)
+        table |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
+        return table | ({} if self.poses is None else {"pitch_rad": self.poses[:, 3]})
+
+    @classmethod
+    def from_arrays(cls, table: dict[str, NDArray[Any]], source: str = "frames") -> SonarFrames:
+        """Frames from what :meth:`arrays` gave; ``source`` is named in errors."""
+        needed = ("image", "range_m", "bearing_rad", "time_s", "sonar")
+        missing = [name for name in needed if name not in table]
+        if missing:
+            raise MitsonarError(f"{source} lacks {', '.join(missing)}: it is not a frames file of mitsonar")
+        try:
+            sonar = Sonar.create(**json.loads(str(table["sonar"])))
+            about = json.loads(str(table.get("about", "{}")))
+        except (json.JSONDecodeError, TypeError):
+            raise MitsonarError(f"{source}: the field sonar is not JSON; the file is damaged") from None
+        values = {name: table[name] for name in ("image", "range_m", "bearing_rad", "time_s")}
+        values |= {name: table[name] for name in ("poses", "height_m", *LABELS) if name in table}
+        scale = float(table.get("level_scale", np.array(1.0)))
+        return cls(**values, sonar=sonar, level=str(table.get("level", "linear")), level_scale=scale, about=about)
+
+    def save(self, path: str | Path) -> None:
+        """Write ``frames.npz``."""
+        table: dict[str, Any] = self.arrays()
+        np.savez_compressed(Path(path), **table)
+
+    @classmethod
+    def load(cls, path: str | Path) -> SonarFrames:
+        """Read ``frames.npz``, or the ``frames.zarr`` of a long run, or the folder of a run that holds either.
+
+        Raises:
+            MitsonarError: no such file, or not frames.
+        """
+        path = Path(path)
+        if path.is_dir() and path.suffix != ".zarr":
+            found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+            if not found:
+                raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
+            path = found[0]
+        try:
+            if path.is_dir():
+                import zarr
+
+                group = zarr.open_group(path, mode="r")
+                table: dict[str, Any] = {name: array[...] for name, array in group.arrays()}
+                table |= {name: np.array(value) for name, value in group.attrs.items()}
+                done = int(table.pop("frames_done", len(table["image"])))
+                table |= {name: table[name][:done] for name in PER_FRAME if name in table}
+            else:
+                table = read_npz(path)
+        except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
+            raise MitsonarError(f"cannot read frames {path}: {error}; give frames.npz or a run's folder") from None
+        return cls.from_arrays(table, str(path))
+
+
+def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """0..1 to 0..255, a non-zero echo at least 1, so that zero means no echo."""
+    values = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return np.where((image > 0) & (values == 0), np.uint8(1), values)

@@ -1,0 +1,229 @@
+"""Runs of impulse responses on disk: written as they are made; a run that is killed goes on to the same bits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.motion.pose import Trajectory
+from mitsonar.plotting.response_figure import response_png, waterfall_png
+from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.simulation.channel import ChannelSimulator, Paths
+from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
+from mitsonar.simulation.render_run import begin, path_digest
+
+__all__ = ["Report", "Spread", "iteration_error", "run_impulse", "spread_of"]
+
+OVERSPREAD = 0.3
+"""Delay spread times Doppler spread above which a channel can hardly be measured."""
+
+MOST_ENERGY = (0.01, 0.99)
+"""Quantiles of the echoes' energy between which delays and Doppler shifts are counted as spread."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far echoes spread: 98 % of their energy lies within ``delay_s`` [s] and ``doppler_hz`` [Hz]."""
+
+    delay_s: float
+    doppler_hz: float
+
+    @property
+    def factor(self) -> float:
+        """Above 1 a channel changes before it has been heard once."""
+        return self.delay_s * self.doppler_hz
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a run did."""
+
+    folder: Path
+    pings: int
+    spread: Spread
+    warnings: list[str]
+
+
+def run_impulse(
+    simulator: ChannelSimulator,
+    flown: Trajectory,
+    velocity: NDArray[np.float64],
+    folder: str | Path,
+    *,
+    origin: dict[str, Any],
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Callable[[int], None] = lambda pings: None,
+) -> Report:
+    """Make a run's folder, or go on with one: ``responses.zarr`` and ``.npz``, two figures, ``run.json``.
+
+    Args:
+        simulator: scene and instrument.
+        flown: poses and times of the pings.
+        velocity: of the vehicle in each, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`.
+        folder: of the run.
+        origin: what repeats the run beside instrument and path.
+        overwrite: replace a run that is there.
+        resume: go on with a run that was broken off.
+        progress: called with the number of pings that were added.
+
+    Raises:
+        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+    """
+    folder, sonar = Path(folder), simulator.sonar
+    recipe = {**origin, "sonar": sonar.model_dump(mode="json"), "pings": len(flown), "poses_sha256": path_digest(flown)}
+    recipe["velocity"] = velocity[0].tolist() if len(np.unique(velocity, axis=0)) == 1 else "of the path"
+    paths = [simulator.paths(flown.poses[0], velocity[:1], receiver) for receiver in range(len(sonar.receivers))]
+    spread = spread_of(paths)
+    if not any(path.amplitude.size for path in paths):
+        _refuse_silence(simulator, flown, paths)
+    state = begin(folder, recipe, "responses", overwrite=overwrite, resume=resume)
+    if not state["finished"]:
+        progress(int(state["frames_done"]))
+        made = _make(simulator, flown, velocity, folder, state, progress)
+        state["warnings"] = [*simulator.notes, *warnings_of(made, spread)]
+        write_json(folder / "run.json", state)
+        made.about |= {"spread_factor": spread.factor}
+        write_whole(folder / "response.png", response_png(made))
+        write_whole(folder / "waterfall.png", waterfall_png(made))
+        made.save(folder / "responses.npz")
+        state["finished"] = True
+        write_json(folder / "run.json", state)
+    return Report(folder, len(flown), spread, state["warnings"])
+
+
+def _make(
+    simulator: ChannelSimulator,
+    flown: Trajectory,
+    velocity: NDArray[np.float64],
+    folder: Path,
+    state: dict[str, Any],
+    progress: Callable[[int], None],
+) -> ImpulseResponses:
+    """Make the pings that are missing; ``state`` and run.json follow each batch."""
+    import zarr
+
+    done = int(state["frames_done"])
+    url = folder / "responses.zarr"
+    if done == 0:
+        shape = (len(flown), len(simulator.sonar.receivers))
+        empty = ImpulseResponses(
+            response=np.zeros((*shape, simulator.sonar.taps), np.complex64),
+            time_s=flown.time_s,
+            sonar=simulator.sonar,
+            poses=flown.poses,
+            velocity=velocity,
+            height_m=np.zeros(shape[0]),
+            echoes=np.zeros(shape, np.int64),
+            dropped=np.zeros(shape, np.int64),
+        )
+        empty.save(url)
+    try:
+        group = zarr.open_group(url, mode="r+")
+        for part in simulator.pings(flown.poses[done:], velocity[done:], first=done):
+            here = slice(part.first, part.first + len(part))
+            for name in ("response", "height_m", "echoes", "dropped"):
+                group[name][here] = getattr(part, name)  # type: ignore[index]
+            state["frames_done"] = here.stop
+            write_json(folder / "run.json", state)
+            progress(len(part))
+    except (KeyError, ValueError) as error:
+        raise MitsonarError(f"cannot go on with {url}: {error}; make it again with --overwrite") from None
+    return ImpulseResponses.load(url)
+
+
+def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[Paths]) -> None:
+    """Nothing is heard in the first ping: neither may it be in the middle and the last.
+
+    Raises:
+        MitsonarError: it is not.
+    """
+    sonar = simulator.sonar
+    for pose in flown.poses[[len(flown) // 2, -1]]:
+        if any(simulator.paths(pose, None, receiver).amplitude.size for receiver in range(len(sonar.receivers))):
+            return
+    beyond = sum(path.dropped for path in paths)
+    x, y, z, pitch, *_ = flown.poses[0]
+    height = float(simulator.tracer.height_m(flown.poses[:1])[0])
+    below = f"{height:.3g} m above what is below it" if math.isfinite(height) else "with nothing below it"
+    raise MitsonarError(
+        f"no receiver hears anything: the vehicle is at ({x:g}, {y:g}, {z:g}) m, {below}, pitched by "
+        f"{math.degrees(pitch):.3g} deg; {beyond:,} echoes came from beyond range_max {sonar.range_max:g} m. z is upwards, "
+        "a level vehicle has pitch 0 (to_world's +z is forward), and receivers look tilt_deg away from straight down"
+    )
+
+
+FAR_ARM_M = 10.0
+"""A receiver farther from the transmitter is probably given in millimetres."""
+
+
+def spread_of(paths: list[Paths]) -> Spread:
+    """Spread of the echoes of all receivers, of 98 % of their energy."""
+    energy = np.concatenate([path.amplitude**2 for path in paths])
+    widths = []
+    for values in (np.concatenate([path.delay_s for path in paths]), np.concatenate([path.doppler_hz for path in paths])):
+        order = np.argsort(values)
+        share = np.cumsum(energy[order])
+        if not share.size or share[-1] == 0:
+            return Spread(0.0, 0.0)
+        low, high = np.searchsorted(share, np.array(MOST_ENERGY) * share[-1])
+        widths.append(float(values[order[min(high, len(order) - 1)]] - values[order[low]]))
+    return Spread(*widths)
+
+
+def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
+    """What the user should know of a run, a sentence each."""
+    sentences = []
+    assert made.echoes is not None
+    assert made.dropped is not None
+    for number, receiver in enumerate(made.sonar.receivers):
+        silent = int((made.echoes[:, number] == 0).sum())
+        away = math.dist(receiver.position, (0, 0, 0))
+        if away > FAR_ARM_M:
+            sentences.append(f"receiver {receiver.name} sits {away:g} m from the transmitter: positions are in metres")
+        if silent:
+            looks = receiver.field
+            up = " (more than 90 looks up)" if looks.tilt_deg > 90 else ""
+            pitch = "" if made.poses is None else f" (pitched by {math.degrees(made.poses[0, 3]):.3g} deg)"
+            sentences.append(
+                f"receiver {receiver.name} hears nothing in {silent} of {len(made)} pings: check where it looks "
+                f"(heading {looks.heading_deg:g} deg, tilt {looks.tilt_deg:g} deg from straight down{up}), "
+                f"the vehicle's pose{pitch} and range_max"
+            )
+    dropped = int(made.dropped.sum())
+    if dropped:
+        share = dropped / max(1, dropped + int(made.echoes.sum()))
+        sentences.append(
+            f"{dropped:,} echoes ({100 * share:.3g} %) came from beyond range_max {made.sonar.range_max:g} m and were "
+            "dropped: raise it, with a frequency_step_hz below sound_speed / (4 range_max)"
+        )
+    if spread.factor > OVERSPREAD:
+        sentences.append(
+            f"the channel is overspread: delays over {1e3 * spread.delay_s:.3g} ms times Doppler shifts over "
+            f"{spread.doppler_hz:.3g} Hz make {spread.factor:.2g}, above {OVERSPREAD:g}; it changes while it is measured, "
+            "and a real sounder would see it blurred"
+        )
+    return sentences
+
+
+def iteration_error(flown: Trajectory, velocity: NDArray[np.float64], sonar: ChannelSonar) -> tuple[float, float]:
+    """What the thesis's two rounds (eq. 5.5-5.14) leave of a moving receiver's delay: largest static error and that of two
+    rounds, in turns of the carrier, for points ahead and behind at ``range_max``."""
+    speed = float(np.linalg.norm(velocity[:, :3], axis=1).max(initial=0.0))
+    ahead = (np.array([sonar.range_max, -sonar.range_max]), np.zeros(2), np.zeros(2))
+    moving = (np.full(2, speed), np.zeros(2), np.zeros(2))
+    exact = delay_exact(ahead, ahead, moving, sonar.sound_speed)
+    errors = [
+        float(np.abs(delay_iterated(ahead, ahead, moving, sonar.sound_speed, rounds) - exact).max()) * sonar.carrier_hz
+        for rounds in (0, 2)
+    ]
+    return (errors[0], errors[1]) if math.isfinite(sum(errors)) else (0.0, 0.0)

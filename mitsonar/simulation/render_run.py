@@ -1,0 +1,324 @@
+"""Runs on disk: frames, pictures and echoes are written as they are made; a run that is killed goes on to the same bits."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.whole_files import read_json, write_json, write_whole
+from mitsonar.motion.pose import Trajectory
+from mitsonar.plotting.fan_figure import save_fan
+from mitsonar.records.echoes import Echoes, load_exr, save_exr
+from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
+from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.simulation.imaging import Pings, Tally, constant_gain, to_image
+from mitsonar.simulation.variant import ensure_variant
+
+__all__ = ["Outputs", "Report", "Source", "StoredEchoes", "begin", "path_digest", "run", "scene_digest"]
+
+
+class Source(Protocol):
+    """Where levels come from: a simulator that traces, or echoes that were stored."""
+
+    sonar: Sonar
+    notes: list[str]
+    variant: str
+
+    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
+        """Levels of consecutive pings, in batches."""
+
+    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
+        """One ping's echoes in the order of the film."""
+
+    def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
+        """Nearest and farthest return outside the window [m]."""
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a run writes beside its frames."""
+
+    noise: NoiseModel
+    labels: bool = False
+    cartesian: bool = False
+    exr: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a run did."""
+
+    folder: Path
+    frames: int
+    pictures: list[Path]
+    warnings: list[str]
+
+
+def run(
+    source: Source,
+    trajectory: Trajectory,
+    folder: str | Path,
+    outputs: Outputs,
+    *,
+    origin: dict[str, Any],
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Callable[[int], None] = lambda frames: None,
+) -> Report:
+    """Make a run's folder, or go on with one.
+
+    Args:
+        source: where levels come from.
+        trajectory: poses and times.
+        folder: is made; holds ``frames.npz`` (or ``frames.zarr``), ``images/``, ``poses.tum``, ``run.json`` and what
+            ``outputs`` asks for.
+        outputs: what is written.
+        origin: what repeats the run beside sonar, poses and outputs (scene, its digest, parameters); kept in run.json.
+        overwrite: replace a run that is there.
+        resume: go on with a run that was broken off.
+        progress: called with the number of frames that were added.
+
+    Raises:
+        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+    """
+    folder = Path(folder)
+    recipe = _recipe(source, trajectory, outputs, origin)
+    state = begin(folder, recipe, "frames", overwrite=overwrite, resume=resume)
+    trajectory.save_tum(folder / "poses.tum")
+    if not state["finished"]:
+        progress(int(state["frames_done"]))
+        store = _make_frames(source, trajectory, folder, outputs, state, progress)
+        tally = Tally.restore(source.sonar, state["tally"])
+        state["warnings"] = [*source.notes, *tally.warnings(source, trajectory.poses)]
+        write_json(folder / "run.json", state)
+        if len(trajectory) <= LONGEST_NPZ:
+            store.pack(folder / "frames.npz")
+        state["finished"] = True
+        write_json(folder / "run.json", state)
+    pictures = "cartesian" if outputs.cartesian else "images"
+    return Report(folder, len(trajectory), sorted((folder / pictures).glob("*.png")), state["warnings"])
+
+
+def _make_frames(
+    source: Source,
+    trajectory: Trajectory,
+    folder: Path,
+    outputs: Outputs,
+    state: dict[str, Any],
+    progress: Callable[[int], None],
+) -> FrameStore:
+    """Write the frames that are missing; ``state`` and run.json follow each batch."""
+    done, tally, store = int(state["frames_done"]), Tally(source.sonar), None
+    if done > 0:
+        store, tally = FrameStore.open(folder / "frames.zarr"), Tally.restore(source.sonar, state["tally"])
+    if store is not None and done == len(trajectory):
+        return store
+    batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
+    if done == 0:
+        state["gain"], batches = constant_gain(batches)
+    for pings in batches:
+        frames, image = _frames_of(pings, source.sonar, trajectory, outputs.noise, float(state["gain"]))
+        store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
+        _write_pictures(folder, pings.first, frames, outputs)
+        if outputs.exr:
+            _write_echoes(folder, source, frames, pings.first)
+        store.write(pings.first, frames)
+        tally.add(pings, image)
+        state |= {"frames_done": pings.first + len(pings), "tally": tally.state()}
+        write_json(folder / "run.json", state)
+        progress(len(pings))
+    assert store is not None
+    return store
+
+
+class StoredEchoes:
+    """The echoes of a run that was rendered with ``--exr``, as a source: bins again, without tracing.
+
+    Args:
+        folder: the run.
+        sonar: other bins or window than the run's; default: the run's own.
+
+    Raises:
+        MitsonarError: no run, or one without echoes.
+    """
+
+    def __init__(self, folder: str | Path, *, bins: int | None = None, window: tuple[float, float] | None = None) -> None:
+        self.variant = ensure_variant()
+        self.folder = Path(folder)
+        self.about = read_json(self.folder / "run.json")
+        if not (self.folder / "echoes").is_dir():
+            raise MitsonarError(f"{folder} holds no echoes: render the run with --exr first")
+        frames = SonarFrames.load(self.folder)
+        assert frames.poses is not None
+        assert frames.height_m is not None
+        self.trajectory = Trajectory(frames.poses, frames.time_s)
+        self.height_m = frames.height_m
+        self.traced = frames.sonar
+        change: dict[str, Any] = {} if bins is None else {"range_bins": bins}
+        change |= {} if window is None else {"range_min": window[0], "range_max": window[1]}
+        self.sonar = frames.sonar.replace(**change)
+        self.notes: list[str] = []
+
+    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
+        """Levels of the stored frames, one at a time; ``poses`` only tells how many."""
+        import drjit as dr
+        import mitsuba as mi
+
+        from mitsonar.instruments.views import Whole
+        from mitsonar.simulation.binning import accumulate, develop, fetch
+        from mitsonar.simulation.view_echoes import ViewEchoes, WholeTracer
+
+        if labels:
+            raise MitsonarError("labels need the scene: render with --labels")
+        tracer = WholeTracer(Whole(self.sonar))
+        pixel = dr.arange(mi.UInt32, self.traced.rays)
+        beam = pixel % self.traced.columns // self.traced.across
+        for number in range(first, first + len(np.atleast_2d(poses))):
+            stored = self.film_echoes(poses, number)
+            echoes = Echoes(**{name: mi.Float(value) for name, value in vars(stored).items()})
+            sums = accumulate(ViewEchoes(echoes, beam, True, None), mi.UInt32(0), 1, tracer)
+            levels, counts = fetch(*develop(sums, 1, tracer), 1, tracer.view)
+            yield Pings(number, levels, counts, self.height_m[number : number + 1])
+
+    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
+        """The echoes of one frame's EXR."""
+        return load_exr(self.folder / "echoes" / f"{ping:06d}.exr", self.traced)
+
+    def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
+        """Nearest and farthest return outside the window [m]."""
+        return self.film_echoes(pose, ping).outside(self.sonar)
+
+
+def scene_digest(path: str | Path) -> str:
+    """SHA-256 of a scene's XML file; meshes and textures that it names are not read."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def path_digest(trajectory: Trajectory) -> str:
+    """SHA-256 of poses and times."""
+    return hashlib.sha256(np.column_stack([trajectory.poses, trajectory.time_s]).tobytes()).hexdigest()
+
+
+def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dict[str, Any]) -> dict[str, Any]:
+    """All that decides the bits of a run."""
+    return {
+        **origin,
+        "variant": source.variant,
+        "sonar": source.sonar.model_dump(),
+        "frames": len(trajectory),
+        "poses_sha256": path_digest(trajectory),
+        "noise": outputs.noise.model_dump(),
+        "labels": outputs.labels,
+        "cartesian": outputs.cartesian,
+        "exr": outputs.exr,
+    }
+
+
+def begin(folder: Path, recipe: dict[str, Any], what: str, *, overwrite: bool, resume: bool) -> dict[str, Any]:
+    """The state of the run: a new one, in a new folder, or the one that is there and was broken off.
+
+    Args:
+        folder: of the run.
+        recipe: all that decides its bits.
+        what: it makes, ``frames`` or ``responses``: a Zarr group of that name while it goes on, packed as npz in the end.
+        overwrite: replace a run that is there.
+        resume: go on with a run that was broken off.
+
+    Raises:
+        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+    """
+    exists = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    if exists and resume:
+        state = read_json(folder / "run.json")
+        old = state.get("recipe", {})
+        other = [key for key in recipe if recipe[key] != old.get(key)]
+        if other:
+            raise MitsonarError(
+                f"{folder} holds another run, it differs in {', '.join(other)}: resume with the options it was begun "
+                f"with (run.json has them), or choose another folder"
+            )
+        if (folder / f"{what}.npz").exists():  # killed while the store was packed, or finished
+            if what == "frames":
+                shutil.rmtree(folder / "frames.zarr", ignore_errors=True)
+            state["finished"] = True
+            write_json(folder / "run.json", state)
+        return {"finished": False, "frames_done": 0, "warnings": []} | state
+    if exists and not overwrite:
+        raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o, or --resume, or --overwrite")
+    if exists:
+        if not (folder / "run.json").is_file():
+            raise MitsonarError(f"{folder} is not a run of mitsonar and is not overwritten: choose another -o")
+        shutil.rmtree(folder)
+    state = {"finished": False, "frames_done": 0, "warnings": [], "recipe": recipe, "versions": _versions()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "run.json", state)
+    except OSError as error:
+        raise MitsonarError(f"cannot write {folder}: {error.strerror}; choose another -o") from None
+    return state
+
+
+def _frames_of(
+    pings: Pings, sonar: Sonar, trajectory: Trajectory, noise: NoiseModel, gain: float
+) -> tuple[SonarFrames, NDArray[np.float32]]:
+    """A batch as frames, and its images before noise."""
+    image = to_image(pings, gain)
+    numbers = np.arange(pings.first, pings.first + len(pings))
+    frames = SonarFrames(
+        image=np.ascontiguousarray(noise.apply(image, seed=sonar.seed, frames=numbers)),
+        range_m=sonar.range_m,
+        bearing_rad=sonar.bearing_rad,
+        time_s=trajectory.time_s[numbers],
+        sonar=sonar,
+        poses=trajectory.poses[numbers],
+        height_m=pings.height_m,
+        level_scale=1 / gain,
+        **pings.labels,
+    )
+    return frames, image
+
+
+def _write_pictures(folder: Path, first: int, frames: SonarFrames, outputs: Outputs) -> None:
+    (folder / "images").mkdir(exist_ok=True)
+    for index, picture in enumerate(to_uint8(frames.image)):
+        buffer = io.BytesIO()
+        Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
+        write_whole(folder / "images" / f"{first + index:06d}.png", buffer.getvalue())
+    if outputs.cartesian:
+        (folder / "cartesian").mkdir(exist_ok=True)
+        for index in range(len(frames)):
+            title = f"{frames.sonar.name}, {frames.sonar.model}, frame {first + index}"
+            save_fan(folder / "cartesian" / f"{first + index:06d}.png", frames, index, title=title)
+
+
+def _write_echoes(folder: Path, source: Source, frames: SonarFrames, first: int) -> None:
+    (folder / "echoes").mkdir(exist_ok=True)
+    assert frames.poses is not None
+    for index, pose in enumerate(frames.poses):
+        path = folder / "echoes" / f"{first + index:06d}.exr"
+        part = path.with_name(f".{path.stem}.part.exr")
+        save_exr(part, source.film_echoes(pose, first + index), source.sonar)
+        part.replace(path)
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in ("mitsonar", "mitsuba", "drjit", "numpy"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed as a package"
+    return found

@@ -1,0 +1,96 @@
+"""Scenes from Mitsuba XML files, the user's or shipped ones, and the sonar that stands in them."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose
+from mitsonar.simulation.variant import ensure_variant
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["channel_sonar_in", "find_scene", "load_scene", "shipped_scenes", "shipped_trajectory", "sonar_in"]
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """The scenes of the package by name, each with a trajectory of the same name beside it."""
+    folder = Path(str(files("mitsonar.scenes")))
+    return {path.stem: path for path in sorted(folder.glob("*.xml"))}
+
+
+def shipped_trajectory(name: str) -> Path:
+    """The trajectory to fly in a shipped scene (TUM)."""
+    return find_scene(name).with_suffix(".tum")
+
+
+def find_scene(name_or_file: str | Path) -> Path:
+    """The XML file of that path, or the shipped scene of that name.
+
+    Raises:
+        MitsonarError: neither.
+    """
+    path = Path(name_or_file)
+    if path.is_file():
+        return path
+    shipped = shipped_scenes()
+    if str(name_or_file) in shipped:
+        return shipped[str(name_or_file)]
+    if path.is_dir():
+        raise MitsonarError(f"scene {path} is a folder: give the XML file in it")
+    names = nearest_names(path.stem, shipped)
+    raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or the name of a shipped scene, {names}")
+
+
+def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
+    """Load a Mitsuba scene; ``parameters`` replace its ``$name`` values, as in ``mi.load_file``.
+
+    Raises:
+        MitsonarError: missing file, malformed XML, a plugin that refuses its properties.
+    """
+    path = find_scene(name_or_file)
+    ensure_variant()
+    import mitsuba as mi
+
+    try:
+        texts: dict[str, Any] = {key: str(value) for key, value in parameters.items()}
+        # merged meshes would lose their ids; in parallel, one load in some 150 failed on a good file, and none is faster
+        scene = mi.load_file(str(path), optimize=False, parallel=False, **texts)
+    except Exception as error:
+        raise MitsonarError(f"cannot load scene {path}: {_reason(error)}") from error
+    if not isinstance(scene, mi.Scene):
+        raise MitsonarError(f"{path} holds a {type(scene).__name__.lower()}, not a scene: wrap it in <scene>")
+    return scene
+
+
+def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
+    """Sonar and pose of the scene's ``imaging_sonar`` number ``index``; None where there is none. Cameras are ignored."""
+    from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
+
+    found = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
+    return (found[index].sonar, found[index].pose) if index < len(found) else None
+
+
+def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pose] | None:
+    """Instrument and pose of the scene's ``channel_sonar`` number ``index``; None where there is none."""
+    from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
+
+    found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
+    return (found[index].sonar, found[index].pose) if index < len(found) else None
+
+
+def _reason(error: BaseException) -> str:
+    """Mitsuba's complaint in one line: our own error where a plugin raised one, else all but the traceback in it."""
+    text = str(error).strip()
+    ours = re.findall(r"^mitsonar\.errors\.MitsonarError: (.+)$", text, flags=re.MULTILINE)
+    if ours:
+        return str(ours[-1])
+    head, _, trace = text.partition("Traceback (most recent call last):")
+    said = f"{head} {trace.strip().splitlines()[-1]}" if trace.strip() else head
+    return " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", said).split())

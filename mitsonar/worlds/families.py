@@ -1,0 +1,45 @@
+"""The kinds of world by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import ValidationError
+
+from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.worlds.flat_objects import FlatObjects
+from mitsonar.worlds.pattern import Pattern
+from mitsonar.worlds.rocky_field import RockyField
+from mitsonar.worlds.scene_file import SceneFile
+from mitsonar.worlds.ship_hull import ShipHull
+from mitsonar.worlds.world import Family
+
+__all__ = ["FAMILIES", "create_family"]
+
+FAMILIES: dict[str, type[Family]] = {
+    "rocky-field": RockyField,
+    "ship-hull": ShipHull,
+    "pattern": Pattern,
+    "flat-objects": FlatObjects,
+}
+
+
+SEE_SCENE = " (see docs/dataset.md, `A scene of your own`)"
+
+
+def create_family(name: str, **fields: Any) -> Family:
+    """The family of that name with these numbers, the others the thesis's; or ``scene``, a file of the user's own.
+
+    Raises:
+        MitsonarError: unknown name or key, or a number outside its limits.
+    """
+    known: dict[str, type[Family]] = {**FAMILIES, "scene": SceneFile}
+    if name not in known:
+        raise MitsonarError(f"unknown world {name!r}: {nearest_names(name, known)}")
+    family = known[name]
+    try:
+        return family(**fields)
+    except ValidationError as error:
+        raise MitsonarError(
+            complaint(error, family, name, SEE_SCENE if name == "scene" else f" (see `mitsonar world {name} --help`)")
+        ) from None

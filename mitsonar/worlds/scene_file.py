@@ -1,0 +1,38 @@
+"""The world ``scene``: a Mitsuba XML file of the user's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from mitsonar.errors import MitsonarError
+from mitsonar.worlds.world import Family, World
+
+__all__ = ["SceneFile"]
+
+
+class SceneFile(Family):
+    """A scene that is there already; the seed only decides how the vehicle moves in it."""
+
+    file: str = Field(description="the XML file; in a recipe, relative to the recipe's folder")
+    size_m: float = Field(gt=0, le=1e6, description="edge of the square around the origin to stay inside [m]")
+    parameters: dict[str, str] = Field(default_factory=dict, description="values of the scene's $names")
+
+    @property
+    def half_m(self) -> float:
+        return self.size_m / 2
+
+    @property
+    def seeded(self) -> bool:
+        return False
+
+    def build(self, seed: int) -> World:
+        raise MitsonarError(f"{self.file} is a scene already: there is nothing to build")
+
+    def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
+        """The file as it is."""
+        if not Path(self.file).is_file():
+            raise MitsonarError(f"no scene file {self.file}: world.file must name a Mitsuba XML file that is there")
+        return Path(self.file), self.parameters

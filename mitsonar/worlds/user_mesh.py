@@ -1,0 +1,215 @@
+"""A user's own model, textured or not, as a world."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from mitsonar.errors import MitsonarError
+from mitsonar.worlds.world import Floor, Mesh, Standpoint, World
+
+__all__ = ["FORMATS", "mesh_world"]
+
+FORMATS = (".glb", ".gltf", ".obj", ".stl", ".dae", ".ply")
+UNCOLOURED = 0.5
+"""Reflectivity of a model without colours, as of BSDFs that have none."""
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
+"""Rows of the turn that brings each axis up, by even permutations: nothing is mirrored."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One geometry of a model: triangles with one value each, or with uv and a picture."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    reflectivity: NDArray[np.float64] | None = None
+    uv: NDArray[np.float64] | None = None
+    picture: bytes | None = None
+
+
+def mesh_world(
+    path: str | Path,
+    *,
+    scale: float = 1.0,
+    up: str | None = None,
+    reflectivity: str | float = "luminance",
+    floor: bool = True,
+    floor_m: float | None = None,
+) -> World:
+    """The world of a model: turned z up, scaled, its lowest point on a seabed at z = 0, its middle at the origin.
+
+    Args:
+        path: glTF, OBJ, STL, COLLADA or PLY.
+        scale: metres a unit of the file.
+        up: the file's axis that points up, x, y or z; default: y for glTF, z otherwise.
+        reflectivity: ``luminance`` (of linear light, as Mitsuba computes it), ``red`` (the red channel as stored, as the
+            thesis does), or one number for all.
+        floor: a seabed of random cells of 15 mm below.
+        floor_m: edge of that seabed [m]; default: three times the model's diagonal.
+
+    Raises:
+        MitsonarError: unreadable, broken or empty model; scale, axis or reflectivity that is not allowed.
+    """
+    path = Path(path)
+    up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
+    if up not in UP:
+        raise MitsonarError(f"up must be x, y or z: got {up!r}")
+    if not (np.isfinite(scale) and scale > 0):
+        raise MitsonarError(f"scale must be a finite number above 0, metres a unit of the file: got {scale:g}")
+    if floor_m is not None and not 0 < floor_m <= 10_000:
+        raise MitsonarError(f"floor_m must lie in 0..10000 m: got {floor_m:g}")
+    value = _value(reflectivity)
+    pieces = [_piece(geometry, value) for geometry in _geometries(path)]
+    turn = np.array(UP[up], dtype=float) * scale
+    corners = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    if not np.isfinite(corners).all() or np.ptp(corners, axis=0).max() <= 0:
+        raise MitsonarError(f"{path} is broken: its vertices are not finite or all in one place; export it again")
+    shift = np.array([*(low + high)[:2] / 2, low[2]])
+    meshes, content = _merge(pieces, turn, shift)
+    radius = float(np.linalg.norm(high - low)) / 2
+    half = 3 * radius if floor_m is None else floor_m / 2
+    return World(
+        about=f"{path.name}: {sum(len(piece.faces) for piece in pieces)} triangles, "
+        f"{' x '.join(f'{edge:.4g}' for edge in high - low)} m, reflectivity {reflectivity}",
+        meshes=meshes,
+        stand=_stand(radius, (high - low)[2]),
+        floor=Floor(half, Floor.cells(int(np.clip(round(2 * half / 0.015), 1, 2**20)), (0, 1), 0)) if floor else None,
+        content=content,
+    )
+
+
+def _stand(radius: float, height: float) -> Standpoint:
+    """So far away, 30 deg above, that the model fills a field of view of 29 deg."""
+    away = 1.1 * radius / np.tan(np.radians(14.5))
+    middle = height / 2
+    sin, cos = np.sin(np.radians(30)), np.cos(np.radians(30))
+    window = (max(away - 1.5 * radius, 0.01), away + 2.5 * radius)
+    return Standpoint((0, -away * cos, middle + away * sin), (0, 0, middle), window=window)
+
+
+def _value(reflectivity: str | float) -> str | float:
+    """``red``, ``luminance``, or a number."""
+    if reflectivity in ("red", "luminance"):
+        return reflectivity
+    try:
+        number = float(reflectivity)
+    except ValueError:
+        number = np.nan
+    if not 0 <= number <= 1:
+        raise MitsonarError(f"reflectivity must be red, luminance or a number 0..1: got {reflectivity!r}")
+    return number
+
+
+def _geometries(path: Path) -> list[trimesh.Trimesh]:
+    """The triangles of a file, moved to where its scene graph puts them."""
+    if not path.is_file():
+        raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
+    if path.suffix.lower() not in FORMATS:
+        raise MitsonarError(
+            f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}"
+        )
+    try:
+        scene = trimesh.load_scene(path, process=False)
+        found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
+        for geometry in found:
+            if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
+                raise ValueError("a triangle names a vertex that is not there")
+    except Exception as error:  # readers raise whatever the bytes lead them to
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
+    if not found:
+        raise MitsonarError(f"{path} holds no triangles: export a mesh, not points or lines")
+    return found
+
+
+def _piece(geometry: trimesh.Trimesh, value: str | float) -> _Piece:
+    """A geometry with its reflectivity."""
+    vertices, faces = np.asarray(geometry.vertices, dtype=float), np.asarray(geometry.faces)
+    if not isinstance(value, str):
+        return _Piece(vertices, faces, np.full(len(faces), value))
+    visual: Any = geometry.visual
+    if visual.kind == "texture":
+        material = visual.material
+        picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        factor = _tint(material, value)
+        if picture is None or visual.uv is None or len(visual.uv) != len(vertices):
+            return _Piece(vertices, faces, np.full(len(faces), factor))
+        # trimesh counts v upwards, Mitsuba's bitmaps from the top row
+        uv = np.asarray(visual.uv, dtype=float) * (1, -1) + (0, 1)
+        return _Piece(vertices, faces, uv=uv, picture=_grey_png(picture, value, factor))
+    if visual.kind is None:
+        return _Piece(vertices, faces, np.full(len(faces), UNCOLOURED))
+    if visual.kind == "vertex":
+        return _Piece(vertices, faces, _one(_colours(visual.vertex_colors), value)[faces].mean(axis=1))
+    return _Piece(vertices, faces, _one(_colours(visual.face_colors), value))
+
+
+def _tint(material: Any, value: str) -> float:
+    """One number of a material's own colour, 0..1; a picture is multiplied by it."""
+    if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear already, white where it is not given
+        factor = material.baseColorFactor
+        colour = np.ones(3) if factor is None else _colours(factor)[0]
+        return float(colour[0] if value == "red" else colour @ LUMINANCE)
+    if getattr(material, "image", None) is not None:
+        return 1.0
+    return float(_one(_colours(material.main_color), value)[0])
+
+
+def _colours(values: Any) -> NDArray[np.float64]:
+    """RGB in 0..1 ``(n, 3)`` of 8-bit or fractional RGB(A)."""
+    table = np.atleast_2d(np.asarray(values))
+    scale = 255 if np.issubdtype(table.dtype, np.integer) else 1
+    return np.clip(table[:, :3].astype(float) / scale, 0, 1)
+
+
+def _one(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
+    """One number of colours ``(..., 3)`` as stored: red, or the luminance of the linear light that sRGB stands for."""
+    if value == "red":
+        return colours[..., 0]
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear @ LUMINANCE, dtype=np.float64)
+
+
+def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
+    """The picture's reflectivity as a 16-bit grey PNG."""
+    grey = _one(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
+    pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _merge(
+    pieces: list[_Piece], turn: NDArray[np.float64], shift: NDArray[np.float64]
+) -> tuple[list[Mesh], dict[str, bytes]]:
+    """One mesh of all plain pieces, and one for each picture."""
+    groups: dict[bytes | None, list[tuple[int, _Piece]]] = {}
+    for number, piece in enumerate(pieces, start=1):
+        groups.setdefault(piece.picture, []).append((number, piece))
+    meshes: list[Mesh] = []
+    content: dict[str, bytes] = {}
+    for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # the plain ones first
+        vertices = np.concatenate([piece.vertices @ turn.T - shift for _, piece in members])
+        first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
+        faces = np.concatenate([piece.faces + start for (_, piece), start in zip(members, first, strict=False)])
+        ids = np.concatenate([np.full(len(piece.faces), number) for number, piece in members])
+        if picture is None:
+            values = np.concatenate([piece.reflectivity for _, piece in members if piece.reflectivity is not None])
+            meshes.append(Mesh("model", vertices, faces, values, ids))
+        else:
+            name = f"textured_{len(content)}"
+            uv = np.concatenate([piece.uv for _, piece in members if piece.uv is not None])
+            content[f"textures/{name}.png"] = picture
+            meshes.append(Mesh(name, vertices, faces, None, ids, uv, f"textures/{name}.png"))
+    return meshes, content

@@ -1,0 +1,148 @@
+"""The sensor ``channel_sonar``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.instruments.channel_sonar import LOOKS, ChannelSonar, FieldOfView, four_receivers
+from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
+
+__all__ = ["ChannelSensor", "is_channel_sonar"]
+
+FIELD = tuple(FieldOfView.model_fields)
+OWN = tuple(name for name in ChannelSonar.model_fields if name not in ("transmitter", "receivers"))
+
+
+class ChannelSensor(mi.Sensor):
+    """A transmitter and named receivers between which channel impulse responses are measured.
+
+    Properties: those of :class:`mitsonar.instruments.channel_sonar.ChannelSonar` (``carrier_hz`` [Hz, 80000],
+    ``bandwidth_hz`` [Hz,
+    4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max`` [m, 25],
+    ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``, ``points_per_m2`` [1700],
+    ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front, left, back, right]: names with commas between; fields
+    of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg`` [deg,
+    50], ``taper`` [0.5]; of one: the same and ``heading_deg`` with its name before, ``front_heading_deg``, and its place,
+    ``front_position`` [m, starboard, forward, up]; of the transmitter: ``transmitter_shape`` [all] and so on; ``to_world``:
+    of the vehicle, local +z forward, +y up.
+
+    Receivers that are called front, left, back or right stand 0.1 m from the transmitter and look that way unless told
+    otherwise; others must have a heading and a position. As a camera it sends one ray, forward: responses are made by
+    ``mitsonar impulse``. It does not model a vehicle that shadows its own receivers, several bounces, or the way between
+    transmitter and receiver.
+
+    .. code-block:: xml
+
+        <sensor type="channel_sonar">
+            <string name="receivers" value="front, keel"/>
+            <float name="keel_heading_deg" value="90"/>
+            <point name="keel_position" value="0.2, 0, -0.1"/>
+            <float name="keel_across_deg" value="4"/>
+            <float name="carrier_hz" value="80000"/>
+            <transform name="to_world">
+                <lookat origin="0, 0, 10" target="0, 1, 10" up="0, 0, 1"/>
+            </transform>
+        </sensor>
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.sonar = _read(props)
+        if not any(isinstance(child, mi.Film) for _, child in props.objects(mark_queried=False)):
+            one = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance", "rfilter": {"type": "box"}}
+            props["film"] = mi.load_dict(one)
+        super().__init__(props)
+        self.pose  # noqa: B018  a to_world that scales is refused here
+
+    @property
+    def pose(self) -> Pose:
+        """Where ``to_world`` puts the vehicle."""
+        return pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
+
+    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """A ray forward, and weight 1."""
+        matrix = to_world_matrices(self.pose)[0]
+        ray = dr.zeros(mi.Ray3f, dr.width(sample2))
+        ray.o, ray.d = mi.Point3f(*map(float, matrix[:3, 3])), mi.Vector3f(*map(float, matrix[:3, 2]))
+        ray.maxt, ray.time = dr.largest(mi.Float), time
+        return ray, mi.Spectrum(1.0)
+
+    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """As :meth:`sample_ray`."""
+        ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+        return mi.RayDifferential3f(ray), weight
+
+    def to_string(self) -> str:
+        return f"ChannelSensor[{self.sonar!r}]"
+
+
+def is_channel_sonar(sensor: mi.Sensor) -> bool:
+    """Whether a sensor is one, also of an earlier load of this module: the class is made anew with each variant."""
+    return any(base.__name__ == ChannelSensor.__name__ for base in type(sensor).__mro__)
+
+
+def _read(props: mi.Properties) -> ChannelSonar:
+    """The instrument that the properties say."""
+    fields = _some(props, OWN)
+    shared = _some(props, tuple(name for name in FIELD if name != "heading_deg"))
+    sends = {"shape": "all", **_some(props, FIELD, "transmitter_")}
+    names = [name.strip() for name in str(props.get("receivers", ", ".join(LOOKS))).split(",")]
+    known = {receiver.name: receiver.model_dump() for receiver in four_receivers()}
+    receivers = []
+    for name in names:
+        own = _some(props, FIELD, f"{name}_")
+        if not name.isidentifier():
+            raise MitsonarError(f"receivers are names with commas between them, as 'bow, port': got {props['receivers']!r}")
+        made = known.get(name, {"name": name, "field": {}})
+        if f"{name}_position" in props:
+            made["position"] = _place(f"{name}_position", props[f"{name}_position"])
+        receivers.append({**made, "field": {**made["field"], **shared, **own}})
+        missing = [
+            key for key, there in (("heading_deg", "heading_deg" in own), ("position", "position" in made)) if not there
+        ]
+        if name not in known and missing:
+            _refuse_unknown(props, names)
+            keys = " and ".join(f"{name}_{key}" for key in missing)
+            raise MitsonarError(
+                f"receiver {name!r} must be told where it is and looks: give {keys} (position: a point, starboard, forward, "
+                "up in m; heading: 0 forward, 90 to starboard); front, left, back and right know theirs"
+            )
+    _refuse_unknown(props, names)
+    return ChannelSonar.create(**fields, transmitter=sends, receivers=receivers)
+
+
+def _place(key: str, value: Any) -> tuple[float, ...]:
+    """A point, or three numbers with commas."""
+    try:
+        given = value.replace(",", " ").split() if isinstance(value, str) else np.ravel(value)
+        place = tuple(float(number) for number in given)
+    except (TypeError, ValueError):
+        place = ()
+    if len(place) != 3:
+        example = f'<point name="{key}" value="0, 0.3, 0"/>'
+        raise MitsonarError(f"{key} is a point, starboard, forward, up in m, {example}: got {value!r}")
+    return place
+
+
+def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
+    """Properties that the sensor does not have.
+
+    Raises:
+        MitsonarError: some.
+    """
+    known = {*OWN, *FIELD, "receivers", "to_world", "id", *(f"transmitter_{key}" for key in FIELD)} - {"heading_deg"}
+    known |= {f"{name}_{key}" for name in names for key in (*FIELD, "position")}
+    for key in props:
+        if key not in known and props.type(key) not in (mi.Properties.Type.Object, mi.Properties.Type.Reference):
+            raise MitsonarError(f"the sensor channel_sonar has no property {key!r}: {nearest_names(key, sorted(known))}")
+
+
+def _some(props: mi.Properties, names: tuple[str, ...], before: str = "") -> dict[str, Any]:
+    return {name: props[before + name] for name in names if before + name in props}
+
+
+mi.register_sensor("channel_sonar", ChannelSensor)

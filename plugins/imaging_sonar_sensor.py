@@ -1,0 +1,213 @@
+"""The sensor ``imaging_sonar``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import sonar_from
+from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
+from mitsonar.plugins.hashed_texture import ROUNDS
+
+__all__ = ["Fan", "ImagingSonar", "is_imaging_sonar"]
+
+
+@dataclass
+class Fan:
+    """Rays in the sensor's frame (local +z the acoustic axis, +y up, +x port).
+
+    Attributes:
+        d: unit direction.
+        lift: its derivative by elevation.
+        side: its derivative by bearing.
+        below: elevation of the lower edge of the ray's cell, relative to the ray [rad], <= 0.
+        above: of the upper edge, >= 0.
+        aside: bearing of the cell's middle, relative to the ray [rad].
+        solid_angle: of the ray's cell [sr].
+        elevation: of the ray [rad].
+    """
+
+    d: mi.Vector3f
+    lift: mi.Vector3f
+    side: mi.Vector3f
+    below: mi.Float
+    above: mi.Float
+    aside: mi.Float
+    solid_angle: mi.Float
+    elevation: mi.Float
+
+    def carried(self, lines: list[mi.Vector4f]) -> Fan:
+        """The same rays in the world's axes; ``lines`` are the first three rows of ``to_world``."""
+        return replace(self, **{name: carried(lines, getattr(self, name)) for name in ("d", "lift", "side")})
+
+
+class ImagingSonar(mi.Sensor):
+    """Fans of rays as an imaging sonar sends them: one pixel of the film is one ray.
+
+    Column ``beam * rays_across + k`` of the film is the k-th ray across a beam, most to port first; row 0 is the
+    highest elevation. Direction for azimuth or bearing b and elevation e, as (starboard, forward, up):
+    ``bearing: azimuth`` (cos e sin b, cos e cos b, sin e); ``bearing: cone``, what a line array measures,
+    (sin b, cos b cos e, cos b sin e).
+
+    Properties: those of :class:`mitsonar.instruments.imaging_sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
+    ``elevation_fov_deg`` [deg, 14],
+    ``beams`` [96], ``rays_per_beam`` [700], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512],
+    ``sound_speed`` [m/s, 1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing],
+    ``rays_across`` [4], ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0],
+    ``frame_rate_hz`` [Hz, 10]); ``preset``, a name that the others change; ``ping`` [0], which draw of the jitter;
+    ``to_world``. A film may be given if it says the same as beams and rays do.
+
+    It does not model side lobes, beam patterns within the width, or a sonar that moves during a ping.
+
+    .. code-block:: xml
+
+        <sensor type="imaging_sonar">
+            <string name="preset" value="didson300"/>
+            <transform name="to_world">
+                <lookat origin="0, 0, 2.5" target="0, 3.57, 0" up="0, 0, 1"/>
+            </transform>
+        </sensor>
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        self.sonar = _read_sonar(props)
+        self.ping = int(props.get("ping", 0))
+        if self.ping < 0:
+            raise MitsonarError(f"ping must be 0 or more: got {self.ping}")
+        if not any(isinstance(child, mi.Film) for _, child in props.objects(mark_queried=False)):
+            props["film"] = self._film()
+        super().__init__(props)
+        self._check_film()
+        self.pose  # noqa: B018  a to_world that scales is refused here
+
+    @property
+    def pose(self) -> Pose:
+        """Where ``to_world`` puts the sonar."""
+        return pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
+
+    def lines(self) -> list[mi.Vector4f]:
+        """The first three rows of ``to_world``, as :func:`carried` wants them."""
+        return [mi.Vector4f(*map(float, row)) for row in to_world_matrices(self.pose)[0, :3].astype(np.float32)]
+
+    # ---------------------------------------------------------------- the law of the rays
+
+    def fan(self, column: mi.UInt32, row: mi.UInt32, key: mi.UInt32) -> Fan:
+        """The ray of each cell; ``key`` (see :meth:`key`) draws its place within the cell where the sonar jitters."""
+        sonar = self.sonar
+        beam, step = column // sonar.across, column % sonar.across
+        across, along = self._place_in_cell(row * sonar.columns + column, key)
+        width = sonar.beam_width_rad / sonar.across
+        height = np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
+        middle = self._axis(beam) + (mi.Float(step) + (0.5 - sonar.across / 2)) * width
+        level = (mi.Float(row) + (0.5 - sonar.rays_per_beam / 2)) * -height
+        sin_b, cos_b = dr.sincos(middle + (across - 0.5) * width)
+        elevation = level - (along - 0.5) * height
+        sin_e, cos_e = dr.sincos(elevation)
+        if sonar.bearing == "azimuth":
+            d = _local(cos_e * sin_b, cos_e * cos_b, sin_e)
+            lift = _local(-sin_e * sin_b, -sin_e * cos_b, cos_e)
+            side = _local(cos_e * cos_b, -cos_e * sin_b, mi.Float(0))
+            solid_angle = dr.cos(level) * (2 * np.sin(height / 2) * width)
+        else:
+            d = _local(sin_b, cos_b * cos_e, cos_b * sin_e)
+            lift = _local(mi.Float(0), -cos_b * sin_e, cos_b * cos_e)
+            side = _local(cos_b, -sin_b * cos_e, -sin_b * sin_e)
+            solid_angle = dr.cos(middle) * (2 * np.sin(width / 2) * height)
+        below, above, aside = (along - 1) * height, along * height, (0.5 - across) * width
+        return Fan(d, lift, side, below, above, aside, solid_angle, elevation)
+
+    def key(self, ping: int) -> int:
+        """32 bits that stand for (seed, ping) in the jitter's hash."""
+        return int(np.random.SeedSequence((self.sonar.seed, ping)).generate_state(1)[0])
+
+    def _axis(self, beam: mi.UInt32) -> mi.Float:
+        """Bearing of a beam's axis [rad]; the same law as ``Sonar.bearing_rad``."""
+        half = np.radians(self.sonar.azimuth_fov_deg) / 2
+        place = (mi.Float(beam) + (0.5 - self.sonar.beams / 2)) * (2 / self.sonar.beams)
+        return place * half if self.sonar.beam_layout == "even" else dr.asin(place * np.sin(half))
+
+    def _place_in_cell(self, ray: mi.UInt32, key: mi.UInt32) -> tuple[mi.Float, mi.Float]:
+        """Across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray)."""
+        if not self.sonar.jittered:
+            return mi.Float(0.5), mi.Float(0.5)
+        first, second = mi.sample_tea_32(ray, key, ROUNDS)
+        return (mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24
+
+    # ---------------------------------------------------------------- what Mitsuba asks of a sensor
+
+    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """The ray of the film's cell that ``sample2`` lies in, and weight 1."""
+        fan = self.film_fan(sample2)
+        lines = self.lines()
+        ray = dr.zeros(mi.Ray3f, dr.width(fan.d))
+        ray.o = mi.Point3f(*(line.w for line in lines))
+        ray.d = carried(lines, fan.d)
+        ray.maxt = dr.largest(mi.Float)
+        ray.time = time
+        return ray, mi.Spectrum(1.0)
+
+    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+        """As :meth:`sample_ray`; a sonar's rays have no differentials."""
+        ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+        return mi.RayDifferential3f(ray), weight
+
+    def film_fan(self, position: mi.Point2f) -> Fan:
+        """The rays of film positions 0..1."""
+        column = mi.UInt32(position.x * self.sonar.columns)
+        row = mi.UInt32(position.y * self.sonar.rays_per_beam)
+        return self.fan(column, row, dr.opaque(mi.UInt32, self.key(self.ping)))
+
+    def to_string(self) -> str:
+        return f"ImagingSonar[{self.sonar!r}]"
+
+    def _film(self) -> mi.Film:
+        return mi.load_dict(
+            {
+                "type": "hdrfilm",
+                "width": self.sonar.columns,
+                "height": self.sonar.rays_per_beam,
+                "pixel_format": "luminance",
+                "component_format": "float32",
+                "rfilter": {"type": "box"},
+            }
+        )
+
+    def _check_film(self) -> None:
+        film, wanted = self.film(), (self.sonar.columns, self.sonar.rays_per_beam)
+        size, crop = (tuple(int(n) for n in film.size()), tuple(int(n) for n in film.crop_size()))
+        if size != wanted or crop != wanted:
+            raise MitsonarError(
+                f"the film must be {wanted[0]} x {wanted[1]} pixels, rays side by side x rays over elevation: got "
+                f"{crop[0]} x {crop[1]}; remove the film from the sensor, it follows from beams and rays"
+            )
+        if not film.rfilter().is_box_filter():
+            raise MitsonarError("the film must have a box filter, one ray a pixel: remove the film from the sensor")
+
+
+def _read_sonar(props: mi.Properties) -> Sonar:
+    names = ("preset", *(name for name in Sonar.model_fields if name != "name"))
+    return sonar_from({name: props[name] for name in names if name in props})
+
+
+def _local(starboard: mi.Float, forward: mi.Float, up: mi.Float) -> mi.Vector3f:
+    """From (starboard, forward, up) to the sensor's axes."""
+    return mi.Vector3f(-starboard, up, forward)
+
+
+def carried(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
+    """A direction from the sensor's axes to the world's, by the same products wherever rays are made."""
+    return mi.Vector3f(*(line.x * v.x + line.y * v.y + line.z * v.z for line in lines))
+
+
+def is_imaging_sonar(sensor: mi.Sensor) -> bool:
+    """Whether a sensor is one, also of an earlier load of this module: the class is made anew with each variant."""
+    return any(base.__name__ == ImagingSonar.__name__ for base in type(sensor).__mro__)
+
+
+mi.register_sensor("imaging_sonar", ImagingSonar)

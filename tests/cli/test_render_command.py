@@ -1,0 +1,308 @@
+"""The command line as a user meets it: what it writes, what it answers to mistakes, what survives a kill."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import Command, by_itself, refused
+from PIL import Image
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.errors import MitsonarError
+from mitsonar.motion.pose import Trajectory
+from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
+from mitsonar.simulation.scene import load_scene, shipped_scenes, shipped_trajectory, sonar_in
+
+SENSOR = """<sensor type="imaging_sonar">
+  <integer name="beams" value="16"/><integer name="rays_per_beam" value="60"/><integer name="rays_across" value="2"/>
+  <integer name="range_bins" value="64"/>
+  <transform name="to_world"><lookat origin="0,0,2.5" target="0,3.57,0" up="0,0,1"/></transform>
+</sensor>"""
+FLOOR = """<shape type="rectangle" id="floor"><transform name="to_world"><scale value="100"/></transform>
+  <bsdf type="diffuse"><texture type="cell_noise" name="reflectance"><integer name="cells" value="$cells"/></texture></bsdf>
+</shape>"""
+DEFAULT = '<default name="cells" value="8000"/>'
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A floor of noise under a small sonar."""
+    path = tmp_path / "floor.xml"
+    path.write_text(f'<scene version="3.0.0">{DEFAULT}{SENSOR}{FLOOR}</scene>')
+    return path
+
+
+def test_render_writes_all_that_it_promises(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = [
+        "--frames",
+        3,
+        "--to",
+        "0.2,0.1,2.5,35,0,5",
+        "--cartesian",
+        "--exr",
+        "--labels",
+        "--noise",
+        "low",
+        "--seed",
+        4,
+    ]
+    done = mitsonar("render", scene, "-o", out, *options)
+    assert done.returncode == 0, done.stderr
+    assert str(out) in done.stdout
+    frames = SonarFrames.load(out)
+    assert frames.image.shape == (3, 64, 16)
+    assert frames.image.dtype == np.float32
+    assert frames.shape_id is not None
+    assert set(np.unique(frames.shape_id)) <= {-1, 0}
+    np.testing.assert_allclose(frames.height_m, 2.5, atol=1e-5)
+    for index in range(3):
+        picture = np.array(Image.open(out / "images" / f"{index:06d}.png"))
+        np.testing.assert_array_equal(picture, to_uint8(frames.image[index]))
+        assert (out / "cartesian" / f"{index:06d}.png").stat().st_size > 5000
+        assert (out / "echoes" / f"{index:06d}.exr").is_file()
+    path = Trajectory.load_tum(out / "poses.tum")
+    np.testing.assert_allclose(path.poses, frames.poses, atol=1e-7)
+    np.testing.assert_allclose(path.poses[-1], [0.2, 0.1, 2.5, np.radians(35), 0, np.radians(5)], atol=1e-7)
+    about = json.loads((out / "run.json").read_text())
+    assert about["finished"]
+    assert about["recipe"]["sonar"]["seed"] == 4
+    assert about["recipe"]["noise"] == NOISE_MODELS["low"].model_dump()
+    assert about["gain"] == pytest.approx(1 / frames.level_scale)
+    assert {"mitsuba", "drjit", "numpy"} <= set(about["versions"])
+
+
+def test_without_options_one_frame_from_the_pose_in_the_scene(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    done = mitsonar("render", scene, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    frames = SonarFrames.load(tmp_path / "out" / "floor")
+    found = sonar_in(load_scene(scene))
+    assert found is not None
+    assert len(frames) == 1
+    np.testing.assert_allclose(frames.poses[0], found[1])
+    same = Simulator(load_scene(scene)).render([found[1]])
+    np.testing.assert_array_equal(frames.image, same.image)
+    assert frames.level_scale == same.level_scale
+
+
+def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(
+    mitsonar: Command, scene: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    assert mitsonar("render", scene, "-o", out, "--frames", 2, "--exr").returncode == 0
+    assert mitsonar("image", out).returncode == 0
+    np.testing.assert_array_equal(SonarFrames.load(out / "rebinned").image, SonarFrames.load(out).image)
+    done = mitsonar("image", out, "--bins", 32, "--range", "4,5.5", "-o", tmp_path / "other")
+    assert done.returncode == 0, done.stderr
+    assert "outside the window" in done.stderr
+    fewer = SonarFrames.load(tmp_path / "other")
+    assert fewer.image.shape == (2, 32, 16)
+    np.testing.assert_allclose(fewer.range_m[[0, -1]], [4 + 1.5 / 64, 5.5 - 1.5 / 64])
+    again = Simulator(load_scene(scene), fewer.sonar)
+    levels = np.concatenate([pings.levels for pings in again.pings(fewer.poses)])
+    np.testing.assert_allclose(np.minimum(levels, fewer.level_scale), fewer.image * fewer.level_scale, rtol=1e-6)
+
+
+def test_bad_input_is_answered_by_one_sentence(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "o"
+    good = scene.read_text()
+
+    def variant(text: str) -> Path:
+        path = tmp_path / "bad.xml"
+        path.write_text(text)
+        return path
+
+    refused(mitsonar("render", tmp_path / "none.xml"), "none.xml", "flat_floor")
+    refused(mitsonar("render", "sunken_shp"), "sunken_ship")
+    refused(mitsonar("render", variant("<scene version='3.0.0'><bla"), "-o", out), "bad.xml", "XML")
+    refused(mitsonar("render", variant(good.replace('"beams"', '"beems"')), "-o", out), "beems")
+    refused(
+        mitsonar("render", variant(good.replace('name="beams" value="16"', 'name="beams" value="0"')), "-o", out), "beams"
+    )
+    window = '<float name="range_max" value="3"/>'
+    text = good.replace("<transform", window + "<transform", 1)
+    refused(mitsonar("render", variant(text), "-o", out), "range_max must exceed range_min", "3 m <= 3.2 m")
+    text = good.replace("<transform", '<film type="hdrfilm"/><transform', 1)
+    refused(mitsonar("render", variant(text), "-o", out), "film", "32 x 60", "remove")
+    refused(mitsonar("render", variant(good.replace(SENSOR, "")), "-o", out), "imaging_sonar", "--sonar")
+    refused(mitsonar("render", variant(good.replace(SENSOR, "")), "--sonar", "didson300", "-o", out), "--from")
+    refused(mitsonar("render", scene, "--sonar", "didson30", "-o", out), "didson300")
+    refused(mitsonar("render", scene, "--sonar", tmp_path / "no.yaml", "-o", out), "no.yaml")
+    refused(mitsonar("render", scene, "--model", "phisical", "-o", out), "model", "physical")
+    refused(mitsonar("render", scene, "--from", "0,0,nan,0,0,0", "-o", out), "finite")
+    refused(mitsonar("render", scene, "--from", "0,0,1", "-o", out), "--from", "6 numbers")
+    refused(mitsonar("render", scene, "--frames", 0, "-o", out), "--frames", "at least 1")
+    refused(mitsonar("render", scene, "--noise", "loud", "-o", out), "noise", "low")
+    refused(mitsonar("render", scene, "-D", "cells", "-o", out), "NAME=VALUE")
+    tum = tmp_path / "broken.tum"
+    tum.write_text("# t x y z q\n0 0 0 2 0 0 0 1\n1 0 0 2 0 0 zero 1\n")
+    refused(mitsonar("render", scene, "--trajectory", tum, "-o", out), "line 3", "zero")
+    refused(mitsonar("image", tmp_path), "run.json")
+    assert not out.exists()
+
+
+def test_an_out_that_exists_is_kept(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("years of work")
+    refused(mitsonar("render", scene, "-o", mine), "exists", "kept", "-o")
+    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "not a run of mitsonar")
+    assert (mine / "thesis.tex").read_text() == "years of work"
+    out = tmp_path / "out"
+    assert mitsonar("render", scene, "-o", out).returncode == 0
+    before = (out / "frames.npz").read_bytes()
+    refused(mitsonar("render", scene, "-o", out, "--seed", 5), "exists")
+    refused(mitsonar("render", scene, "-o", out, "--seed", 5, "--resume"), "another run", "sonar")
+    assert (out / "frames.npz").read_bytes() == before
+    assert mitsonar("render", scene, "-o", out, "--seed", 5, "--overwrite").returncode == 0
+    assert (out / "frames.npz").read_bytes() != before
+
+
+def test_without_llvm_the_error_names_the_command(scene: Path, tmp_path: Path) -> None:
+    done = by_itself("render", scene, "-o", tmp_path / "o", DRJIT_LIBLLVM_PATH="/nonexistent", CUDA_VISIBLE_DEVICES="")
+    refused(done, "libLLVM", "apt-get install")
+
+
+def test_a_seed_changes_the_jitter_and_a_parameter_the_scene(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    images = []
+    for name, options in (("a", []), ("b", ["--seed", 1]), ("c", ["-D", "cells=50"]), ("d", [])):
+        assert mitsonar("render", scene, "-o", tmp_path / name, *options).returncode == 0
+        images.append(SonarFrames.load(tmp_path / name).image)
+    np.testing.assert_array_equal(images[0], images[3])
+    assert not np.array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
+
+
+def test_a_killed_run_leaves_whole_frames_and_resumes_to_the_same_bits(
+    mitsonar: Command, scene: Path, tmp_path: Path
+) -> None:
+    options = ["--frames", 60, "--to", "1,1,2.5,35,0,20", "--noise", "high"]
+    assert mitsonar("render", scene, "-o", tmp_path / "whole", *options).returncode == 0
+    out = tmp_path / "killed"
+    command = [sys.executable, "-m", "mitsonar", "render", str(scene), "-o", str(out), *map(str, options)]
+    # few rays a launch make many batches, so that the kill comes between them
+    command += ["--rays-per-launch", "20000"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    done = 0
+    deadline = time.monotonic() + 120
+    while done < 20 and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.02)
+        if (out / "run.json").exists():
+            done = json.loads((out / "run.json").read_text())["frames_done"]
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert 20 <= done < 60, done
+    half = SonarFrames.load(out)
+    whole = SonarFrames.load(tmp_path / "whole")
+    assert 20 <= len(half) < 60
+    np.testing.assert_array_equal(half.image, whole.image[: len(half)])
+    for picture in sorted((out / "images").glob("*.png")):
+        Image.open(picture).load()
+    done_again = subprocess.run([*command, "--resume"], capture_output=True, text=True)
+    assert done_again.returncode == 0, done_again.stderr
+    finished = SonarFrames.load(out)
+    for name in ("image", "poses", "height_m", "time_s"):
+        np.testing.assert_array_equal(getattr(finished, name), getattr(whole, name))
+    assert finished.level_scale == whole.level_scale
+    for picture in sorted((tmp_path / "whole" / "images").glob("*.png")):
+        assert (out / "images" / picture.name).read_bytes() == picture.read_bytes()
+    state = json.loads((out / "run.json").read_text())
+    assert state["tally"] == json.loads((tmp_path / "whole" / "run.json").read_text())["tally"]
+    assert not (out / "frames.zarr").exists()
+    assert mitsonar("render", scene, "-o", out, *options, "--resume").returncode == 0
+
+
+def test_a_long_run_stays_zarr(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mitsonar.simulation.render_run as runs
+
+    simulator = Simulator(load_scene(scene))
+    path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (5, 1)), np.arange(5.0))
+    run(simulator, path, tmp_path / "npz", Outputs(NOISE_MODELS["none"]), origin={})
+    monkeypatch.setattr(runs, "LONGEST_NPZ", 4)
+    run(simulator, path, tmp_path / "zarr", Outputs(NOISE_MODELS["none"]), origin={})
+    assert not (tmp_path / "zarr" / "frames.npz").exists()
+    np.testing.assert_array_equal(SonarFrames.load(tmp_path / "zarr").image, SonarFrames.load(tmp_path / "npz").image)
+
+
+def test_broken_echoes_are_named(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert mitsonar("render", scene, "-o", out, "--exr").returncode == 0
+    (out / "echoes" / "000000.exr").write_bytes(b"not an image")
+    with pytest.raises(MitsonarError, match=r"000000\.exr"):
+        list(StoredEchoes(out).pings(np.zeros((1, 6))))
+
+
+def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
+    listed = mitsonar("presets")
+    assert listed.returncode == 0
+    assert "oculus-m1200d-2100khz" in listed.stdout
+    one = mitsonar("presets", "gemini-720is")
+    assert "0703-SOM-00002" in one.stdout
+    refused(mitsonar("presets", "gemini"), "gemini-720is")
+    assert "sunken_ship" in mitsonar("scenes").stdout
+    doctor = mitsonar("doctor")
+    assert doctor.returncode == 0, doctor.stderr
+    assert "all is well" in doctor.stdout
+    assert "rays traced and binned" in doctor.stdout
+
+
+@pytest.mark.parametrize("name", sorted(shipped_scenes()))
+def test_shipped_scenes_render_and_have_a_trajectory_to_fly(name: str) -> None:
+    path = Trajectory.load_tum(shipped_trajectory(name))
+    scene = load_scene(name)
+    found = sonar_in(scene)
+    assert found is not None
+    frames = Simulator(scene).render([found[1], path.poses[len(path) // 2]])
+    lit = (frames.image > 0).mean(axis=(1, 2))
+    assert (lit > 0.05).all(), lit
+    assert (lit < 0.98).all(), lit
+
+
+def test_texture_parameter_of_the_pattern() -> None:
+    images = []
+    for texture in ("gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock"):
+        scene = load_scene("pattern", texture=texture)
+        found = sonar_in(scene)
+        assert found is not None
+        images.append(Simulator(scene, found[0].replace(rays_per_beam=100)).render([found[1]]).image)
+    for index, image in enumerate(images):
+        assert all(not np.array_equal(image, other) for other in images[index + 1 :])
+    with pytest.raises(MitsonarError, match="mud"):
+        load_scene("pattern", texture="mud")
+
+
+def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mitsonar.records.frame_store import FrameStore
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (3, 1)), np.arange(3.0))
+    outputs = Outputs(NOISE_MODELS["none"])
+    with monkeypatch.context() as patch:
+        patch.setattr(FrameStore, "pack", killed)
+        with pytest.raises(KeyboardInterrupt):
+            run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={})
+    assert not json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
+    run(Simulator(load_scene(scene)), path, tmp_path / "run", outputs, origin={}, resume=True)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["finished"]
+    assert len(SonarFrames.load(tmp_path / "run")) == 3
+
+
+def test_echoes_are_not_replaced_by_what_is_made_of_them(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert mitsonar("render", scene, "-o", out, "--exr").returncode == 0
+    refused(mitsonar("image", out, "-o", out, "--overwrite"), "echoes", "another folder")
+    refused(mitsonar("image", out, "-o", tmp_path, "--overwrite"), "another folder")
+    assert (out / "echoes" / "000000.exr").is_file()

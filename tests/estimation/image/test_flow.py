@@ -1,0 +1,185 @@
+"""The estimator ``flow``: signs and sizes of known motions, honest covariances, no confident answer where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage, special
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.image.flow import Flow
+from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Motion, Pose, Trajectory, compose
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.scene import load_scene
+from mitsonar.worlds.flat_objects import FlatObjects
+
+UNITS = np.array([1e3, 1e3, 180 / np.pi])
+START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
+CELL = 0.02
+"""Cells of the painted ground [m]."""
+
+
+def ground(seed: int) -> NDArray[np.float64]:
+    """Reflectivity of 20 x 20 m, even in 0.2..0.5, correlated over some 4 cm; x = y = 0 is the middle of the array."""
+    values = np.random.default_rng(seed).uniform(0, 1, (1000, 1000))
+    smooth = ndimage.gaussian_filter(values, 2)
+    return 0.2 + 0.3 * special.ndtr((smooth - smooth.mean()) / smooth.std())
+
+
+def painted(motion: Motion, sonar: Sonar, seeds: tuple[int, int] = (1, 1), pose: Pose = START) -> SonarFrames:
+    """Two frames, the motion apart, of painted level ground: each cell shows its ground point, without any ray tracing."""
+    poses = np.array([pose, compose(pose, motion)])
+    images = []
+    for seed, (x, y, height, pitch, roll, heading) in zip(seeds, poses, strict=True):
+        aside, ahead = np.moveaxis(
+            GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, height, pitch, roll).points, -1, 0
+        )
+        east = x + aside * np.cos(heading) + ahead * np.sin(heading)
+        north = y - aside * np.sin(heading) + ahead * np.cos(heading)
+        place = [np.nan_to_num(axis) / CELL + 500 for axis in (north, east)]
+        images.append(np.where(np.isnan(east), 0, ndimage.map_coordinates(ground(seed), place, order=1)))
+    return SonarFrames(
+        np.array(images, np.float32), sonar.range_m, sonar.bearing_rad, np.array([0.0, 0.1]), sonar, poses, poses[:, 2]
+    )
+
+
+def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
+    """The frames with some fields replaced."""
+    return SonarFrames(**{**vars(frames), **fields})
+
+
+def noisy(frames: SonarFrames, noise: str, seed: int = 1) -> SonarFrames:
+    """The frames with noise."""
+    return changed(frames, image=NOISE_MODELS[noise].apply(frames.image, seed=seed, frames=np.arange(2)))
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("size", [0.3, 1.0, 5.0])
+def test_sign_and_size_of_each_axis(axis: int, sign: int, size: float) -> None:
+    """Motions of 6 to 100 mm and 0.12 to 2 deg along one axis."""
+    motion = np.zeros(3)
+    motion[axis] = sign * size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
+    found = Flow(relief_m=0).estimate(painted(Motion(*motion), Sonar()))
+    error = (np.array(found.motion) - motion) * UNITS
+    assert found.valid, found.reason
+    assert (np.abs(error) < [0.3, 0.1, 0.01]).all(), f"mm, mm, deg: {error}"
+
+
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+@pytest.mark.parametrize("match", ["map", "vector"])
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, -1), (1, -1, -1)])
+def test_all_three_at_once_for_both_bearings_and_matches(bearing: str, match: str, signs: tuple[int, int, int]) -> None:
+    motion = np.array(signs) * [0.1, 0.1, np.radians(2)]
+    sonar = Sonar.create(bearing=bearing, beam_layout="sine" if bearing == "cone" else "even")
+    found = Flow(match=match, relief_m=0).estimate(painted(Motion(*motion), sonar))
+    error = (np.array(found.motion) - motion) * UNITS
+    assert found.valid, found.reason
+    assert (np.abs(error) < [1.0, 0.3, 0.03]).all(), f"mm, mm, deg: {error}"
+
+
+def test_covariance_says_the_errors_that_noise_makes() -> None:
+    """The errors of ten noisy pairs, over the stated deviations, are of order one on each axis."""
+    motion = np.array([0.012, -0.015, np.radians(0.3)])
+    frames = painted(Motion(*motion), Sonar())
+    over = []
+    for seed in range(10):
+        found = Flow(relief_m=0).estimate(noisy(frames, "high", seed))
+        assert found.valid, found.reason
+        assert found.covariance is not None
+        over.append((np.array(found.motion) - motion) / np.sqrt(np.diag(found.covariance)))
+    rms = np.sqrt(np.mean(np.square(over), axis=0))
+    assert ((rms > 0.3) & (rms < 2.0)).all(), rms
+
+
+def test_height_is_a_further_unknown() -> None:
+    """A height 6 % too large makes forward motion wrong; less so where height_std lets the match find it, at the price of a
+    larger covariance where the height was right."""
+    motion = Motion(0.0, 0.06, 0.0)
+    frames = painted(motion, Sonar())
+    held, free = (Flow(height_m=2.65, relief_m=0, height_std=std).estimate(frames) for std in (0.0, 0.05))
+    errors = [abs(found.motion.forward - motion.forward) * 1e3 for found in (held, free)]
+    assert errors[0] > 1.0
+    assert errors[1] < 0.5 * errors[0]
+    held, free = (Flow(relief_m=0, height_std=std).estimate(noisy(frames, "high")) for std in (0.0, 0.05))
+    assert held.covariance is not None
+    assert free.covariance is not None
+    assert free.covariance[1, 1] > held.covariance[1, 1]
+
+
+def test_nothing_to_match_is_not_believed() -> None:
+    """Blank frames, even frames, noise alone, frames of two places, one object on black: no confident wrong answer."""
+    frames = painted(Motion(0.01, 0.01, 0.0), Sonar())
+    blank = changed(frames, image=np.zeros_like(frames.image))
+    even = changed(frames, image=np.full_like(frames.image, 0.5))
+    elsewhere = painted(Motion(0.01, 0.01, 0.0), Sonar(), seeds=(1, 2))
+    one = np.zeros_like(frames.image)
+    one[0, 250:270, 45:50] = one[1, 246:266, 45:50] = 0.8
+    wrong = {
+        "blank": blank,
+        "even": even,
+        "noise": noisy(blank, "high"),
+        "even, noise": noisy(even, "high"),
+        "two places": elsewhere,
+        "two places, noise": noisy(elsewhere, "high"),
+        "one object": changed(frames, image=one),
+        "one object, noise": noisy(changed(frames, image=one), "low"),
+    }
+    for match in ("map", "vector"):
+        believed = [name for name, pair in wrong.items() if Flow(match=match).estimate(pair).valid]
+        assert not believed, f"{match}: {believed}"
+
+
+@pytest.mark.parametrize("geometry", [{"height_m": 1.2}, {"height_m": 6.0}, {"pitch_rad": 0.2}, {"pitch_rad": 1.1}])
+def test_badly_wrong_geometry_is_not_believed(geometry: dict[str, float]) -> None:
+    found = Flow(**geometry).estimate(painted(Motion(0.01, 0.02, 0.005), Sonar()))
+    assert not found.valid
+
+
+def test_what_is_missing_or_wrong_is_said() -> None:
+    frames = painted(Motion(0, 0, 0), Sonar(beams=24, range_bins=64))
+    with pytest.raises(MitsonarError, match="flow needs height and pitch"):
+        Flow().estimate(changed(frames, poses=None, height_m=None))
+    with pytest.raises(MitsonarError, match="height must be above 0: got -1 m"):
+        Flow(height_m=-1)
+    with pytest.raises(MitsonarError, match="match must be map or vector: got 'grid'"):
+        Flow(match="grid")
+    with pytest.raises(MitsonarError, match="height_std must be 0 or more"):
+        Flow(height_std=-0.1)
+    with pytest.raises(MitsonarError, match="takes two frames: got 1"):
+        Flow().estimate(frames.select(slice(0, 1)))
+    assert np.allclose(Flow(height_m=2.5, pitch_rad=START.pitch).estimate(changed(frames, poses=None)).motion, 0, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Simulator:
+    """Flat objects: no relief, so that the geometry is exact."""
+    folder = tmp_path_factory.mktemp("flat") / "world"
+    scene = load_scene(FlatObjects(size_m=16, objects=(150, 150), seabed_cells=400).build(2).write(folder))
+    return Simulator(scene, Sonar(rays_per_beam=300, rays_across=2))
+
+
+@pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("noise", ["none", "high"])
+def test_rendered_frames(simulator: Simulator, noise: str) -> None:
+    """A second route to the known motion: traced rays instead of painted cells."""
+    motion = Motion(0.015, -0.012, np.radians(0.4))
+    poses = Trajectory(np.array([START, compose(START, motion)]), np.array([0.0, 0.1]))
+    found = Flow().estimate(simulator.render(poses, noise=NOISE_MODELS[noise], seed=3))
+    error = (np.array(found.motion) - motion) * UNITS
+    allowed = {"none": [3.0, 1.0, 0.07], "high": [6.0, 2.0, 0.12]}[noise]
+    assert found.valid, found.reason
+    assert (np.abs(error) < allowed).all(), f"{noise}, mm, mm, deg: {error}"
+
+
+@pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
+@pytest.mark.usefixtures("variant")
+def test_rendered_frames_of_two_places_are_not_believed(simulator: Simulator) -> None:
+    apart = np.array([START, compose(START, Motion(2.0, 0, 1.0))])
+    assert not Flow().estimate(simulator.render(Trajectory(apart, np.array([0.0, 0.1])))).valid

@@ -1,0 +1,263 @@
+"""Estimators: signs and sizes of known motions, honest covariances, and no confident answer where there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from helpers import box, scene
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.image.direct import Direct
+from mitsonar.estimation.image.ecc import Ecc
+from mitsonar.estimation.image.ground_view import GroundView
+from mitsonar.estimation.image.zero import Zero
+from mitsonar.estimation.named_estimators import ESTIMATORS, create_estimator, estimator_from
+from mitsonar.geometry.attitude import Attitude, attitude_of
+from mitsonar.geometry.ground_plane import moved
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Motion, Pose, Trajectory, compose
+from mitsonar.networks.shipped import SHIPPED
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.scene import load_scene
+from mitsonar.worlds.flat_objects import FlatObjects
+from mitsonar.worlds.rocky_field import RockyField
+
+pytestmark = [
+    pytest.mark.usefixtures("variant"),
+    pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
+]
+
+START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
+UNITS = np.array([1e3, 1e3, 180 / np.pi])
+CLASSICAL = [name for name in ESTIMATORS if name != "zero"]
+METHODS = [*CLASSICAL, *(pytest.param(name, marks=pytest.mark.learn) for name in SHIPPED)]
+
+ALLOWED = {
+    "direct": [3.0, 1.5, 0.07],
+    "ecc": [3.0, 1.5, 0.07],
+    "phase": [5.0, 2.0, 0.10],
+    "flow": [8.0, 4.0, 0.25],
+    "corrnet": [3.0, 1.5, 0.07],
+}
+"""Errors on flat objects in mm, mm, deg. Large plates of one reflectivity, whose brightness belongs to the range and not to
+the ground, hold estimates back."""
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Simulator:
+    """Flat objects: no relief, so that the geometry is exact."""
+    folder = tmp_path_factory.mktemp("flat") / "world"
+    scene = load_scene(FlatObjects(size_m=16, objects=(150, 150), seabed_cells=400).build(2).write(folder))
+    return Simulator(scene, Sonar(rays_per_beam=300, rays_across=4))
+
+
+@pytest.fixture(scope="module")
+def rocks(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Simulator:
+    """A rocky field as dense as that of the issue's trial."""
+    folder = tmp_path_factory.mktemp("rocks") / "world"
+    scene = load_scene(RockyField(size_m=16, a_side=(32, 32)).build(3).write(folder))
+    return Simulator(scene, Sonar(rays_per_beam=300, rays_across=4))
+
+
+Pair = Callable[..., SonarFrames]
+
+
+@pytest.fixture(scope="module")
+def pair(simulator: Simulator) -> Pair:
+    """Two frames over flat objects, a motion apart; each is rendered once."""
+    known: dict[tuple[Motion, str], SonarFrames] = {}
+
+    def frames(motion: Motion, noise: str = "none") -> SonarFrames:
+        if (motion, noise) not in known:
+            known[motion, noise] = two(simulator, motion, noise)
+        return known[motion, noise]
+
+    return frames
+
+
+def two(simulator: Simulator, motion: Motion, noise: str = "none", start: Pose = START) -> SonarFrames:
+    """Two frames, the motion apart."""
+    poses = Trajectory(np.array([start, compose(start, motion)]), np.array([0.0, 0.1]))
+    return simulator.render(poses, noise=NOISE_MODELS[noise], seed=3)
+
+
+def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
+    """The frames with some fields replaced."""
+    return SonarFrames(**{**vars(frames), **fields})  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------- signs and sizes
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("size", [0.3, 1.0, 5.0])
+@pytest.mark.parametrize("method", METHODS)
+def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, sign: int, size: float) -> None:
+    """Motions along one axis of 6, 20 and 100 mm, or 0.12, 0.4 and 2 deg."""
+    motion = np.zeros(3)
+    motion[axis] = sign * size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
+    found = create_estimator(method).estimate(pair(Motion(*motion)))
+    if method in SHIPPED and size > 1:  # beyond what it has learnt
+        assert not found.valid
+        return
+    error = (np.array(found.motion) - motion) * UNITS
+    assert found.valid, found.reason
+    assert (np.abs(error) < ALLOWED[method]).all(), f"mm, mm, deg: {error}"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_three_at_once_on_rocks(rocks: Simulator, method: str) -> None:
+    """The relief is not told: heights come from the first echoes."""
+    motion = np.array([0.015, -0.012, np.radians(0.4)])
+    found = create_estimator(method).estimate(two(rocks, Motion(*motion)))
+    error = (np.array(found.motion) - motion) * UNITS
+    assert found.valid, found.reason
+    assert (np.abs(error) < np.array([1.5, 1, 1.5]) * ALLOWED[method]).all(), f"mm, mm, deg: {error}"
+
+
+@pytest.mark.parametrize(("noise", "allowed"), [("none", [3.0, 1.0, 0.07]), ("high", [6.0, 2.0, 0.12])])
+@pytest.mark.parametrize("method", ["direct", *(name for name in METHODS if name not in CLASSICAL)])
+def test_covariances_hold_with_noise(pair: Pair, rocks: Simulator, method: str, noise: str, allowed: list[float]) -> None:
+    """A network's hold on what it has learnt only: rocks; on large plates they are too small."""
+    motion = Motion(0.015, -0.012, np.radians(0.4))
+    found = create_estimator(method).estimate(pair(motion, noise) if method == "direct" else two(rocks, motion, noise))
+    error = (np.array(found.motion) - motion) * UNITS
+    assert found.valid, found.reason
+    assert (np.abs(error) < allowed).all(), f"{noise}, mm, mm, deg: {error}"
+    assert found.covariance is not None
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+    std = np.sqrt(np.diag(found.covariance)) * UNITS
+    assert (np.abs(error) < 4 * std).all(), f"errors {error}, standard deviations {std}"
+
+
+def test_direct_tells_heave_apart_from_forward(simulator: Simulator) -> None:
+    """A sonar that has risen by 5 mm seems to have gone back by 3 to 5 mm, unless heave is allowed for."""
+    motion = Motion(0.005, 0.01, 0.002)
+    second = compose(START, motion)
+    poses = np.array([START, second._replace(z=second.z + 0.005)])
+    frames = simulator.render(Trajectory(poses, np.array([0.0, 0.1])), seed=3)
+    stiff, free = (np.array(Direct(heave_std_m=std).estimate(frames).motion) - motion for std in (0.0, 0.01))
+    assert abs(stiff[1]) > 2e-3
+    assert abs(free[1]) < abs(stiff[1]) / 2
+    about = Direct(heave_std_m=0.01).estimate(frames).about
+    assert about["heave_m"] == pytest.approx(0.005, abs=3e-3)
+
+
+def test_swapped_frames_tell_the_opposite_motion(pair: Pair) -> None:
+    """The way back: direct treats both frames alike, so that the middle frame's motion only changes its sign."""
+    frames = pair(Motion(0.015, -0.012, np.radians(0.4)))
+    there = Direct().estimate(frames)
+    back = Direct().estimate(frames.select(np.array([1, 0])))
+    assert back.motion.yaw == pytest.approx(-there.motion.yaw, abs=2e-6)
+    home = compose(compose(Pose(0, 0, 0), there.motion), back.motion)
+    assert np.allclose(home[:2], 0, atol=1e-4)
+
+
+# ---------------------------------------------------------------- nothing to believe
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nothing_to_match_is_not_believed(pair: Pair, simulator: Simulator, method: str) -> None:
+    """A blank frame, noise alone, frames of two different places."""
+    estimator = create_estimator(method)
+    frames = pair(Motion(0.0, 0.0, 0.0))
+    blank = changed(frames, image=np.zeros_like(frames.image))
+    half = changed(frames, image=np.stack([frames.image[0], blank.image[0]]))
+    noise = NOISE_MODELS["high"].apply(blank.image, seed=1, frames=np.arange(2))
+    for name, seen in {"blank": blank, "one blank": half, "noise": changed(frames, image=noise)}.items():
+        found = estimator.estimate(seen)
+        assert not found.valid, name
+        assert found.reason
+    elsewhere = two(simulator, Motion(2.0, 0.0, 1.0))
+    assert not estimator.estimate(elsewhere).valid, "elsewhere"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_object_alone_is_not_believed(method: str) -> None:
+    """A box of unknown height on nothing: its sideways motion and the sonar's turn look alike."""
+    only = Simulator(scene(thing=box([0, 0, 0.2], [0.2, 0.2, 0.2])), Sonar(rays_per_beam=300))
+    start = Pose(0.0, -3.6, 2.5, np.radians(35), 0, 0)
+    frames = only.render(Trajectory(np.array([start, compose(start, Motion(0.01, 0.01, 0.003))]), np.array([0.0, 0.1])))
+    assert (frames.image > 0).mean() > 0.003
+    found = create_estimator(method).estimate(changed(frames, height_m=np.full(2, 2.5)))
+    assert not found.valid
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("wrong", [{"height_m": 4.0}, {"height_m": 1.2}, {"pitch_rad": np.radians(10)}])
+def test_wrong_geometry_is_not_believed(rocks: Simulator, method: str, wrong: dict[str, float]) -> None:
+    """First echoes tell another height than the one given."""
+    found = create_estimator(method, **wrong).estimate(two(rocks, Motion(0.01, 0.01, 0.003)))
+    assert not found.valid
+    assert "height" in found.reason
+
+
+# ---------------------------------------------------------------- height and ground
+
+
+def test_height_comes_from_first_echoes(pair: Pair) -> None:
+    """Over a flat floor the steepest rays end at the sonar's height, whatever height is told (within reason)."""
+    frames = pair(Motion(0.0, 0.0, 0.0))
+    for told in (np.full(2, 2.3), np.full(2, 2.7), None):
+        attitude = attitude_of(changed(frames, height_m=told), "direct", None, None)
+        assert attitude.height_m == pytest.approx(2.5, rel=0.01)
+        assert attitude.pitch_rad == pytest.approx(np.radians(35))
+        assert not attitude.reason
+    assert attitude_of(frames, "direct", 2.4, None, relief_m=0.1).height_m == pytest.approx(2.3)
+    late = slice(300, None)  # a window that begins within the lit floor shows no first echoes
+    cut = changed(frames, image=frames.image[:, late], range_m=frames.range_m[late])
+    assert attitude_of(cut, "direct", None, None).height_m == pytest.approx(2.5, rel=1e-3)
+
+
+def test_what_is_missing_is_said() -> None:
+    sonar = Sonar(beams=8, range_bins=16)
+    bare = SonarFrames(np.zeros((2, 16, 8), np.float32), sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
+    for method in CLASSICAL:
+        with pytest.raises(MitsonarError, match=f"{method} needs height and pitch"):
+            create_estimator(method).estimate(bare)
+        with pytest.raises(MitsonarError, match="takes two frames: got 1"):
+            create_estimator(method, height_m=2.0, pitch_rad=0.6).estimate(bare.select(slice(0, 1)))
+    with pytest.raises(MitsonarError, match="takes two frames: got 1"):
+        Zero().estimate(bare.select(slice(0, 1)))
+    with pytest.raises(MitsonarError, match="did you mean direct"):
+        create_estimator("dierct")
+    with pytest.raises(MitsonarError, match="estimator direct"):
+        create_estimator("direct", heigth_m=2)
+    with pytest.raises(MitsonarError, match="above 0"):
+        Direct(height_m=1.0, pitch_rad=0.6, relief_m=1.5).estimate(bare)
+    with pytest.raises(MitsonarError, match="heave_std_m"):
+        Direct(heave_std_m=-1)
+    assert create_estimator("zero").estimate(bare).motion == Motion(0, 0, 0)
+
+
+def test_estimators_are_named_with_options_on_one_line() -> None:
+    assert estimator_from("direct") == Direct()
+    assert estimator_from("direct:height_m=2.5:heave_std_m=0.005") == Direct(height_m=2.5, heave_std_m=0.005)
+    assert estimator_from("ecc:pitch_deg=30") == Ecc(pitch_rad=np.radians(30))
+    for text, words in {
+        "direct:height_m": "NAME:key=value",
+        "direct:height_m=high": "must be a number",
+        "direct:levels=3": "takes height_m, pitch_deg, relief_m, heave_std_m",
+        "posenet.ckpt": "checkpoint",
+    }.items():
+        with pytest.raises(MitsonarError, match=words):
+            estimator_from(text)
+
+
+def test_a_view_of_the_ground_moves_with_the_motion(pair: Pair) -> None:
+    """Its warp is `moved` in pixels, and `motion` undoes it."""
+    view = GroundView(pair(Motion(0.0, 0.0, 0.0)), Attitude(2.5, 0.05, np.radians(35)), 0.02)
+    motion = Motion(0.03, -0.07, 0.02)
+    warp = view.warp(motion)
+    left, _, _, far = view.reach
+    column, row = 31.0, 17.0
+    ground = np.array([left + (column + 0.5) * view.edge, far - (row + 0.5) * view.edge])
+    there = moved(ground, motion)
+    wanted = [(there[0] - left) / view.edge - 0.5, (far - there[1]) / view.edge - 0.5]
+    assert np.allclose(warp @ [column, row, 1], wanted, atol=1e-4)
+    assert np.allclose(view.motion(warp), motion, atol=1e-6)

@@ -1,0 +1,210 @@
+"""Estimators side by side: the same pairs for all, wrong geometry told as announced, broken runs that go on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import Command, refused, tiny_recipe
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.datasets.generation import make_dataset
+from mitsonar.motion.motion_errors import cluster_resamples, in_units
+
+torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
+pytestmark = [
+    pytest.mark.learn,
+    pytest.mark.usefixtures("variant"),
+    pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
+]
+
+from mitsonar.datasets.re_render import re_rendered  # noqa: E402
+from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
+from mitsonar.estimation.benchmark import (  # noqa: E402
+    VARIATIONS,
+    Answers,
+    _heaved,
+    answers_of,
+    bounds_of_pairs,
+    frames_of,
+    rows_of,
+    with_prior,
+)
+from mitsonar.estimation.estimator import Estimate  # noqa: E402
+from mitsonar.estimation.image.direct import Direct  # noqa: E402
+from mitsonar.estimation.image.zero import Zero  # noqa: E402
+from mitsonar.motion.pose import Motion  # noqa: E402
+from mitsonar.records.sonar_frames import SonarFrames  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three small scenes of four pairs, fine enough to register."""
+    url = tmp_path_factory.mktemp("made") / "small.zarr"
+    words = {"sonar__beams": 48, "sonar__range_bins": 256, "sonar__rays_per_beam": 300, "world__a_side": [25, 25]}
+    make_dataset(tiny_recipe(scenes=[{"count": 3, "sequences": 4}], flight={"pings": 2}, **words), str(url))
+    return url
+
+
+@pytest.fixture(scope="module")
+def pairs(made: Path) -> SonarPairs:
+    return SonarPairs(made, part="all", frames=2, one_a_sequence=True, noise="low")
+
+
+class Oracle:
+    """Knows the truth; in every third pair it does not stand for what it says."""
+
+    inputs = "the truth"
+
+    def __init__(self, pairs: SonarPairs) -> None:
+        self.pairs, self.asked = pairs, 0
+        self.truth = {float(pairs.pose[pairs.first[k], 0]): pairs.target(k) for k in range(len(pairs))}
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        self.asked += 1
+        assert frames.poses is not None
+        motion = Motion(*self.truth[float(frames.poses[0, 0])])
+        return Estimate(motion, np.eye(3) * 1e-6, valid=self.asked % 3 != 0)
+
+
+def test_all_methods_get_the_same_pairs_and_failures_count(pairs: SonarPairs) -> None:
+    numbers = list(range(len(pairs)))
+    oracle = Oracle(pairs)
+    answers = answers_of({"oracle": oracle, "zero": Zero()}, pairs, numbers)
+    truth = np.array([pairs.target(k) for k in numbers])
+    assert np.allclose(answers["oracle"].motion, truth)
+    assert (~answers["oracle"].valid).sum() == len(numbers) // 3
+    table = cluster_resamples(pairs.scene[pairs.first[numbers]], count=100)
+    rows = {row.method: row for row in rows_of(answers, {"oracle": "", "zero": ""}, truth, table, reference="zero")}
+    failed = in_units(truth[~answers["oracle"].valid])
+    assert np.allclose(rows["oracle"].errors.rmse, np.sqrt((failed**2).sum(axis=0) / len(numbers)))
+    assert np.allclose(rows["zero"].errors.rmse, rows["zero"].errors.zero)
+    assert (rows["oracle"].over_reference < 0).all()
+    assert (rows["zero"].over_reference == 0).all()
+    plain = rows["oracle"].plain()
+    assert plain["over_limit"] == [None, None, None]
+    assert (rows["oracle"].over_reference_low <= rows["oracle"].over_reference).all()
+    assert (rows["oracle"].over_reference <= rows["oracle"].over_reference_high).all()
+    json.dumps(plain, allow_nan=False)
+
+
+def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
+    told = {number: frames for number, frames in frames_of(pairs, [0, 1], "as told")}
+    for variation, change in {
+        "height 5 %": lambda f: f.height_m[0],
+        "pitch 1 deg": lambda f: np.degrees(f.poses[0, 3]),
+        "roll 1 deg": lambda f: np.degrees(f.poses[0, 4]),
+        "sound speed 1 %": lambda f: f.range_m[100],
+    }.items():
+        for number, frames in frames_of(pairs, [0, 1], variation):
+            was, became = change(told[number]), change(frames)
+            size = became / was - 1 if "%" in variation else became - was
+            wanted = (1 if number % 2 == 0 else -1) * (float(variation.split()[-2]) / (100 if "%" in variation else 1))
+            assert size == pytest.approx(wanted), variation
+            assert (frames.image == told[number].image).all()
+    assert {"heave 5 mm", "jitter", "as told"} < set(VARIATIONS)
+
+
+def test_rendered_again_unchanged_is_what_is_stored(pairs: SonarPairs) -> None:
+    """World, gain, jitter, noise: bit for bit."""
+    numbers = [1, 5, 9]
+    seen = dict(re_rendered(pairs, numbers))
+    assert sorted(seen) == numbers
+    for number, frames in seen.items():
+        assert (frames.image == pairs.sonar_frames(number).image).all()
+    rest = np.zeros((2, 6))
+    assert [_heaved(k, rest)[1, 2] for k in (0, 1)] == pytest.approx([0.005, -0.005])
+    heaved = dict(frames_of(pairs, numbers, "heave 5 mm"))
+    moved = [(heaved[k].image[0] != seen[k].image[0]).mean() for k in numbers]
+    assert max(moved) == 0, "the first ping stays"
+    assert all((heaved[k].image[1] != seen[k].image[1]).mean() > 0.05 for k in numbers)
+    assert all((heaved[k].poses == seen[k].poses).all() for k in numbers), "what is told stays"
+    jittered = dict(frames_of(pairs, numbers, "jitter"))
+    assert all((jittered[k].image[0] != seen[k].image[0]).mean() > 0.05 for k in numbers)
+
+
+def test_a_prior_shrinks_what_is_unsure_and_leaves_what_is_sure() -> None:
+    answers = Answers.unasked(2)
+    answers.motion[:] = 0.01
+    answers.covariance[0], answers.covariance[1] = np.eye(3) * 1e-12, np.eye(3) * 1.0
+    found = with_prior(answers, np.full(3, 0.02)).motion
+    assert np.allclose(found[0], 0.01, rtol=1e-6)
+    assert (np.abs(found[1]) < 1e-5).all()
+
+
+def test_limits_are_below_what_is_reached(pairs: SonarPairs) -> None:
+    """The bound by the rays' own noise at high noise is positive, and below direct's errors."""
+    loud = SonarPairs(pairs.store.place.url, part="all", frames=2, one_a_sequence=True, noise="high")
+    found = bounds_of_pairs(loud, [6], NOISE_MODELS["high"])
+    assert (found["pixel"] > 0).all()
+    assert (found["pixel"] < found["gaussian"]).all()
+    assert (found["gaussian"] < found["rays"]).all()
+    numbers = list(range(len(loud)))
+    answers = answers_of({"direct": Direct()}, loud, numbers)["direct"]
+    errors = answers.motion - np.array([loud.target(k) for k in numbers])
+    assert (np.sqrt((errors**2).mean(axis=0)) > found["pixel"]).all()
+
+
+def test_command_prints_a_table_and_goes_on(mitsonar: Command, made: Path, tmp_path: Path) -> None:
+    words = ("compare", made, "--part", "all", "--noise", "none,high", "--limit", 0, "--estimators", "zero,ecc,direct")
+    done = mitsonar(*words, "-o", tmp_path / "out", "--prior")
+    assert done.returncode == 0, done.stderr
+    assert "noise none, as told" in done.stdout
+    assert "| zero " in done.stdout
+    assert "direct with prior" in done.stdout
+    assert "ecc less direct" in done.stdout
+    table = json.loads((tmp_path / "out" / "table.json").read_text())
+    by_name = {row["method"]: row for row in table["tables"][0]["rows"]}
+    assert by_name["direct"]["rmse"][0] < 0.4 * by_name["zero"]["rmse"][0]
+    # broken off: half of the answers have gone
+    (path,) = (tmp_path / "out").glob("answers-high-*-as-told.npz")
+    with np.load(path) as kept:
+        arrays = {name: kept[name].copy() for name in kept.files}
+    arrays["direct/ms"][6:] = np.nan
+    arrays["direct/motion"][6:] = 99
+    np.savez(path, **arrays)
+    again = mitsonar(*words, "-o", tmp_path / "out", "--prior", "--json")
+    assert again.returncode == 0, again.stderr
+    report = json.loads(again.stdout)
+    for before, after in zip(table["tables"], report["tables"], strict=True):
+        assert [row["rmse"] for row in before["rows"]] == [row["rmse"] for row in after["rows"]]
+    refused(mitsonar(*words, "--pairs", 5, "-o", tmp_path / "out"), "other pairs", "choose another -o")
+
+
+def test_mistakes_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> None:
+    refused(mitsonar("compare", made, "--estimators", "dierct"), "unknown estimator", "did you mean direct")
+    refused(mitsonar("compare", made, "--part", "all", "--reference", "ecc", "--estimators", "zero"), "--reference")
+    refused(mitsonar("compare", made, "--part", "all", "--noise", "loud"), "noise must be")
+    refused(mitsonar("compare", tmp_path / "none.zarr"), "none.zarr")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thing").write_text("mine")
+    refused(mitsonar("compare", made, "--part", "all", "-o", tmp_path / "full"), "holds other things")
+
+
+def test_damaged_answers_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> None:
+    words = ("compare", made, "--part", "all", "--limit", 0, "--estimators", "zero", "--pairs", 4, "-o", tmp_path / "out")
+    assert mitsonar(*words).returncode == 0
+    (path,) = (tmp_path / "out").glob("answers-*.npz")
+    path.write_bytes(path.read_bytes()[:200])
+    refused(mitsonar(*words), "is damaged", "remove it")
+
+
+def test_an_axis_that_never_moves_and_a_turned_mount(mitsonar: Command, tmp_path: Path) -> None:
+    """The truth is the sonar's motion, not the vehicle's; tables have no number for an axis without motion."""
+    words = {"sonar__beams": 48, "sonar__range_bins": 256, "sonar__rays_per_beam": 200, "world__a_side": [25, 25]}
+    mount = {"mount__heading_deg": 90.0, "mount__forward_m": 0.3}
+    flight = {"pings": 2, "yaw_deg": 0}
+    make_dataset(
+        tiny_recipe(scenes=[{"count": 2, "sequences": 3}], flight=flight, **words, **mount), str(tmp_path / "m.zarr")
+    )
+    command = ("compare", tmp_path / "m.zarr", "--part", "all", "--limit", 0, "--estimators", "zero,direct")
+    done = mitsonar(*command, "--json")
+    assert done.returncode == 0, done.stderr
+    assert "2 scenes only" in done.stderr
+    (table,) = json.loads(done.stdout)["tables"]
+    direct = table["rows"][1]
+    assert direct["slope"][2] is None
+    assert direct["slope"][1] > 0.8
+    assert direct["rmse"][1] < 2.0

@@ -1,0 +1,128 @@
+"""The instrument: defaults, cell centres, derived numbers, and errors that name what is wrong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+
+DEFAULTS = {
+    "name": "custom",
+    "azimuth_fov_deg": 29.0,
+    "elevation_fov_deg": 14.0,
+    "beams": 96,
+    "rays_per_beam": 700,
+    "range_min": 3.2,
+    "range_max": 5.6,
+    "range_bins": 512,
+    "sound_speed": 1500.0,
+    "bearing": "azimuth",
+    "beam_layout": "even",
+    "beam_width_deg": None,
+    "rays_across": 4,
+    "jitter": None,
+    "seed": 0,
+    "model": "physical",
+    "gain_exponent": 0,
+    "frame_rate_hz": 10.0,
+}
+
+
+def test_fields_and_defaults() -> None:
+    assert Sonar().model_dump() == DEFAULTS
+    assert all(field.description for field in Sonar.model_fields.values())
+
+
+@pytest.mark.parametrize(("fov", "beams"), [(29.0, 96), (100.0, 1), (30.0, 7)])
+def test_beams_sit_at_cell_centres(fov: float, beams: int) -> None:
+    bearing = np.degrees(Sonar(azimuth_fov_deg=fov, beams=beams).bearing_rad)
+    spacing = fov / beams
+    np.testing.assert_allclose(bearing, -fov / 2 + spacing * (np.arange(beams) + 0.5), atol=1e-12)
+    assert np.abs(bearing).max() < fov / 2  # never on an edge
+    np.testing.assert_allclose(bearing, -bearing[::-1], atol=1e-12)
+
+
+def test_range_bins_are_given_by_their_centres() -> None:
+    sonar = Sonar(range_min=2.0, range_max=4.0, range_bins=4)
+    np.testing.assert_allclose(sonar.range_m, [2.25, 2.75, 3.25, 3.75], rtol=1e-15)
+    assert sonar.bin_m == 0.5
+
+
+def test_sine_layout_steps_evenly_in_the_sine() -> None:
+    sonar = Sonar(azimuth_fov_deg=120, beams=16, beam_layout="sine")
+    edge = np.sin(np.radians(60))
+    np.testing.assert_allclose(np.sin(sonar.bearing_rad), edge * ((np.arange(16) + 0.5) / 8 - 1), atol=1e-15)
+    assert np.diff(sonar.bearing_rad)[0] > np.diff(sonar.bearing_rad)[8]  # wider towards the edges
+
+
+def test_physical_and_thesis_differ_in_rays_jitter_and_width() -> None:
+    physical = Sonar(beams=10, rays_per_beam=20, beam_width_deg=0.3)
+    thesis = physical.replace(model="thesis")
+    assert (physical.across, physical.columns, physical.rays, physical.jittered) == (4, 40, 800, True)
+    assert (thesis.across, thesis.columns, thesis.rays, thesis.jittered) == (1, 10, 200, False)
+    assert physical.beam_width_rad == pytest.approx(np.radians(0.3))
+    assert thesis.beam_width_rad == thesis.beam_spacing_rad == pytest.approx(np.radians(2.9))
+    assert Sonar().beam_width_rad == Sonar().beam_spacing_rad
+
+
+@pytest.mark.parametrize("model", ["physical", "thesis"])
+@pytest.mark.parametrize("jitter", [True, False])
+def test_jitter_can_be_forced(model: str, jitter: bool) -> None:
+    assert Sonar(model=model, jitter=jitter).jittered is jitter
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"range_min": 4.0, "range_max": 4.0}, r"range_max must exceed range_min: got 4 m <= 4 m"),
+        ({"range_min": 5.0, "range_max": 4.0}, r"range_max must exceed range_min: got 4 m <= 5 m"),
+        ({"beams": 0}, r"beams: .*greater than or equal to 1, got 0"),
+        ({"beams": 2.5}, r"beams: .*integer.*2\.5"),
+        ({"rays_per_beam": 0}, r"rays_per_beam: .*got 0"),
+        ({"range_bins": -3}, r"range_bins: .*got -3"),
+        ({"azimuth_fov_deg": 0}, r"azimuth_fov_deg: .*greater than 0, got 0"),
+        ({"azimuth_fov_deg": 361}, r"azimuth_fov_deg: .*360, got 361"),
+        ({"elevation_fov_deg": float("nan")}, r"elevation_fov_deg: .*got nan"),
+        ({"range_max": float("inf")}, r"range_max: .*got inf"),
+        ({"bearing": "sideways"}, r"bearing: .*azimuth.*cone.*got 'sideways'"),
+        ({"model": "real"}, r"model: .*physical.*thesis.*got 'real'"),
+        ({"gain_exponent": 5}, r"gain_exponent: .*4, got 5"),
+        ({"seed": -1}, r"seed: .*got -1"),
+        ({"bearing": "cone", "azimuth_fov_deg": 200}, r"cone bearing covers at most 180 deg: got azimuth_fov_deg 200"),
+        ({"beam_layout": "sine", "azimuth_fov_deg": 200}, r"beam_layout sine covers at most 180 deg"),
+        ({"beams": 60_000, "rays_per_beam": 900_000}, r"at most 268,435,456 rays: got 216,000,000,000"),
+    ],
+)
+def test_errors_say_what_and_got(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(MitsonarError, match=message) as caught:
+        Sonar.create(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_key_names_the_nearest() -> None:
+    with pytest.raises(MitsonarError, match=r"unknown sonar key azimut_fov_deg: did you mean azimuth_fov_deg") as caught:
+        Sonar.create(azimut_fov_deg=20)
+    assert "range_bins" in str(caught.value)  # all known keys are listed
+
+
+def test_replace_checks_again_and_leaves_the_original() -> None:
+    sonar = Sonar(beams=5)
+    assert sonar.replace(beams=6).beams == 6
+    assert sonar.beams == 5
+    with pytest.raises(MitsonarError, match="range_max must exceed range_min"):
+        sonar.replace(range_min=9.0)
+    with pytest.raises(ValidationError):
+        sonar.beams = 7  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    "fields", [{"azimuth_fov_deg": 180, "beam_width_deg": 10}, {"azimuth_fov_deg": 60, "beam_width_deg": 200}]
+)
+def test_a_cone_ends_at_ninety_degrees(fields: dict[str, float]) -> None:
+    with pytest.raises(MitsonarError, match="beams end at 90 deg"):
+        Sonar.create(bearing="cone", **fields)

@@ -1,0 +1,95 @@
+"""Named sonars and YAML files: every preset is valid and sourced, every mistake is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import PRESETS, load_sonar, preset, preset_sources, sonar_from
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_preset_is_valid_and_every_number_has_a_source(name: str) -> None:
+    sonar, sources = preset(name), preset_sources(name)
+    assert sonar.name == name
+    assert PRESETS[name][0].strip()
+    assert all(isinstance(source, str) and len(source.strip()) >= 4 for source in sources.values())
+    given = {key for key, value in sonar.model_dump().items() if value != getattr(Sonar(), key)} - {"name"}
+    assert given <= set(sources)  # nothing differs from the defaults without a source
+    assert {"azimuth_fov_deg", "elevation_fov_deg", "beams", "range_min", "range_max", "range_bins"} <= set(sources)
+    assert {key: getattr(sonar, key) for key in sources} == {key: value for key, (value, _) in PRESETS[name][1].items()}
+
+
+def test_numbers_of_the_reference() -> None:
+    """SPEC.md, section 2: DIDSON 300 has 29 x 14 deg, 96 beams, 512 bins, 21 frames/s; the thesis's looking-down sonar."""
+    didson, down = preset("didson300"), preset("lookdown100")
+    assert (didson.azimuth_fov_deg, didson.elevation_fov_deg, didson.beams, didson.range_bins) == (29, 14, 96, 512)
+    assert didson.frame_rate_hz == 21
+    assert (preset("aris3000").beams, preset("aris3000").range_bins) == (128, 1344)
+    assert (down.azimuth_fov_deg, down.elevation_fov_deg, down.beams, down.range_bins) == (100, 100, 1000, 512)
+    assert (down.range_min, down.range_max, down.bearing) == (2.0, 6.1, "azimuth")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"), [("didson30", "didson300"), ("Aris3000", "aris3000"), ("gemini720is", "gemini-720is")]
+)
+def test_unknown_preset_names_the_nearest(wrong: str, near: str) -> None:
+    with pytest.raises(MitsonarError, match=rf"unknown sonar preset '{wrong}': did you mean {near}") as caught:
+        load_sonar(wrong)
+    assert all(name in str(caught.value) for name in PRESETS)
+    with pytest.raises(MitsonarError, match=f"did you mean {near}"):
+        preset_sources(wrong)
+
+
+def test_yaml_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("beams: 12\nrange_max: 7.5\nbearing: cone\n")
+    assert load_sonar(path) == Sonar(name="mine", beams=12, range_max=7.5, bearing="cone")
+
+
+def test_yaml_file_changes_a_preset(tmp_path: Path) -> None:
+    path = tmp_path / "didson_near.YML"
+    path.write_text("preset: didson300\nrange_min: 1.0\nname: near\n")
+    assert load_sonar(str(path)) == preset("didson300").replace(range_min=1.0, name="near")
+
+
+def test_sonar_from_leaves_its_argument() -> None:
+    fields = {"preset": "aris3000", "beams": 64}
+    assert sonar_from(fields) == preset("aris3000").replace(beams=64)
+    assert fields == {"preset": "aris3000", "beams": 64}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("beams: [1", "is not YAML"),
+        ("- beams\n- 12\n", "must hold `key: value` lines"),
+        ("", "must hold `key: value` lines"),
+        ("12: 3\n", "must hold `key: value` lines"),
+        ("beems: 12\n", "unknown sonar key beems: did you mean beams"),
+        ("preset: didson30\n", "unknown sonar preset 'didson30': did you mean didson300"),
+        ("preset: didson300\nbeems: 12\n", "unknown sonar key beems: did you mean beams"),
+        ("preset: didson300\nrange_min: 9\n", "range_max must exceed range_min: got 5.6 m <= 9 m"),
+        ("beams: many\n", "beams: .*got 'many'"),
+    ],
+)
+def test_bad_yaml_files(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(MitsonarError, match=message) as caught:
+        load_sonar(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(MitsonarError, match=r"cannot read sonar file .*absent\.yaml: No such file"):
+        load_sonar(tmp_path / "absent.yaml")
+    (tmp_path / "latin.yaml").write_bytes("name: Meßgerät".encode("latin-1"))
+    with pytest.raises(MitsonarError, match="is not YAML"):
+        load_sonar(tmp_path / "latin.yaml")
+    (tmp_path / "sonar.txt").write_text("beams: 12")
+    with pytest.raises(MitsonarError, match=r"ends in \.yaml: got .*sonar\.txt"):
+        load_sonar(tmp_path / "sonar.txt")

@@ -1,0 +1,630 @@
+"""Odometry: frames and an estimator become a path; what is killed goes on; what is not believed is bridged."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import files_of, tiny_recipe
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.image.direct import Direct
+from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping import odometry_run
+from mitsonar.mapping.frame_source import FrameSource, open_frames
+from mitsonar.mapping.odometry import PAIRS_A_BATCH, bridged, estimate_motions, odometry
+from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
+from mitsonar.mapping.trajectory_smoothing import MotionSeries, path_of
+from mitsonar.motion.pose import Motion, Pose, Trajectory, motions
+from mitsonar.records.frame_store import FrameStore
+from mitsonar.records.sonar_frames import SonarFrames
+
+Array = NDArray[np.float64]
+
+SONAR = Sonar(bearing="azimuth", beams=96, range_bins=128, range_min=3.6, range_max=5.4)
+START = Pose.from_degrees([1.0, -2.0, 2.5, 35, 0, 40])
+STD = np.array([1e-3, 5e-4, 2e-4])
+
+
+def sway(frames: int) -> Trajectory:
+    """A path that turns and changes its speed, at uneven times."""
+    step = np.random.default_rng(1).uniform(0.08, 0.12, frames - 1)
+    time = np.concatenate([[5.0], 5.0 + np.cumsum(step)])
+    t = (time[1:] + time[:-1]) / 2
+    velocity = np.column_stack([0.1 * np.sin(t), 0.12 + 0.04 * np.cos(0.7 * t), np.radians(3) * np.sin(0.5 * t)])
+    return path_of(velocity * step[:, None], START, time)
+
+
+def over_ground(path: Trajectory, sonar: Sonar = SONAR, noise: float = 0.01) -> SonarFrames:
+    """Frames of a flat floor of smooth random reflectivity, drawn by geometry alone."""
+    cell, rng = 0.02, np.random.default_rng(7)
+    floor = ndimage.gaussian_filter(rng.uniform(0, 1, (700, 700)), 3)
+    floor = np.clip(0.4 + (floor - floor.mean()) / floor.std() * 0.15, 0.02, 1)
+    images = []
+    for pose in path.poses:
+        geometry = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, pose[2], pose[3], pose[4])
+        place = moved(geometry.points, (0.0, 0.0, -pose[5])) + pose[:2]
+        level = ndimage.map_coordinates(floor, np.moveaxis(place, -1, 0)[::-1] / cell + 350, order=1, mode="grid-wrap")
+        images.append(np.clip(level + noise * rng.normal(size=level.shape), 0, 1))
+    heights = path.poses[:, 2].copy()
+    image = np.array(images, np.float32)
+    return SonarFrames(image, sonar.range_m, sonar.bearing_rad, path.time_s, sonar, path.poses, heights)
+
+
+def numbered(path: Trajectory) -> SonarFrames:
+    """Frames that hold nothing but their number, for :class:`Told`."""
+    image = np.broadcast_to(np.arange(len(path), dtype=np.float32)[:, None, None], (len(path), 3, 2)).copy()
+    sonar = Sonar(beams=2, range_bins=3)
+    heights = np.full(len(path), 2.5)
+    return SonarFrames(image, sonar.range_m, sonar.bearing_rad, path.time_s, sonar, path.poses, heights)
+
+
+@dataclass(frozen=True)
+class Told:
+    """An estimator that knows the answers ``(frames, frames)`` by the numbers in the images.
+
+    Attributes:
+        poses: the path that it tells.
+        off: errors of the motions by the first frame ``(frames, 3)``.
+        lost: first frames of motions that it does not believe.
+        covariance: that it tells.
+        deadly: the first frame at which its process ends.
+    """
+
+    poses: Array
+    off: Array | None = None
+    lost: tuple[int, ...] = ()
+    covariance: Array | None = None
+    deadly: int | None = None
+
+    inputs = "nothing"
+
+    def estimate(self, frames: SonarFrames) -> Estimate:
+        first, second = (int(number) for number in frames.image[:, 0, 0])
+        if first == self.deadly:
+            os._exit(9)
+        if first in self.lost:
+            return Estimate(Motion(0, 0, 0), None, False, f"correlates by 0.{first:02d} only")
+        answer = motions(self.poses[[first, second]])[0]
+        return Estimate(Motion(*(answer if self.off is None else answer + self.off[first])), self.covariance)
+
+
+def told(path: Trajectory, **options: Any) -> tuple[SonarFrames, Told]:
+    return numbered(path), Told(path.poses, **options)
+
+
+# ---------------------------------------------------------------- path
+
+
+def test_the_path_is_the_motions_composed_from_the_first_pose() -> None:
+    path = sway(30)
+    found = odometry(*told(path))
+    np.testing.assert_allclose(found.path.poses, path.poses, atol=1e-12)
+    np.testing.assert_array_equal(found.path.time_s, path.time_s)
+    assert found.believed.all()
+    elsewhere = odometry(*told(path), start=Pose(5, 6, 7, 0.1, 0.2, 1.0))
+    assert elsewhere.path.poses[0].tolist() == [5, 6, 7, 0.1, 0.2, 1.0]
+    np.testing.assert_allclose(motions(elsewhere.path.poses), motions(path.poses), atol=1e-12)
+
+
+def test_without_poses_the_path_begins_at_the_origin_with_what_is_known() -> None:
+    path = sway(5)
+    frames, estimator = told(path)
+    frames.poses = None
+    source = FrameSource.of(frames).with_geometry(pitch_rad=0.6)
+    found = odometry(source, estimator)
+    np.testing.assert_allclose(found.path.poses[0], [0, 0, 2.5, 0.6, 0, 0])
+    assert found.true is None
+    assert ("estimated path length", pytest.approx(np.linalg.norm(motions(path.poses)[:, :2], axis=1).sum()), "m") in (
+        found.rows()
+    )
+
+
+def test_every_third_frame() -> None:
+    path = sway(30)
+    found = odometry(*told(path), every=3)
+    assert found.frames.tolist() == list(range(0, 30, 3))
+    np.testing.assert_allclose(found.path.poses, path.poses[::3], atol=1e-12)
+    rows = {name: value for name, value, _ in found.rows()}
+    assert rows["poses compared"] == 10
+    assert rows["end-point error"] < 1e-6
+
+
+def test_estimators_do_not_see_where_the_sonar_was() -> None:
+    frames = numbered(sway(9))
+    seen = FrameSource.of(frames).read([2, 3])
+    assert seen.poses is not None
+    np.testing.assert_array_equal(seen.poses[:, [0, 1, 5]], 0)
+    np.testing.assert_allclose(seen.poses[:, [2, 3, 4]], np.tile([2.5, np.radians(35), 0], (2, 1)))
+    assert seen.image[:, 0, 0].tolist() == [2, 3]
+    np.testing.assert_array_equal(seen.time_s, frames.time_s[2:4])
+
+
+def test_direct_finds_the_path_over_a_drawn_floor() -> None:
+    path = sway(16)
+    found = odometry(over_ground(path), Direct())
+    errors = motions(found.path.poses) - motions(path.poses)
+    assert found.believed.all()
+    rmse = np.sqrt((errors**2).mean(axis=0))
+    assert (rmse < [6e-4, 3e-4, 3e-4]).all(), rmse
+    assert found.pose_covariances is not None
+    assert found.pose_covariances.shape == (16, 3, 3)
+
+
+def test_workers_change_no_bit() -> None:
+    frames = over_ground(sway(3 * PAIRS_A_BATCH), noise=0.05)
+    one, two = (odometry(frames, Direct(), workers=workers) for workers in (1, 2))
+    np.testing.assert_array_equal(one.path.poses, two.path.poses)
+    assert one.series.covariances is not None
+    np.testing.assert_array_equal(one.series.covariances, two.series.covariances)
+    assert [e.reason for e in one.estimates] == [e.reason for e in two.estimates]
+
+
+def test_a_worker_that_is_lost_is_said_to_be() -> None:
+    had = os.environ.get("OMP_NUM_THREADS")
+    with pytest.raises(MitsonarError, match="worker was lost"):
+        odometry(*told(sway(40), deadly=20), workers=2)
+    assert os.environ.get("OMP_NUM_THREADS") == had
+
+
+# ---------------------------------------------------------------- what is not believed
+
+
+@pytest.mark.parametrize("covariance", [None, np.diag(STD**2)], ids=["alone", "with covariances"])
+def test_what_is_not_believed_is_bridged_and_the_rest_left_as_it_is(covariance: Array | None) -> None:
+    """A straight path at one speed, uneven times: a bridge by velocity ends where the path does."""
+    path = sway(30)
+    speed = np.array([0.02, 0.1, 0.01])
+    even = path_of(speed * np.diff(path.time_s)[:, None], START, path.time_s)
+    lost = (0, 7, 8, 9, 28)
+    found = odometry(*told(even, lost=lost, covariance=covariance))
+    assert np.flatnonzero(~found.believed).tolist() == list(lost)
+    np.testing.assert_allclose(found.path.poses, even.poses, atol=1e-6)
+    kept = found.believed
+    np.testing.assert_array_equal(found.series.motions[kept], np.array([e.motion for e in found.estimates])[kept])
+    if covariance is None:
+        assert found.series.covariances is None
+        assert found.pose_covariances is None
+    else:
+        assert found.series.covariances is not None
+        np.testing.assert_array_equal(found.series.covariances[kept], np.tile(covariance, (kept.sum(), 1, 1)))
+        assert found.pose_covariances is not None
+
+
+def test_a_bridge_s_covariance_grows_with_its_length() -> None:
+    rng = np.random.default_rng(3)
+    time = np.arange(60) / 10
+    true = np.cumsum(rng.normal(0, 1e-3, (59, 3)), axis=0)
+    covariances = np.tile(np.diag(STD**2), (59, 1, 1))
+    valid = np.ones(59, dtype=bool)
+    valid[20:31] = False
+    series = bridged(MotionSeries(true + STD * rng.normal(size=true.shape), time, covariances, valid))
+    assert series.covariances is not None
+    spread = np.trace(series.covariances, axis1=1, axis2=2)
+    assert spread[25] > 2 * spread[20] > 2 * spread[19]
+    # honest: within some standard deviations of what it was
+    assert (np.abs(series.motions[25] - true[25]) < 4 * np.sqrt(np.diag(series.covariances[25]))).all()
+
+
+@pytest.mark.parametrize("covariance", [None, np.diag(STD**2)])
+def test_one_believed_motion_is_enough(covariance: Array | None) -> None:
+    path = path_of(np.tile([0, 0.01, 0.0], (5, 1)), START, np.arange(6.0))
+    found = odometry(*told(path, lost=(0, 1, 3, 4), covariance=covariance))
+    np.testing.assert_allclose(found.path.poses, path.poses, atol=1e-12)
+
+
+def test_many_that_are_not_believed_are_warned_of_and_all_is_an_error() -> None:
+    path = sway(31)
+    assert odometry(*told(path, lost=(3, 4, 5))).warnings() == []
+    (warning,) = odometry(*told(path, lost=(3, 4, 5, 6))).warnings()
+    assert "4 of 30 motions (13 %) are not believed" in warning
+    assert "4 times such as 'correlates by 0.03 only'" in warning
+    with pytest.raises(MitsonarError, match=r"none of 30 motions is believed.*30 times such as 'correlates by 0.00 only'"):
+        odometry(*told(path, lost=tuple(range(30))))
+
+
+# ---------------------------------------------------------------- scale and smoothing
+
+
+def test_scale_fits_what_was_shrunk() -> None:
+    """Estimates of half, a third and twice the size, one of them lost: the fit undoes it, from the believed ones alone."""
+    path = sway(30)
+    shrunk = motions(path.poses) * (np.array([1 / 2, 1 / 3, 2]) - 1)
+    words = {"off": np.vstack([shrunk, np.zeros(3)]), "covariance": np.diag(STD**2)}
+    found = odometry(*told(path, lost=(4,), **words), scale="fit")
+    np.testing.assert_allclose(found.factors, [2, 3, 0.5], rtol=1e-9)
+    kept = found.believed
+    np.testing.assert_allclose(found.series.motions[kept], motions(path.poses)[kept], atol=1e-12)
+    assert found.series.covariances is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(found.series.covariances[0])), STD * [2, 3, 0.5])
+    rows = {name: value for name, value, _ in found.rows()}
+    assert rows["scale of forward, fitted to the true path"] == pytest.approx(3)
+    given = odometry(*told(path, **words), scale=[2, 3, 0.5])
+    np.testing.assert_allclose(given.path.poses, path.poses, atol=1e-9)
+    assert "scale of yaw, as given" in [name for name, _, _ in given.rows()]
+
+
+def test_smoothing_takes_noise_from_motions_and_hardly_changes_the_end() -> None:
+    """Why `none` is the default: over ten draws, the RMSE of motions falls, and that of the end stays as it is."""
+    path = sway(200)
+    end: dict[str, list[float]] = {"none": [], "spline": [], "kalman": []}
+    each: dict[str, list[float]] = {"none": [], "spline": [], "kalman": []}
+    for seed in range(10):
+        off = STD * np.random.default_rng(seed).normal(size=(200, 3))
+        for smooth in end:
+            found = odometry(*told(path, off=off, covariance=np.diag(STD**2)), smooth=smooth)  # type: ignore[arg-type]
+            rows = {name: value for name, value, _ in found.rows()}
+            end[smooth].append(rows["end-point error"])
+            each[smooth].append(rows["motion error RMSE, sideways"])
+    rms = {smooth: np.sqrt(np.mean(np.square(values))) for smooth, values in end.items()}
+    for smooth in ("spline", "kalman"):
+        assert np.mean(each[smooth]) < 0.65 * np.mean(each["none"])
+        assert 0.9 < rms[smooth] / rms["none"] < 1.1, rms
+    assert np.mean(each["none"]) == pytest.approx(1.0, rel=0.05)
+
+
+def test_the_table_tells_what_a_hand_finds() -> None:
+    path = sway(41)
+    off = STD * np.random.default_rng(5).normal(size=(41, 3))
+    found = odometry(*told(path, off=off, covariance=np.diag(STD**2)))
+    rows = {name: (value, unit) for name, value, unit in found.rows()}
+    driven = motions(path.poses)
+    for k, (name, scale, unit) in enumerate((("sideways", 1e3, "mm"), ("forward", 1e3, "mm"), ("yaw", 57.29578, "deg"))):
+        assert rows[f"motion error RMSE, {name}"] == (pytest.approx(scale * np.sqrt((off[:40, k] ** 2).mean())), unit)
+        assert rows[f"RMSE of always answering zero, {name}"][0] == pytest.approx(
+            scale * np.sqrt((driven[:, k] ** 2).mean())
+        )
+        assert rows[f"standard deviation of a motion as told, {name}"][0] == pytest.approx(scale * STD[k])
+        slope = ((driven + off[:40])[:, k] * driven[:, k]).sum() / (driven[:, k] ** 2).sum()
+        assert rows[f"slope over the true {name}"][0] == pytest.approx(slope)
+    nees = ((off[:40] / STD) ** 2).sum(axis=1).mean() / 3
+    assert rows["squared motion error over its covariance, a third"][0] == pytest.approx(nees)
+    end = np.linalg.norm(found.path.poses[-1, :2] - path.poses[-1, :2])
+    assert rows["end-point error"] == (pytest.approx(1e3 * end), "mm")
+    lines = table_lines(found.rows())
+    assert lines[0].split("|")[2].strip() == "value"
+    assert len({len(line) for line in lines}) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "message"),
+    [
+        ("one", {}, "two frames or more: got 1"),
+        ("", {"every": 30}, "got 30 from the frames, 1 of them used"),
+        ("", {"every": 0}, "every must be at least 1"),
+        ("still", {}, "increase: got 0, 0 s at frame 0"),
+        ("nan", {}, "finite"),
+        ("back", {}, "increase: got 5, 4 s at frame 0"),
+        ("", {"smooth": "kalmann"}, "did you mean kalman"),
+        ("", {"scale": "fitt"}, "three factors or fit"),
+        ("no poses", {"scale": "fit"}, "true poses"),
+        ("", {"scale": [1, 2]}, "three finite numbers"),
+    ],
+)
+def test_what_cannot_be_driven_is_said(change: str, options: dict[str, Any], message: str) -> None:
+    frames, estimator = told(sway(30))
+    match change:
+        case "one":
+            frames = frames.select(slice(1))
+        case "still":
+            frames.time_s = np.zeros(30)
+        case "nan":
+            frames.time_s = np.full(30, np.nan)
+        case "back":
+            frames.time_s = np.arange(5.0, -25, -1)
+        case "no poses":
+            frames.poses = None
+    with pytest.raises(MitsonarError, match=message):
+        odometry(frames, estimator, **options)
+
+
+# ---------------------------------------------------------------- sources
+
+
+def counted(source: FrameSource) -> tuple[FrameSource, list[int]]:
+    """A source that writes down how many frames are asked for."""
+    sizes: list[int] = []
+
+    def images(index: NDArray[np.intp]) -> NDArray[Any]:
+        sizes.append(len(index))
+        return source.images(index)
+
+    return replace(source, images=images), sizes
+
+
+def test_few_frames_are_in_memory_at_a_time() -> None:
+    path = sway(100)
+    source, sizes = counted(FrameSource.of(numbered(path)))
+    estimate_motions(source, Told(path.poses), np.arange(100))
+    assert max(sizes) == PAIRS_A_BATCH + 1
+    assert sum(sizes) < 100 + 100 / PAIRS_A_BATCH + 1
+    big = replace(FrameSource.of(over_ground(sway(2))), time_s=np.arange(5000.0))
+    assert big.frames_a_chunk * SONAR.range_bins * SONAR.beams * 4 <= 8 * 2**20
+
+
+def as_zarr(frames: SonarFrames, path: Path, done: int | None = None) -> None:
+    store = FrameStore.create(path, len(frames), frames)
+    store.write(0, frames.select(slice(done)))
+
+
+def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
+    frames = over_ground(sway(12))
+    frames.elevation_rad = np.zeros_like(frames.image)
+    (tmp_path / "short").mkdir()
+    (tmp_path / "long").mkdir()
+    frames.save(tmp_path / "short" / "frames.npz")
+    as_zarr(frames, tmp_path / "long" / "frames.zarr")
+    digests = []
+    for where in ("short", "short/frames.npz", "long", "long/frames.zarr"):
+        source = open_frames(tmp_path / where)
+        assert len(source) == 12
+        for index in ([3], [2, 3, 4], [1, 5, 9], [7, 2, 4]):
+            read = source.read(index)
+            np.testing.assert_array_equal(read.image, frames.image[index])
+            assert frames.height_m is not None
+            np.testing.assert_array_equal(read.height_m, frames.height_m[index])
+            assert read.elevation_rad is None
+        assert source.like.sonar == SONAR
+        np.testing.assert_array_equal(source.poses, frames.poses)
+        digests.append(source.digest())
+    assert len(set(digests)) == 1
+    frames.image[5] += 0.001  # of the first, the middle and the last frame
+    assert FrameSource.of(frames).digest() != digests[0]
+
+
+def test_a_run_that_goes_on_gives_what_is_there(tmp_path: Path) -> None:
+    as_zarr(numbered(sway(12)), tmp_path / "frames.zarr", done=7)
+    with pytest.warns(MitsonarWarning, match="7 of 12 frames are there"):
+        source = open_frames(tmp_path)
+    assert len(source) == 7
+    np.testing.assert_array_equal(source.read([6]).image[0, 0], 6)
+
+
+def test_times_of_beams_are_averaged() -> None:
+    frames = numbered(sway(4))
+    frames.time_s = frames.time_s[:, None] + np.array([0.0, 0.02])
+    np.testing.assert_allclose(FrameSource.of(frames).time_s, frames.time_s[:, 0] + 0.01)
+
+
+def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
+    frames = numbered(sway(4))
+    frames.poses, frames.height_m = None, np.array([2.5, np.nan, 2.6, np.nan])
+    source = FrameSource.of(frames).with_geometry(3.0, 0.5)
+    seen = source.read([0, 1])
+    assert seen.height_m is not None
+    assert seen.poses is not None
+    assert seen.height_m.tolist() == [2.5, 3.0]
+    assert seen.poses[:, 3].tolist() == [0.5, 0.5]
+    assert source.true is None
+    with pytest.raises(MitsonarError, match="tell their heights"):
+        source.with_geometry(2.0)
+    with pytest.raises(MitsonarError, match="tell their pitch"):
+        FrameSource.of(numbered(sway(4))).with_geometry(pitch_rad=0.5)
+    with pytest.raises(MitsonarError, match="above 0"):
+        FrameSource.of(frames).with_geometry(-1.0)
+    with pytest.raises(MitsonarError, match=r"-90..90"):
+        FrameSource.of(frames).with_geometry(pitch_rad=2.0)
+
+
+def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> None:
+    path = sway(10)
+    frames = numbered(path)
+    assert frames.poses is not None
+    frames.poses[:, 3] += np.linspace(0, 0.1, 10)
+    source = FrameSource.of(frames)
+    some = slice(2, 9, 2)
+    index, poses = source.along(Trajectory(path.poses[some], path.time_s[some] + 0.004))
+    assert index.tolist() == [2, 4, 6, 8]
+    np.testing.assert_array_equal(poses[:, 3], frames.poses[some, 3])
+    np.testing.assert_array_equal(poses[:, [0, 1, 2, 5]], path.poses[some][:, [0, 1, 2, 5]])
+    own = path.poses.copy()
+    own[:, 3] = np.linspace(0.3, 0.5, 10)
+    np.testing.assert_array_equal(source.along(Trajectory(own, path.time_s))[1], own)
+    with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
+        source.along(Trajectory(path.poses, path.time_s + 100))
+
+
+@pytest.mark.learn
+def test_a_data_set_s_sequences_are_runs(tmp_path: Path) -> None:
+    """The longest unless told; pixels and noise as the reader of pairs gives them."""
+    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.torch_pairs import SonarPairs
+
+    url = str(tmp_path / "tiny.zarr")
+    make_dataset(tiny_recipe(), url, sequences=3)
+    pairs = SonarPairs(url, part="all", frames=2, noise="low", seed=4)
+    for sequence in (None, 2):
+        source = open_frames(url, sequence=sequence).with_noise(NOISE_MODELS["low"], 4)
+        number = sequence or 0
+        mine = [k for k in range(len(pairs)) if pairs.sequence[pairs.first[k]] == number]
+        assert len(source) == len(mine) + 1 == 5
+        for k, place in enumerate(mine):
+            one = pairs.sonar_frames(place)
+            np.testing.assert_array_equal(source.read([k, k + 1]).image, one.image)
+            assert source.poses is not None
+            np.testing.assert_array_equal(source.poses[k : k + 2], one.poses)
+        assert source.note == f"sequence {number} of 3{', the longest' if sequence is None else ''}: 5 frames"
+    with pytest.raises(MitsonarError, match="no sequence 3: it has 3, numbered from 0"):
+        open_frames(url, sequence=3)
+    with pytest.raises(MitsonarError, match="no view 'left'"):
+        open_frames(url, view="left")
+
+
+def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "wrong.npz").write_bytes(b"no zip")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    as_zarr(numbered(sway(4)), tmp_path / "damaged.zarr")
+    (tmp_path / "damaged.zarr" / "zarr.json").write_text("{")
+    numbered(sway(4)).save(tmp_path / "frames.npz")
+    for name, message in (
+        ("empty", "holds no frames.npz"),
+        ("none.npz", "cannot read frames"),
+        ("wrong.npz", "cannot read frames"),
+        ("other.npz", "lacks image"),
+        ("damaged.zarr", "cannot read frames"),
+    ):
+        with pytest.raises(MitsonarError, match=message):
+            open_frames(tmp_path / name)
+    with pytest.raises(MitsonarError, match="is no data set"):
+        open_frames(tmp_path, sequence=1)
+
+
+# ---------------------------------------------------------------- folders
+
+RESULTS = {
+    *("run.json", "estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
+    *("table.md", "table.json", "path.png"),
+}
+
+
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty figure in place of the path's, which takes half a second."""
+    monkeypatch.setattr(odometry_run, "path_figure", lambda *_, **__: Figure(figsize=(1, 1)))
+
+
+def run(out: Path, path: Trajectory, estimator: Any = None, **options: Any) -> dict[str, bytes]:
+    """An odometry's files, but for run.json, which tells the time, and the picture."""
+    source = FrameSource.of(numbered(path))
+    run_odometry(source, "told", estimator or Told(path.poses, covariance=np.diag(STD**2)), out, **options)
+    files = files_of(out)
+    assert set(files) == RESULTS
+    return {name: content for name, content in files.items() if name not in ("run.json", "path.png")}
+
+
+def test_a_folder_holds_the_path_and_all_about_it(tmp_path: Path) -> None:
+    path = sway(20)
+    out = tmp_path / "out"
+    run(out, path, Told(path.poses, lost=(4,), covariance=np.diag(STD**2)))
+    folder = OdometryFolder.open(out)
+    np.testing.assert_allclose(folder.estimated.poses[:4], path.poses[:4], atol=2e-8)
+    assert folder.true is not None
+    np.testing.assert_allclose(folder.true.poses, path.poses, atol=2e-8)
+    rows = list(csv.DictReader((out / "motions.csv").open()))
+    assert [int(row["frame"]) for row in rows] == list(range(1, 20))
+    assert [row["believed"] for row in rows].count("0") == 1
+    assert rows[4]["reason"] == "correlates by 0.04 only"
+    driven = motions(path.poses)
+    assert float(rows[9]["forward_mm"]) == pytest.approx(1e3 * driven[9, 1], abs=1e-6)
+    assert float(rows[9]["yaw_std_deg"]) == pytest.approx(np.degrees(STD[2]), rel=1e-5)
+    with np.load(out / "covariances.npz") as table:
+        assert table["motion_covariances"].shape == (19, 3, 3)
+        assert table["pose_covariances"].shape == (20, 3, 3)
+        np.testing.assert_allclose(table["motion_covariances"][0], np.diag(STD**2))
+    state = json.loads((out / "run.json").read_text())
+    assert state["finished"]
+    assert state["recipe"]["estimator"] == "told"
+    assert state["recipe"]["options"]["lost"] == [4]
+    assert (state["smooth"], state["not_believed"]) == ("none", 1)
+    table = json.loads((out / "table.json").read_text())["rows"]
+    assert {"name": "motions not believed, bridged", "value": 1.0, "unit": ""} in table
+    assert (out / "table.md").read_text().count("\n") == len(table) + 2
+
+
+def killed_at(number: int) -> Callable[[int], None]:
+    done = 0
+
+    def progress(pairs: int) -> None:
+        nonlocal done
+        done += pairs
+        if done >= number:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.usefixtures("no_picture")
+def test_a_killed_odometry_goes_on_to_the_same_files(tmp_path: Path, workers: int) -> None:
+    path = sway(40)
+    whole = run(tmp_path / "whole", path)
+    out = tmp_path / "killed"
+    with pytest.raises(KeyboardInterrupt):
+        run(out, path, workers=workers, progress=killed_at(17))
+    with pytest.raises(MitsonarError, match="not finished: run the same"):
+        OdometryFolder.open(out)
+    journal = out / "estimates.jsonl"
+    assert 17 <= journal.read_text().count("\n") < 39
+    with journal.open("a") as file:
+        file.write('{"pair": 30, "motion": [0.1, 0')  # a line that a kill left half written
+    assert run(out, path, resume=True) == whole
+    assert run(out, path, resume=True) == whole
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_path_options_may_change_when_it_goes_on(tmp_path: Path) -> None:
+    """Nothing is estimated again: an estimator that would end the process is not asked."""
+    path = sway(40)
+    off = STD * np.random.default_rng(1).normal(size=(40, 3))
+    first = Told(path.poses, off=off, covariance=np.diag(STD**2))
+    out = tmp_path / "out"
+    before = run(out, path, first)
+    wanted = run(tmp_path / "new", path, first, smooth="kalman", scale="fit")
+    again = run(out, path, first, smooth="kalman", scale="fit", resume=True)
+    assert again == wanted
+    assert again["estimates.jsonl"] == before["estimates.jsonl"]
+    assert again["motions.csv"] != before["motions.csv"]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_another_odometry_is_not_gone_on_with(tmp_path: Path) -> None:
+    path = sway(20)
+    out = tmp_path / "out"
+    run(out, path)
+    before = files_of(out)
+    with pytest.raises(MitsonarError, match="exists and is kept"):
+        run(out, path)
+    with pytest.raises(MitsonarError, match="differs in options"):
+        run(out, path, Told(path.poses), resume=True)
+    with pytest.raises(MitsonarError, match="differs in every"):
+        run(out, path, every=2, resume=True)
+    with pytest.raises(MitsonarError, match="differs in frames_sha256"):
+        run(out, replace(path, poses=path.poses + 1), Told(path.poses, covariance=np.diag(STD**2)), resume=True)
+    with pytest.raises(MitsonarError, match="contradict"):
+        run(out, path, overwrite=True, resume=True)
+    assert files_of(out) == before
+    journal = out / "estimates.jsonl"
+    journal.write_text(journal.read_text().replace('"motion"', '"emotion"', 1))
+    with pytest.raises(MitsonarError, match=r"estimates.jsonl, line 1 is damaged"):
+        run(out, path, resume=True)
+    run(out, path, overwrite=True)
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_folders_of_others_are_kept(tmp_path: Path) -> None:
+    path = sway(20)
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("years of work")
+    for options in ({}, {"overwrite": True}, {"resume": True}):
+        with pytest.raises(MitsonarError, match="kept as it is"):
+            run(mine, path, **options)
+    assert files_of(mine) == {"thesis.tex": b"years of work"}
+    out = tmp_path / "out"
+    run(out, path)
+    (out / "note.txt").write_text("mine")
+    with pytest.raises(AssertionError):  # of `run`: a file of others stays
+        run(out, path, overwrite=True)
+    assert (out / "note.txt").read_text() == "mine"
+
+
+def test_nothing_is_left_where_nothing_was_estimated(tmp_path: Path) -> None:
+    frames = over_ground(sway(4))
+    frames.height_m = frames.poses = None
+    with pytest.raises(MitsonarError, match="needs height and pitch"):
+        run_odometry(FrameSource.of(frames), "direct", Direct(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()

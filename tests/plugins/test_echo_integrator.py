@@ -1,0 +1,132 @@
+"""The integrator `echo`: its channels, its misses, one ray a pixel, any camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from helpers import box, diffuse, floor, sphere
+
+from mitsonar.records.echoes import CHANNELS
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def camera(origin: tuple[float, ...] = (0, 0, 3), target: tuple[float, ...] = (0, 3, 0), **more: Any) -> dict[str, Any]:
+    """A perspective camera of 24 x 16 pixels."""
+    film = {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    look = mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 0, 1])
+    return {"type": "perspective", "fov": 60, "to_world": look, "film": film, **more}
+
+
+def channels(sensor: dict[str, Any], **shapes: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What `echo` records, by name, each ``(height, width)``; ``film`` is the film's own channel."""
+    loaded = mi.load_dict({"type": "scene", "integrator": {"type": "echo"}, "sensor": sensor, **shapes})
+    assert tuple(loaded.integrator().aov_names()) == CHANNELS
+    image = np.array(mi.render(loaded))
+    return {"film": image[..., 0], **{name: image[..., 1 + k] for k, name in enumerate(CHANNELS)}}
+
+
+@pytest.mark.parametrize("near_clip", [0.01, 1.0, 3.0])
+def test_range_counts_from_the_camera_not_from_its_near_plane(near_clip: float) -> None:
+    """In the middle of a 10 m sphere every range is 10 m and every cosine 1."""
+    got = channels(camera((1, 2, 3), (4, 5, 3), near_clip=near_clip), around=sphere((1, 2, 3), 10))
+    np.testing.assert_allclose(got["range_m"], 10, atol=1e-5)
+    np.testing.assert_allclose(got["cosine"], 1, atol=1e-5)
+
+
+def test_channels_agree_with_each_other() -> None:
+    got = channels(camera(), floor=floor(diffuse(0.3)), box=box((0.5, 3, 0), (0.4, 0.4, 0.4), diffuse(0.8)))
+    hit = got["hit"] == 1
+    origin, point = np.array([0, 0, 3.0]), np.stack([got["x"], got["y"], got["z"]], -1)
+    normal = np.stack([got["nx"], got["ny"], got["nz"]], -1)
+    way = point - origin
+    np.testing.assert_allclose(np.linalg.norm(way, axis=-1)[hit], got["range_m"][hit], rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1)[hit], 1, atol=1e-6)
+    cosine = np.abs((way * normal).sum(-1))[hit] / got["range_m"][hit]
+    np.testing.assert_allclose(got["cosine"][hit], cosine, atol=1e-5)
+    np.testing.assert_allclose(got["film"], got["reflectivity"] * got["cosine"], rtol=1e-6)
+    assert set(np.unique(got["reflectivity"][hit])) == {np.float32(0.3), np.float32(0.8)}
+    on_floor = hit & (got["reflectivity"] == np.float32(0.3))
+    assert np.abs(got["z"][on_floor]).max() < 1e-5
+    assert (got["nz"][on_floor] == 1).all()
+
+
+def test_a_miss_is_marked() -> None:
+    """Looking level over the floor's edge: hit 0, shape_id -1, all others 0."""
+    got = channels(camera((0, 0, 3), (0, 3, 2.5)), floor=floor(half=8))
+    miss = got["hit"] == 0
+    assert 0.2 < miss.mean() < 0.9
+    assert (got["hit"][~miss] == 1).all()
+    assert (got["shape_id"][miss] == -1).all()
+    assert (got["shape_id"][~miss] == 0).all()
+    for name in set(CHANNELS) - {"hit", "shape_id"}:
+        assert (got[name][miss] == 0).all(), name
+    nothing = channels({"type": "imaging_sonar", "beams": 2, "rays_per_beam": 3, "rays_across": 1})
+    assert {name: np.unique(values).tolist() for name, values in nothing.items()} == {
+        **{name: [0.0] for name in nothing},
+        "shape_id": [-1.0],
+    }
+
+
+def test_other_sensors_have_no_cells() -> None:
+    got = channels(camera(), floor=floor())
+    hit = got["hit"] == 1
+    np.testing.assert_array_equal(got["solid_angle_sr"], 0)
+    np.testing.assert_array_equal(got["near_m"][hit], got["range_m"][hit])
+    np.testing.assert_array_equal(got["far_m"][hit], got["range_m"][hit])
+
+
+def test_one_ray_a_pixel_whatever_the_sampler_says() -> None:
+    """At the edge of a sphere an average of samples would lie between hit and miss."""
+    ball = sphere((0, 3, 0), 1)
+    once = channels(camera(), ball=ball)
+    often = channels(camera(sampler={"type": "independent", "sample_count": 16}), ball=ball)
+    assert set(np.unique(once["hit"])) == {0, 1}
+    for name, values in once.items():
+        np.testing.assert_array_equal(often[name], values, err_msg=name)
+
+
+def test_rays_go_through_the_middle_of_pixels() -> None:
+    """A perspective camera of 60 deg over 24 pixels: column k looks at tan = (1 - 2 (k + 1/2) / 24) tan 30 deg."""
+    got = channels(camera((0, 0, 0), (0, 1, 0)), wall=box((0, 6, 0), (50, 1, 50)))
+    column = np.arange(24) + 0.5
+    tangent = (2 * column / 24 - 1) * np.tan(np.radians(30))
+    np.testing.assert_allclose(got["x"][8] / got["y"][8], tangent, atol=1e-5)
+
+
+def test_a_crop_is_a_part_of_the_whole() -> None:
+    crop = {"crop_offset_x": 5, "crop_offset_y": 3, "crop_width": 10, "crop_height": 8}
+    part_camera = camera()
+    part_camera["film"] |= crop
+    whole, part = (channels(source, floor=floor(), ball=sphere((0, 3, 0), 1)) for source in (camera(), part_camera))
+    for name in ("hit", "shape_id"):
+        np.testing.assert_array_equal(part[name], whole[name][3:11, 5:15], err_msg=name)
+    np.testing.assert_allclose(part["range_m"], whole["range_m"][3:11, 5:15], rtol=1e-5)
+
+
+def test_an_integrator_serves_one_scene_after_another() -> None:
+    """Its tables follow the scene that is rendered."""
+    integrator = mi.load_dict({"type": "echo"})
+    scenes = [mi.load_dict({"type": "scene", "s": camera(), "f": floor(diffuse(value))}) for value in (0.2, 0.7)]
+    for loaded, value in zip([*scenes, scenes[0]], (0.2, 0.7, 0.2), strict=True):
+        image = np.array(mi.render(loaded, integrator=integrator))
+        hit = image[..., 1] == 1
+        np.testing.assert_allclose(image[..., 1 + CHANNELS.index("reflectivity")][hit], value, rtol=1e-6)
+
+
+def test_reflectivity_follows_an_edited_scene() -> None:
+    """``mi.traverse`` changes a reflectance; the next rendering shows it."""
+    loaded = mi.load_dict(
+        {"type": "scene", "i": {"type": "echo"}, "s": camera(), "box": box((0, 3, 0), (2, 2, 1), diffuse(0.2))}
+    )
+    place = 1 + CHANNELS.index("reflectivity")
+    assert np.array(mi.render(loaded))[..., place].max() == pytest.approx(0.2)
+    parameters = mi.traverse(loaded)
+    parameters["box.bsdf.reflectance.value"] = mi.Float(0.6)
+    parameters.update()
+    assert np.array(mi.render(loaded))[..., place].max() == pytest.approx(0.6)
+    assert dr.width(parameters["box.bsdf.reflectance.value"]) == 1

@@ -1,0 +1,182 @@
+"""Plugins work from XML in whichever order variant and imports come, and after the variant has changed."""
+
+from __future__ import annotations
+
+import ast
+import re
+import textwrap
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import pytest
+from helpers import run_python
+
+from mitsonar.plugins import PLUGINS
+
+SHIPPED = ("imaging_sonar", "channel_sonar", "echo", "cell_noise", "perlin")
+
+SCENE = """
+    XML = '''<scene version="3.0.0">
+        <integrator type="echo"/>
+        <sensor type="imaging_sonar">
+            <integer name="beams" value="3"/> <integer name="rays_per_beam" value="5"/>
+            <transform name="to_world"><lookat origin="0, 0, 2.5" target="0, 3.57, 0" up="0, 0, 1"/></transform>
+        </sensor>
+        <shape type="rectangle">
+            <transform name="to_world"><scale value="100"/></transform>
+            <bsdf type="diffuse"><texture type="cell_noise" name="reflectance"/></bsdf>
+        </shape>
+        <shape type="sphere">
+            <point name="center" x="0" y="4" z="0"/> <float name="radius" value="0.4"/>
+            <bsdf type="diffuse"><texture type="perlin" name="reflectance"/></bsdf>
+        </shape>
+    </scene>'''
+
+    def channels(scene=None):
+        import mitsuba as mi, numpy as np
+        scene = scene or mi.load_string(XML, parallel=False)
+        image = np.array(mi.render(scene))
+        assert image.shape[:2] == (5, 12)
+        picked = image[:, :, -len(scene.integrator().aov_names()):]
+        assert (picked[:, :, 0] == 1).all() and set(np.unique(picked[:, :, -1])) <= {0, 1}
+        return picked
+"""
+
+ORDERS = {
+    "mitsonar, mitsuba, variant": """
+        import mitsonar
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_mono")
+        channels()
+    """,
+    "mitsuba, variant, mitsonar": """
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_mono")
+        import mitsonar
+        channels()
+    """,
+    "mitsuba, mitsonar, variant": """
+        import mitsuba as mi
+        import mitsonar
+        mi.set_variant("llvm_ad_mono")
+        channels()
+    """,
+    "variant changed twice": """
+        import mitsonar
+        import mitsuba as mi
+        import numpy as np
+        mi.set_variant("llvm_ad_mono")
+        first = channels()
+        mi.set_variant("llvm_ad_rgb")
+        colour = channels()
+        mi.set_variant("llvm_ad_mono")
+        np.testing.assert_array_equal(channels(), first)
+        np.testing.assert_allclose(colour, first, atol=1e-6)
+    """,
+    "mitsuba's submodules first": """
+        import mitsonar
+        from mitsuba.llvm_ad_mono import Float
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_mono")
+        channels()
+    """,
+    "scalar variant between": """
+        import mitsonar
+        import mitsuba as mi
+        mi.set_variant("scalar_rgb")
+        mi.render(mi.load_dict({"type": "scene", "i": {"type": "direct"}, "s": {"type": "sphere"},
+                                "c": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}}), spp=1)
+        mi.set_variant("llvm_ad_mono")
+        channels()
+    """,
+}
+
+
+KEPT = """
+    import mitsonar
+    import mitsuba as mi
+    import numpy as np
+    mi.set_variant("llvm_ad_mono")
+    scene = mi.load_string(XML, parallel=False)
+    first = channels(scene)
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_mono")
+    from mitsonar.simulation.scene import sonar_in
+    assert sonar_in(scene) is not None, "the scene's sonar is not found any more"
+    names = scene.integrator().aov_names()
+    again = channels(scene)
+    changed = [name for k, name in enumerate(names) if not np.array_equal(again[..., k], first[..., k])]
+    assert not changed, f"other values in {changed}"
+"""
+
+
+@pytest.fixture(scope="module")
+def interpreters() -> Iterator[dict[str, Future[str]]]:
+    """All scripts under way, two at a time: each spends its two seconds on loading Mitsuba."""
+    with ThreadPoolExecutor(2) as pool:
+        scripts = {**ORDERS, "kept": KEPT}
+        yield {name: pool.submit(run_python, textwrap.dedent(SCENE) + textwrap.dedent(s)) for name, s in scripts.items()}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_order_of_imports_and_variants(interpreters: dict[str, Future[str]], order: str) -> None:
+    interpreters[order].result()
+
+
+def test_a_scene_outlives_a_change_of_variant_and_back(interpreters: dict[str, Future[str]]) -> None:
+    """A scene loaded before still renders the same, and its sonar is still found."""
+    interpreters["kept"].result()
+
+
+def snippet(name: str) -> str:
+    """The XML in the docstring of a plugin's class."""
+    import importlib.util
+
+    spec = importlib.util.find_spec("mitsonar.plugins")
+    assert spec is not None
+    assert spec.submodule_search_locations is not None
+    with open(f"{spec.submodule_search_locations[0]}/{name}.py", encoding="utf-8") as file:
+        tree = ast.parse(file.read())
+    assert (ast.get_docstring(tree) or "").startswith(("The sensor", "The integrator", "The texture"))
+    docs = [ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)]
+    found = re.findall(r"\.\. code-block:: xml\n\n((?:    .*\n?|\n)+)", "\n".join(docs))
+    assert len(found) == 1, f"{name} needs one scene snippet in its docstring"
+    return textwrap.dedent(found[0])
+
+
+def test_every_module_that_registers_is_known() -> None:
+    assert set(SHIPPED) <= set(PLUGINS)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_snippet_of_the_docstring_loads(name: str) -> None:
+    import mitsuba as mi
+
+    text = snippet(name)
+    assert f'type="{name}"' in text
+    if text.startswith("<texture"):
+        text = f'<shape type="sphere"><bsdf type="diffuse">{text}</bsdf></shape>'
+    scene = mi.load_string(f'<scene version="3.0.0">{text}</scene>', parallel=False)
+    assert isinstance(scene, mi.Scene)
+    if name == "imaging_sonar":
+        assert type(scene.sensors()[0]).__name__ == "ImagingSonar"
+    elif name == "echo":
+        assert type(scene.integrator()).__name__ == "Echo"
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_typing_slip_is_an_error(name: str) -> None:
+    import mitsuba as mi
+
+    with pytest.raises(RuntimeError, match=r"sead"):
+        mi.load_dict({"type": name, "sead": 3})
+
+
+def test_asking_whether_mitsuba_is_there_does_not_lose_the_plugins() -> None:
+    run_python("""
+        import importlib.util, mitsonar
+        assert importlib.util.find_spec("mitsuba") is not None
+        mitsonar.load_scene("flat_floor")
+    """)

@@ -1,0 +1,499 @@
+"""Impulse responses: closed forms, direct sums, and scatterers that stay where they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import box, diffuse, floor, plate, scene, sphere
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone, four_receivers
+from mitsonar.motion.pose import Pose, Trajectory, steady
+from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.simulation.channel import ChannelSimulator, Paths, frequency_response, impulse_response
+from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated, delay_static
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+C = 1500.0
+LEVEL = Pose(0, 0, 10)
+CELLS = {"type": "cell_noise", "cells": 512.0, "seed": 5}
+EVERYWHERE = FieldOfView(shape="all")
+
+
+def received_from(place: tuple[float, float, float] = (0, 0, 0), **field: Any) -> Hydrophone:
+    return Hydrophone(name="one", position=place, field=FieldOfView(**field) if field else EVERYWHERE)
+
+
+def cells_floor(half: float = 14.0, cells: float = 512.0) -> dict[str, Any]:
+    return floor(diffuse({**CELLS, "cells": cells}), half)
+
+
+def simulator(sonar: ChannelSonar, **shapes: Any) -> ChannelSimulator:
+    return ChannelSimulator(scene(**shapes), sonar)
+
+
+def points(made: ChannelSimulator) -> NDArray[np.float64]:
+    return np.asarray(made.tracer.source.scatterers.place, dtype=float)
+
+
+def one_response(made: ChannelSimulator, pose: Pose = LEVEL, velocity: Any = None) -> NDArray[np.complex128]:
+    (part,) = made.pings([pose], None if velocity is None else [velocity])
+    return np.asarray(part.response[0], np.complex128)
+
+
+# ---------------------------------------------------------------- delays
+
+
+def test_exact_delay_solves_its_equation() -> None:
+    rng = np.random.default_rng(1)
+    to_point, velocity = rng.normal(0, 8, (3, 500)), rng.uniform(-3, 3, (3, 500))
+    from_receiver = to_point + rng.normal(0, 0.3, (3, 500))
+    delay = delay_exact(to_point, from_receiver, velocity, C)
+    out, back = np.linalg.norm(to_point, axis=0), np.linalg.norm(from_receiver - velocity * delay, axis=0)
+    assert np.abs(out + back - C * delay).max() < 1e-12 * C
+    still = delay_exact(to_point, from_receiver, np.zeros((3, 500)), C)
+    assert np.abs(still - delay_static(to_point, from_receiver, C)).max() < 1e-17
+
+
+def test_iteration_gains_a_factor_of_v_over_c_each_round() -> None:
+    """Eq. 5.5-5.14 repeated: error against the exact root, fitted on log axes."""
+    point, velocity = np.array([3.0, 4.0, -10.0]), np.array([2.0, -1.0, 0.0])
+    exact = delay_exact(point, point, velocity, C)
+    errors = [abs(delay_iterated(point, point, velocity, C, rounds) - exact) for rounds in range(4)]
+    closing = -velocity @ point / np.linalg.norm(point) / C  # what a round multiplies the error by
+    assert np.polyfit(range(4), np.log(errors), 1)[0] == pytest.approx(np.log(abs(closing)), abs=0.1)
+    assert errors[2] * 320e3 < 1e-4  # turns of the highest carrier: two rounds do, as the thesis says
+
+
+def test_delays_hold_their_phase_at_320_khz_and_25_m() -> None:
+    """Against 50 digits: float64 leaves 1e-10 turns."""
+    mpmath = pytest.importorskip("mpmath")
+    mpmath.mp.dps = 50
+    p, b, v = (15.1234567, 3.7654321, -19.5), (15.0234567, 3.7654321, -19.5), (1.9, -0.7, 0.0)
+    tau0 = mpmath.sqrt(sum(mpmath.mpf(x) ** 2 for x in p)) / 1500
+    q = [mpmath.mpf(x) - mpmath.mpf(w) * tau0 for x, w in zip(b, v, strict=True)]
+    qv, qq, vv = (sum(x * y for x, y in zip(a, c, strict=True)) for a, c in ((q, v), (q, q), (v, v)))
+    vv = sum(mpmath.mpf(x) ** 2 for x in v)
+    exact = tau0 + (mpmath.sqrt(qv**2 + (mpmath.mpf(1500) ** 2 - vv) * qq) - qv) / (mpmath.mpf(1500) ** 2 - vv)
+    assert abs(float(delay_exact(p, b, v, C) - exact)) * 320e3 < 1e-10
+
+
+# ---------------------------------------------------------------- one plate, two receivers
+
+
+def test_one_plate_is_one_pulse_of_known_delay_magnitude_and_phase() -> None:
+    sonar = ChannelSonar(receivers=(received_from((0.3, 0.1, 0)),), points_per_m2=1e4)
+    made = simulator(sonar, plate=plate((1, 7, 2), (-1, -7, 8), half=0.005))
+    (place,) = points(made)
+    sent, back = np.array(LEVEL[:3]), np.add(LEVEL[:3], (0.3, 0.1, 0))
+    r_a, r_b = np.linalg.norm(place - sent), np.linalg.norm(place - back)
+    normal = np.array([-1, -7, 8]) / np.linalg.norm([-1, -7, 8])
+    cosines = abs(normal @ (place - sent)) / r_a * abs(normal @ (place - back)) / r_b
+    amplitude = np.sqrt(0.5 * 1e-4 * cosines) / (r_a * r_b)
+    delay = (r_a + r_b) / C
+    wanted = amplitude * sonar.pulse(sonar.delay_s - delay) * np.exp(-2j * np.pi * sonar.carrier_hz * delay)
+    found = one_response(made)[0]
+    assert np.abs(found - wanted).max() < 1e-5 * np.abs(wanted).max()
+    assert np.abs(found).argmax() == round(delay * sonar.sampling_hz)
+
+
+def test_two_receivers_differ_in_phase_as_their_ways_do() -> None:
+    sonar = ChannelSonar(
+        receivers=(received_from(), received_from((0.12, 0, 0)).model_copy(update={"name": "two"})), points_per_m2=1e4
+    )
+    made = simulator(sonar, plate=plate((6, 7, 0), (0, 0, 1), half=0.005))
+    (place,) = points(made)
+    way = [np.linalg.norm(place - np.array(LEVEL[:3]) - offset) for offset in sonar.offsets]
+    first, second = one_response(made)
+    peak = np.abs(first).argmax()
+    wanted = -2 * np.pi * sonar.carrier_hz * (way[1] - way[0]) / C
+    difference = np.angle(second[peak] / first[peak]) - wanted
+    assert abs(np.angle(np.exp(1j * difference))) < 1e-4
+
+
+def test_a_vehicle_that_moves_hears_later_or_sooner() -> None:
+    sonar = ChannelSonar(receivers=(received_from(),), points_per_m2=1e4)
+    made = simulator(sonar, plate=plate((0, 7, 0), (0, 0, 1), half=0.005))
+    still, moving = made.paths(LEVEL), made.paths(LEVEL, [0, 2, 0, 0])
+    forward = 7 / np.hypot(7, 10)
+    assert (still.delay_s - moving.delay_s)[0] == pytest.approx(2 * forward * still.delay_s[0] / C, rel=1e-2)
+    assert moving.doppler_hz[0] == pytest.approx(2 * 2 * forward / sonar.wavelength_m, rel=1e-2)
+
+
+def test_turning_swings_receivers_around() -> None:
+    """A receiver 0.5 m to starboard of a vehicle that turns to starboard moves back."""
+    made = simulator(
+        ChannelSonar(receivers=(received_from((0.5, 0, 0)),), points_per_m2=1e4),
+        plate=plate((0, 9, 10), (0, -1, 0), half=0.005),
+    )
+    turned, straight = made.paths(LEVEL, [0, 0, 0, 0.8]), made.paths(LEVEL, [0, -0.4, 0, 0])
+    assert turned.delay_s[0] == pytest.approx(straight.delay_s[0], abs=1e-12)
+    assert turned.delay_s[0] > made.paths(LEVEL).delay_s[0]
+
+
+# ---------------------------------------------------------------- the transform
+
+
+def echoes(count: int = 3000, seed: int = 3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.012, 0.024, count), rng.uniform(0, 1, count)
+
+
+@pytest.mark.parametrize("carrier", [80e3, 320e3])
+def test_frequency_response_is_the_direct_sum(carrier: float) -> None:
+    """Eq. 5.15, double precision, relative error under 1e-6 (found: 1e-9)."""
+    sonar = ChannelSonar(carrier_hz=carrier)
+    delay, amplitude = echoes()
+    frequency, found = frequency_response(delay, amplitude, sonar)
+    direct = np.exp(-2j * np.pi * np.outer(sonar.carrier_hz + frequency, delay)) @ amplitude
+    assert len(frequency) == 721
+    assert np.abs(found - direct).max() < 1e-8 * np.abs(direct).max()
+
+
+@pytest.mark.gpu
+def test_sums_on_the_device_are_those_of_the_host() -> None:
+    from mitsonar.simulation import nonuniform_fft
+
+    pytest.importorskip("cufinufft")
+    rng = np.random.default_rng(0)
+    turn, strength = rng.uniform(-np.pi, np.pi, 5000), rng.normal(size=(5000, 2)) @ [1, 1j]
+    k = np.arange(-360, 361)
+    direct = np.exp(-1j * np.outer(k, turn)) @ strength
+    assert np.abs(nonuniform_fft._on_the_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
+
+
+def test_response_is_the_sum_of_pulses_and_nothing_wraps() -> None:
+    """Two routes: padded transform, and pulses written down in time; echoes at the very beginning too."""
+    sonar = ChannelSonar()
+    delay, amplitude = echoes(200)
+    delay[:3] = 1e-5, 4e-5, 3e-4
+    pulses = sonar.pulse(sonar.delay_s[:, None] - delay) @ (amplitude * np.exp(-2j * np.pi * sonar.carrier_hz * delay))
+    found = impulse_response(delay, amplitude, sonar)
+    assert np.abs(found - pulses).max() < 2e-6 * np.abs(pulses).max()
+    unpadded = np.fft.ifft(
+        np.exp(-2j * np.pi * np.fft.fftfreq(800, 1 / 8000) * 1e-5) * sonar.raised_cosine(np.fft.fftfreq(800, 1 / 8000))
+    )
+    assert np.abs(unpadded[-20:]).max() > 1e-3  # what padding crops
+    assert np.abs(impulse_response([1e-5], [1.0], sonar)[-20:]).max() < 1e-5
+
+
+def test_mean_energy_of_a_tap_is_that_of_its_echoes() -> None:
+    """With random phases; z-test over 400 draws."""
+    sonar = ChannelSonar()
+    delay, amplitude = echoes(300)
+    rng = np.random.default_rng(9)
+    draws = np.array(
+        [np.abs(impulse_response(delay, amplitude * np.exp(2j * np.pi * rng.random(300)), sonar)) ** 2 for _ in range(400)]
+    )
+    wanted = sonar.pulse(sonar.delay_s[:, None] - delay) ** 2 @ amplitude**2
+    inside = slice(110, 180)
+    z = (draws.mean(axis=0) - wanted)[inside] / (draws.std(axis=0)[inside] / 20)
+    assert np.abs(z).max() < 4.5
+    assert abs(z.mean()) < 4.5 / np.sqrt(10)  # neighbouring taps share echoes
+
+
+# ---------------------------------------------------------------- scatterers of the world
+
+
+def test_every_cell_has_one_point_inside_it_whoever_looks() -> None:
+    made = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
+    place = points(made)
+    assert len(place) == 64**2
+    cell = np.floor((place[:, :2] / 28 + 0.5) * 64).astype(int)
+    assert len(np.unique(cell, axis=0)) == 64**2
+    within = (place[:, :2] / 28 + 0.5) * 64 - cell
+    for axis in within.T:  # uniform in the cell: Kolmogorov's distance
+        assert np.abs(np.sort(axis) - (np.arange(64**2) + 0.5) / 64**2).max() < 1.63 / 64
+    other = simulator(ChannelSonar(seed=8, range_max=20.0), floor=cells_floor(cells=64.0))
+    assert np.array_equal(points(other), place)
+    different = simulator(ChannelSonar(), floor=floor(diffuse({**CELLS, "cells": 64.0, "seed": 6}), 14.0))
+    assert not np.array_equal(points(different), place)
+
+
+@pytest.mark.parametrize("shape", ["rectangle", "mesh", "sphere"])
+def test_strengths_add_up_to_reflectivity_times_area(shape: str) -> None:
+    kinds = {
+        "rectangle": (floor(diffuse(0.3), 2.0), 16.0),
+        "mesh": (box((0, 0, 0), (1, 2, 3), diffuse(0.3)), 88.0),
+        "sphere": (sphere((0, 0, 0), 1.5, diffuse(0.3)), 4 * np.pi * 2.25),
+    }
+    body, area = kinds[shape]
+    made = simulator(ChannelSonar(), body=body)
+    assert made.tracer.source.scatterers.strength.sum() == pytest.approx(0.3 * area, rel=0.03 if shape == "sphere" else 1e-5)
+
+
+def test_a_textured_floor_has_the_strength_of_its_cells() -> None:
+    made = simulator(ChannelSonar(), floor=cells_floor())
+    assert made.tracer.source.scatterers.strength.sum() == pytest.approx(0.5 * 28**2, rel=0.01)
+
+
+def test_what_a_field_of_view_asks_for_holds_all_that_it_hears() -> None:
+    field = FieldOfView(heading_deg=40.0, tilt_deg=35.0, across_deg=17.0, along_deg=60.0)
+    for one in (
+        field,
+        field.model_copy(update={"shape": "circular"}),
+        FieldOfView(tilt_deg=90.0, across_deg=100.0, along_deg=170.0),
+    ):
+        sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=one),))
+        made = simulator(sonar, floor=cells_floor(), body=box((3, 4, 1), (1, 1, 1)))
+        pose = np.array([1.0, -2.0, 6.0, 0.2, -0.1, 0.7])
+        stored = made.tracer.source.scatterers
+        asked = made.tracer.source.asked(pose, 0)
+        from mitsonar.motion.pose import vehicle_rotation
+
+        way = stored.place - pose[:3]
+        unit = way / np.linalg.norm(way, axis=1)[:, None]
+        local = unit @ vehicle_rotation(pose).as_matrix()[0] @ one.axes.T
+        front = np.einsum("pi,pi->p", stored.normal, unit) < 0
+        receives = np.flatnonzero((one.sensitivity(*local.T) > 0) & front)
+        assert len(receives) > 100
+        assert np.isin(receives, asked).all()
+        assert len(asked) < 0.8 * len(stored)
+
+
+def test_bodies_hide_what_is_behind_them() -> None:
+    sonar = ChannelSonar(receivers=(received_from(),))
+    bare = simulator(sonar, floor=cells_floor()).paths(LEVEL)
+    hidden = simulator(sonar, floor=cells_floor(), lid=box((0, 0, 5), (1.0, 1.0, 0.01), diffuse(0.0))).paths(LEVEL)
+    shadow = (2 * 1.0 * 10 / 4.99) ** 2
+    assert 1 - len(hidden.delay_s) / len(bare.delay_s) == pytest.approx(shadow / 28**2, rel=0.1)
+    assert hidden.delay_s.min() > 2 * 10.19 / C  # straight below nothing is left
+
+
+def test_energy_is_that_of_the_imaging_sonar() -> None:
+    """Two routes to the energy of the floor: echoes of a receiver at the transmitter, and pixels of an image."""
+    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.simulation.imaging import Simulator
+
+    field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)
+    sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2000.0)
+    ground = scene(floor=floor(diffuse(0.5), 16.0))
+    received = ChannelSimulator(ground, sonar).paths(LEVEL)
+    fan = Sonar(
+        azimuth_fov_deg=20.0,
+        elevation_fov_deg=30.0,
+        beams=20,
+        range_min=5.0,
+        range_max=25.0,
+        bearing="cone",
+        rays_per_beam=400,
+    )
+    (pings,) = Simulator(ground, fan).pings([Pose(0, 0, 10, np.radians(50))])
+    assert (received.amplitude**2).sum() == pytest.approx(pings.levels.sum(), rel=0.01)
+
+
+# ---------------------------------------------------------------- from ping to ping
+
+
+def rough_floor(half: float = 9.0, cells: int = 160, rms: float = 0.05) -> Any:
+    """A mesh of random heights, as wide as ``2 half``."""
+    import mitsuba as mi
+
+    edge = np.linspace(-half, half, cells + 1)
+    x, y = np.meshgrid(edge, edge)
+    z = np.random.default_rng(4).normal(0, rms, x.shape)
+    corner = np.arange((cells + 1) ** 2).reshape(x.shape)
+    a, b, c, d = corner[:-1, :-1].ravel(), corner[:-1, 1:].ravel(), corner[1:, 1:].ravel(), corner[1:, :-1].ravel()
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(diffuse(0.5))
+    mesh = mi.Mesh("rough", vertex_count=x.size, face_count=len(faces), props=props, has_vertex_normals=False)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.column_stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32).ravel()
+    params["faces"] = faces.astype(np.uint32).ravel()
+    params.update()
+    return mesh
+
+
+STEPS_M = np.array([1e-4, 3e-4, 1e-3, 2e-3, 5e-3])
+
+
+def correlations(
+    made: ChannelSimulator, steps: NDArray[np.float64], places: NDArray[np.float64] | None = None
+) -> NDArray[np.complex128]:
+    """Correlation coefficients of responses with those ``steps`` ahead, over all places ``(receivers, steps)``."""
+    places = np.zeros((1, 2)) if places is None else places
+    product = energy = 0.0
+    for place in places:
+        poses = np.zeros((len(steps) + 1, 6))
+        poses[:, :2], poses[:, 2] = place, 8.0
+        poses[1:, 1] += steps
+        response = np.concatenate([part.response for part in made.pings(poses)]).astype(np.complex128)
+        product = product + np.einsum("rt,srt->rs", response[0].conj(), response[1:])
+        energy = energy + (np.abs(response) ** 2).sum(axis=2)
+    return np.asarray(product / np.sqrt(energy[0] * energy[1:]).T)
+
+
+def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
+    """On a rough floor, 0.1 to 5 mm apart: phase within 2 % of a direct sum over the anchored points, written down here."""
+    sonar = ChannelSonar(range_max=20.0)
+    made = simulator(sonar, floor=rough_floor())
+    found = correlations(made, STEPS_M)[0]
+    echo = made.tracer.source.scatterers
+    field = sonar.receivers[0].field
+    responses = []
+    for ahead in (0.0, *STEPS_M):
+        sent = np.array([0, ahead, 8.0])
+        received = np.add(sent, (0, 0.1, 0))
+        out, back = echo.place - sent, echo.place - received
+        r_a, r_b = np.linalg.norm(out, axis=1), np.linalg.norm(back, axis=1)
+        cosines = np.einsum("pi,pi->p", out, echo.normal) * np.einsum("pi,pi->p", back, echo.normal) / (r_a * r_b)
+        weight = field.sensitivity(*(field.axes @ (back / r_b[:, None]).T))
+        amplitude = weight * np.sqrt(echo.strength * np.maximum(cosines, 0)) / (r_a * r_b)
+        loud = np.flatnonzero(amplitude)
+        responses.append(impulse_response((r_a + r_b)[loud] / C, amplitude[loud], sonar))
+    here, *there = responses
+    direct = np.array([np.vdot(here, one) / np.linalg.norm(here) / np.linalg.norm(one) for one in there])
+    assert np.abs(np.angle(found) / np.angle(direct) - 1)[1:].max() < 0.02
+    assert np.abs(np.abs(found) - np.abs(direct)).max() < 0.02
+    assert np.angle(found)[2] > 0.1  # going towards what it sees, the way gets shorter
+
+
+def test_rays_of_the_vehicle_do_not_feel_its_motion() -> None:
+    """The artefact that `scatterers` is without: over level ground rays keep their delays, only reflectivities change."""
+    phases = {}
+    for model in ("rays", "scatterers"):
+        sonar = ChannelSonar(range_max=20.0, model=model)
+        phases[model] = np.angle(correlations(simulator(sonar, floor=floor(diffuse(0.5), 9.0)), STEPS_M)[0])
+    assert np.abs(phases["rays"]).max() < 1e-3
+    assert phases["scatterers"][-1] > 0.5
+
+
+def test_doppler_of_every_echo() -> None:
+    """2 v cos / lambda, against the phase of the same points from a place that is really farther on."""
+    sonar = ChannelSonar(receivers=(received_from(),), points_per_m2=200.0)
+    made = simulator(sonar, floor=rough_floor())
+    here, there = made.paths(LEVEL), made.paths(Pose(0, 2e-5, 10))
+    rate = (here.delay_s - there.delay_s) * sonar.carrier_hz / 1e-5
+    doppler = made.paths(LEVEL, [0, 2, 0, 0]).doppler_hz
+    ahead = points(made)[made.tracer.trace(np.array(LEVEL), np.zeros(4), 0, ("counts",))["counts"]] - np.array(LEVEL[:3])
+    cosine = ahead[:, 1] / np.linalg.norm(ahead, axis=1)
+    steep = np.abs(cosine) > 0.1
+    assert np.abs(doppler / (2 * 2 * cosine / sonar.wavelength_m) - 1)[steep].max() < 1e-5
+    assert np.abs(rate / doppler - 1)[steep].max() < 1e-4
+
+
+@pytest.mark.parametrize("tilt", [45.0, 60.0])
+def test_doppler_of_an_angle(tilt: float) -> None:
+    """Within 0.5 %: phase between responses 40 um apart of a narrow beam, mean over places. (A beam that moves over the
+    ground changes which points it holds: the narrower, the more places are needed.)"""
+    field = FieldOfView(shape="circular", tilt_deg=tilt, across_deg=4.0, taper=1.0)
+    sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2500.0)
+    made = simulator(sonar, floor=rough_floor(half=18.0, rms=0.01))
+    speed, apart, places = 2.0, 2e-5, 100
+    rng = np.random.default_rng(2)
+    first = np.zeros((places, 6))
+    first[:, :2], first[:, 2], first[:, 5] = rng.uniform(-3, 3, (places, 2)), 8.0, rng.uniform(0, 6, places)
+    second = first.copy()
+    second[:, :2] += np.stack([np.sin(first[:, 5]), np.cos(first[:, 5])], axis=1) * speed * apart
+    here, there = (np.concatenate([part.response for part in made.pings(poses)]) for poses in (first, second))
+    doppler = np.angle(np.vdot(here.astype(np.complex128), there.astype(np.complex128))) / (2 * np.pi * apart)
+    assert doppler == pytest.approx(2 * speed * np.sin(np.radians(tilt)) / sonar.wavelength_m, rel=0.005)
+
+
+@pytest.mark.slow
+def test_correlation_does_not_depend_on_the_density_of_points() -> None:
+    """Its curve over the way, at one density and at twice as many points: correlation 0.99 at least, means over places."""
+    steps, places = np.linspace(0.5e-3, 20e-3, 12), np.random.default_rng(5).uniform(-2, 2, (8, 2))
+    curves = []
+    for density in (1000.0, 2000.0):
+        made = simulator(ChannelSonar(range_max=20.0, points_per_m2=density), floor=rough_floor(half=12.0, cells=200))
+        curves.append(correlations(made, steps, places))
+    alike = abs(np.vdot(*curves)) / np.linalg.norm(curves[0]) / np.linalg.norm(curves[1])
+    assert alike > 0.99
+
+
+# ---------------------------------------------------------------- what is told, and refused
+
+
+def test_the_same_bits_however_many_pings_are_asked_for() -> None:
+    made = simulator(ChannelSonar(), floor=cells_floor())
+    flown, velocity = steady(LEVEL, (1.0, -0.5, 0.2), 20, 20.0)
+    together = made.responses(flown, velocity).response
+    for first in (0, 7, 19):
+        (alone,) = made.pings(flown.poses[first : first + 1], velocity[first : first + 1])
+        assert np.array_equal(alone.response[0], together[first])
+    again = simulator(ChannelSonar(), floor=cells_floor()).responses(flown, velocity).response
+    assert np.array_equal(again, together)
+
+
+@pytest.mark.parametrize("model", ["scatterers", "rays"])
+def test_what_comes_from_too_far_is_dropped_and_counted(model: Any) -> None:
+    far = ChannelSonar(model=model, range_max=12.0, frequency_step_hz=10.0)
+    (near_part,), (far_part,) = (
+        simulator(sonar, floor=cells_floor()).pings([LEVEL]) for sonar in (ChannelSonar(model=model), far)
+    )
+    assert (near_part.dropped == 0).all()
+    assert (far_part.dropped > 0).all()
+    assert np.array_equal(far_part.dropped + far_part.echoes, near_part.echoes)
+    late = int(24 / C * far.sampling_hz) + 8
+    assert np.abs(far_part.response[:, :, late:]).max() < 1e-2 * np.abs(far_part.response).max()
+
+
+def test_height_is_measured() -> None:
+    (part,) = simulator(ChannelSonar(), floor=cells_floor()).pings([LEVEL, Pose(100, 0, 10)])
+    assert part.height_m[0] == pytest.approx(10.0)
+    assert np.isnan(part.height_m[1])
+    assert not part.response[1].any()
+
+
+def test_no_surface_to_carry_scatterers() -> None:
+    with pytest.raises(MitsonarError, match="no surface that can carry scatterers"):
+        ChannelSimulator(scene(), ChannelSonar())
+    with pytest.raises(MitsonarError, match="no surface that can carry scatterers"):
+        ChannelSimulator(scene(floor=floor(diffuse(0.5), 0.001)), ChannelSonar())
+    with pytest.raises(MitsonarError, match="more than"):
+        ChannelSimulator(scene(floor=floor(diffuse(0.5), 1e4)), ChannelSonar())
+
+
+@pytest.mark.parametrize("velocity", [[[0, 0, 0]], [[np.nan, 0, 0, 0]], [[1000, 0, 0, 0]]])
+def test_velocities_that_cannot_be(velocity: Any) -> None:
+    with pytest.raises(MitsonarError, match="velocity"):
+        list(simulator(ChannelSonar(), floor=cells_floor(cells=32.0)).pings([LEVEL], velocity))
+
+
+def test_responses_are_saved_whole(tmp_path: Any) -> None:
+    made = simulator(ChannelSonar(receivers=four_receivers(across_deg=20.0)[:2]), floor=cells_floor(cells=64.0))
+    flown, velocity = steady(LEVEL, (1.0, -0.5, 0.2), 3, 20.0)
+    responses = made.responses(flown, velocity)
+    for name in ("responses.npz", "responses.zarr"):
+        responses.save(tmp_path / name)
+        back = ImpulseResponses.load(tmp_path / name)
+        assert back.sonar == responses.sonar
+        for key, values in responses.arrays().items():
+            assert np.array_equal(back.arrays()[key], values)
+    (tmp_path / "responses.npz").write_bytes(b"PK no")
+    with pytest.raises(MitsonarError, match="cannot read responses"):
+        ImpulseResponses.load(tmp_path)
+
+
+def test_paths_add_up_to_the_response() -> None:
+    made = simulator(ChannelSonar(), floor=cells_floor())
+    (part,) = made.pings([LEVEL], [[1.0, 2.0, 0.0, 0.0]])
+    for receiver in range(4):
+        received: Paths = made.paths(LEVEL, [1.0, 2.0, 0.0, 0.0], receiver)
+        assert len(received.delay_s) == part.echoes[0, receiver]
+        wanted = impulse_response(received.delay_s, received.amplitude, made.sonar)
+        assert np.abs(part.response[0, receiver] - wanted).max() < 2e-6 * np.abs(wanted).max()
+
+
+def test_another_instrument_may_use_the_same_scatterers() -> None:
+    ground, sonar = scene(floor=cells_floor()), ChannelSonar()
+    first, other = ChannelSimulator(ground, sonar), sonar.replace(carrier_hz=40e3)
+    shared = ChannelSimulator(ground, other, like=first)
+    assert shared.tracer.source.scatterers is first.tracer.source.scatterers
+    assert np.array_equal(one_response(shared), one_response(ChannelSimulator(ground, other)))
+    assert (
+        ChannelSimulator(ground, sonar.replace(seed=3), like=first).tracer.source.scatterers
+        is not first.tracer.source.scatterers
+    )
+
+
+def test_a_trajectory_alone_stands_still() -> None:
+    made = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
+    flown = Trajectory(np.array([LEVEL]), np.zeros(1))
+    assert np.array_equal(made.responses(flown).response, made.responses(flown, np.zeros((1, 4))).response)

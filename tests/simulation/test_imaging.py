@@ -1,0 +1,413 @@
+"""From scene to frames: energies in closed form, convergence at its order, gain, labels, warnings, launches."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import assert_image_close, box, diffuse, floor, floor_levels, place_of, run_python, scene, slope, sphere
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose, Trajectory
+from mitsonar.simulation.imaging import Simulator
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+HEIGHT, PITCH = 2.5, np.radians(35)
+POSE = Pose(0, 0, HEIGHT, PITCH, 0, 0)
+
+
+@pytest.fixture(scope="module")
+def flat(variant: str) -> Any:
+    """An endless floor of reflectivity 0.5."""
+    return scene(floor=floor(diffuse(0.5)))
+
+
+def levels(loaded: Any, sonar: Sonar, pings: int = 1) -> np.ndarray:
+    """Levels ``(pings, bins, beams)`` at the pose above."""
+    return np.concatenate([batch.levels for batch in Simulator(loaded, sonar).pings([POSE] * pings)])
+
+
+def whole_bins(truth: np.ndarray) -> np.ndarray:
+    """Where a bin and both its neighbours are lit by the floor: the ends of the field of view cut theirs."""
+    lit = truth > 0
+    return lit & np.roll(lit, 1, axis=0) & np.roll(lit, -1, axis=0)
+
+
+# ---------------------------------------------------------------- energy
+
+
+@pytest.mark.parametrize("jitter", [True, False])
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+def test_energy_of_a_flat_floor(flat: Any, tmp_path: Path, bearing: str, jitter: bool) -> None:
+    """SPEC.md, section 2: with footprints 1 % a bin at 700 rays a beam; four rays across measure 0.03 %."""
+    sonar = Sonar(bearing=bearing, jitter=jitter)
+    truth = floor_levels(sonar, HEIGHT, PITCH, 0.5)
+    got = levels(flat, sonar)[0]
+    assert_image_close(got, np.where(whole_bins(truth), truth, 0), 1e-3, tmp_path / "floor.png")
+    assert got.sum(dtype=float) == pytest.approx(truth.sum(), rel=1e-4)
+    dark = (truth == 0) & ~np.roll(truth > 0, 1, axis=0) & ~np.roll(truth > 0, -1, axis=0)
+    assert dark.any()
+    assert (got[dark] == 0).all()
+
+
+@pytest.mark.parametrize("exponent", [2, 4])
+def test_gain_laws_of_a_flat_floor(flat: Any, tmp_path: Path, exponent: int) -> None:
+    sonar = Sonar(gain_exponent=exponent, beams=16, beam_width_deg=0.3)
+    truth = floor_levels(sonar, HEIGHT, PITCH, 0.5)
+    got = levels(flat, sonar)[0]
+    assert_image_close(got, np.where(whole_bins(truth), truth, 0), 2e-3, tmp_path / "floor.png")
+
+
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+def test_levels_do_not_depend_on_the_number_of_rays(flat: Any, tmp_path: Path, bearing: str) -> None:
+    """Energy a beam to 1e-3 and levels to 1 % rms, from 350 x 1 to 1400 x 3 rays a beam."""
+    base = Sonar(bearing=bearing, beams=24, range_bins=256, beam_width_deg=0.4)
+    truth = floor_levels(base, HEIGHT, PITCH, 0.5)
+    for rays, across in ((350, 1), (700, 2), (1400, 3)):
+        got = levels(flat, base.replace(rays_per_beam=rays, rays_across=across))[0]
+        np.testing.assert_allclose(got.sum(axis=0, dtype=float), truth.sum(axis=0), rtol=1e-3)
+        assert_image_close(got, np.where(whole_bins(truth), truth, 0), 1e-2, tmp_path / f"{rays}_{across}.png")
+
+
+def test_spreading_and_cosine_of_a_sphere_around(flat: Any) -> None:
+    """Energy of a beam from a sphere of radius R around the sonar: C dOmega / R^2, whatever the bin."""
+    sonar = Sonar(beams=4, range_min=1.0, range_max=20.0)
+    wanted = 0.5 * 2 * np.sin(np.radians(7)) * sonar.beam_width_rad
+    for radius in (2.0, 5.0, 17.0):
+        got = levels(scene(ball=sphere(POSE[:3], radius)), sonar)[0].sum(axis=0, dtype=float)
+        np.testing.assert_allclose(got, wanted / radius**2, rtol=1e-5)
+
+
+# ---------------------------------------------------------------- convergence of the thesis's points
+
+
+def point_error(flat: Any, sonar: Sonar, pings: int) -> float:
+    """Relative error rms over whole bins, beams and pings."""
+    truth = floor_levels(sonar, HEIGHT, PITCH, 0.5, axis_only=not sonar.jittered)
+    inside = whole_bins(truth)
+    return float(np.sqrt(np.mean((levels(flat, sonar, pings)[:, inside] / truth[inside] - 1) ** 2)))
+
+
+def test_points_on_the_grid_converge_as_one_over_the_rays(flat: Any) -> None:
+    """Of evenly spaced rays a bin gets the right number to within one: slope -1."""
+    rays = (64, 128, 256, 512, 1024)
+    coarse = Sonar(model="thesis", beams=24, range_min=3, range_max=8, range_bins=48)
+    errors = [point_error(flat, coarse.replace(rays_per_beam=n), 1) for n in rays]
+    assert slope(rays, errors) == pytest.approx(-1, abs=0.08), dict(zip(rays, errors, strict=True))
+
+
+def test_points_at_random_converge_as_one_over_the_root(flat: Any) -> None:
+    """Wide beams of jittered rays: the bins a ray may fall in are many, so its place is a matter of chance: slope -1/2."""
+    rays = (256, 512, 1024, 2048, 4096)
+    coarse = Sonar(model="thesis", jitter=True, azimuth_fov_deg=100, beams=8, range_min=3, range_max=8, range_bins=48)
+    errors = [point_error(flat, coarse.replace(rays_per_beam=n), 16) for n in rays]
+    assert slope(rays, errors) == pytest.approx(-0.5, abs=0.05), dict(zip(rays, errors, strict=True))
+
+
+def test_points_err_by_the_law_of_small_numbers(flat: Any) -> None:
+    """SPEC.md, section 2: one to two rays a bin err by tens of percent, where footprints stay below 1 %."""
+    thesis = point_error(flat, Sonar(model="thesis", jitter=True, beams=24), 1)
+    truth = floor_levels(Sonar(beams=24), HEIGHT, PITCH, 0.5)
+    footprints = levels(flat, Sonar(beams=24))[0][whole_bins(truth)] / truth[whole_bins(truth)] - 1
+    assert thesis > 0.2
+    assert np.sqrt(np.mean(footprints**2)) < 0.01
+
+
+# ---------------------------------------------------------------- gain
+
+
+def descent(frames: int) -> Trajectory:
+    """Nearing the floor from 2.9 m by 1 cm a frame: levels rise."""
+    return Trajectory.between(Pose(0, 0, 2.9, PITCH, 0, 0), Pose(0, 0, 2.9 - 0.01 * (frames - 1), PITCH, 0, 0), frames, 10)
+
+
+SMALL = Sonar(beams=8, rays_per_beam=200, range_bins=64, range_min=2.5, range_max=8.0)
+
+
+def quietly(simulator: Simulator, trajectory: Any, **options: Any) -> Any:
+    """Frames, whatever there is to warn of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MitsonarWarning)
+        return simulator.render(trajectory, **options)
+
+
+def test_gain_is_one_constant_from_the_first_20_frames(flat: Any) -> None:
+    """Their 99.9th percentile becomes 0.9; level_scale undoes it; brighter frames after them are not looked at."""
+    flown = descent(26)
+    raw = np.concatenate([batch.levels for batch in Simulator(flat, SMALL).pings(flown.poses)])
+    frames = quietly(Simulator(flat, SMALL), flown)
+    gain = 0.9 / np.percentile(raw[:20], 99.9)
+    assert np.percentile(frames.image[:20], 99.9) == pytest.approx(0.9, rel=1e-5)
+    np.testing.assert_allclose(frames.image, np.clip(raw * gain, 0, 1), rtol=1e-6)
+    assert frames.image.max() == 1  # the floor came nearer after the calibration
+    below = frames.image < 1
+    np.testing.assert_allclose((frames.image * frames.level_scale)[below], raw[below], rtol=1e-6)
+    split = quietly(Simulator(flat, SMALL, rays_per_launch=3 * SMALL.rays), flown)
+    np.testing.assert_array_equal(split.image, frames.image)
+    assert split.level_scale == frames.level_scale
+
+
+def test_gain_can_be_given_and_a_dark_scene_has_gain_one(flat: Any) -> None:
+    raw = levels(flat, SMALL)
+    frames = quietly(Simulator(flat, SMALL), [POSE], gain=3.0)
+    np.testing.assert_allclose(frames.image, np.clip(raw * 3, 0, 1), rtol=1e-6)
+    assert frames.level_scale == pytest.approx(1 / 3)
+    assert quietly(Simulator(scene(), SMALL), [POSE]).level_scale == 1
+    few = scene(ball=sphere((0, 4, -0.3), 0.02))  # so few pixels that the percentile is empty: the largest counts
+    frames = quietly(Simulator(few, SMALL.replace(beams=60, range_bins=512)), [POSE])
+    assert np.count_nonzero(frames.image) < 0.001 * frames.image.size
+    assert frames.image.max() == pytest.approx(0.9)
+
+
+def test_frames_say_what_they_are(flat: Any) -> None:
+    flown = descent(3)
+    frames = quietly(Simulator(flat, SMALL), flown)
+    assert frames.image.shape == (3, 64, 8)
+    assert frames.image.dtype == np.float32
+    np.testing.assert_array_equal(frames.range_m, SMALL.range_m)
+    np.testing.assert_array_equal(frames.bearing_rad, SMALL.bearing_rad)
+    np.testing.assert_array_equal(frames.time_s, flown.time_s)
+    np.testing.assert_array_equal(frames.poses, flown.poses)
+    np.testing.assert_allclose(frames.height_m, [2.9, 2.89, 2.88], rtol=1e-6)
+    assert frames.sonar == SMALL
+    assert (frames.elevation_rad, frames.shape_id, frames.shadow) == (None, None, None)
+    bare = quietly(Simulator(flat, SMALL), flown.poses)  # poses alone: one every 1 / frame_rate_hz
+    np.testing.assert_allclose(bare.time_s, [0, 0.1, 0.2])
+    np.testing.assert_array_equal(bare.image, frames.image)
+
+
+def test_noise_is_drawn_by_frame_and_cell(flat: Any) -> None:
+    noise = NOISE_MODELS["high"]
+    still = quietly(Simulator(flat, SMALL), [POSE] * 4)
+    noisy = quietly(Simulator(flat, SMALL, rays_per_launch=SMALL.rays), [POSE] * 4, noise=noise, seed=5)
+    np.testing.assert_array_equal(noisy.image, noise.apply(still.image, seed=5, frames=np.arange(4)))
+    assert noisy.level_scale == still.level_scale
+
+
+def test_pings_draw_their_own_jitter(flat: Any) -> None:
+    """The same pose twice: other rays, nearly the same image; and ping k is ping k wherever it starts."""
+    first, second = levels(flat, Sonar(beams=4), 2)
+    assert (first != second).mean() > 0.5
+    np.testing.assert_allclose(first.sum(), second.sum(), rtol=1e-3)
+    third = next(Simulator(flat, Sonar(beams=4)).pings([POSE], first=1)).levels[0]
+    np.testing.assert_array_equal(third, second)
+    still = levels(flat, Sonar(beams=4, jitter=False), 2)
+    np.testing.assert_array_equal(still[0], still[1])
+
+
+# ---------------------------------------------------------------- labels
+
+BEAMS = 15
+LABELLED = Sonar(azimuth_fov_deg=30, beams=BEAMS, elevation_fov_deg=30, rays_per_beam=800, range_min=3.0, range_max=9.0)
+
+
+def labelled(tall: float, half: float = 100.0, **fields: Any) -> tuple[Any, Any]:
+    """A box of that height ahead, on a floor; frames with labels, and the scene."""
+    loaded = scene(floor=floor(diffuse(0.4), half), box=box((0, 4.2, tall / 2), (0.4, 0.1, tall / 2), diffuse(0.8)))
+    return quietly(Simulator(loaded, LABELLED.replace(**fields)), [POSE], labels=True), loaded
+
+
+@pytest.mark.parametrize("model", ["physical", "thesis"])
+def test_labels_of_floor_and_box(model: str) -> None:
+    frames, loaded = labelled(0.5, model=model, rays_per_beam=3000 if model == "thesis" else 800, range_bins=200)
+    image, shape, elevation = frames.image[0], frames.shape_id[0], frames.elevation_rad[0]
+    assert shape.dtype == np.int32
+    assert elevation.dtype == np.float32
+    empty = image == 0
+    assert (shape[empty] == -1).all()
+    assert np.isnan(elevation[empty]).all()
+    assert set(np.unique(shape[~empty])) == {place_of(loaded, "floor"), place_of(loaded, "box")}
+    # the box's front, 4.1 m ahead, reaches from the floor at 4.80 m to its upper edge at 4.56 m
+    middle = BEAMS // 2
+    on_box = frames.range_m[shape[:, middle] == place_of(loaded, "box")]
+    assert on_box.min() == pytest.approx(np.hypot(4.1, 2.0), abs=0.04)
+    assert on_box.max() == pytest.approx(np.hypot(4.1, 2.5), abs=0.04)
+    assert (shape[:, 0] != place_of(loaded, "box")).all()
+    # the floor's elevation in its range: sin(pitch - e) = height / range on the axis beam
+    on_floor = shape[:, middle] == place_of(loaded, "floor")
+    wanted = PITCH - np.arcsin(HEIGHT / frames.range_m[on_floor])
+    np.testing.assert_allclose(elevation[on_floor, middle], wanted, atol=0.01)
+
+
+@pytest.mark.parametrize(("tall", "half"), [(0.5, 100.0), (1.6, 100.0), (1.6, 6.0)], ids=["low", "tall", "tall, floor ends"])
+def test_shadow_behind_a_box(tall: float, half: float) -> None:
+    """1 between the box and floor that is lit again; 2 where all sound of the beam was intercepted; 0 elsewhere.
+
+    Sound grazes the box's far upper edge, 4.3 m ahead, and meets the floor 4.3 h / (h - tall) ahead: at 5.4 m (low), 11.9 m
+    (tall). The upper rays, 20 deg down, meet it 6.87 m ahead, at 7.31 m: behind the tall box nothing is lit any more.
+    """
+    frames, _ = labelled(tall, half)
+    code, echo, radius = frames.shadow[0], frames.image[0] > 0, frames.range_m
+    assert code.dtype == np.uint8
+    assert (code[echo] == 0).all()
+    side, middle = 0, BEAMS // 2
+    nearest = radius[echo[:, middle]].min()
+    assert (code[radius < nearest - 0.05, middle] == 0).all()
+    lit_to = radius[echo[:, side]].max()
+    beyond = radius > lit_to + 0.05
+    assert beyond.any()
+    if tall < 1:
+        lit_again = np.hypot(4.3 * 2.5 / (2.5 - tall), 2.5)
+        shadow = (radius > np.hypot(4.1, 2.5) + 0.1) & (radius < lit_again - 0.1)
+        assert shadow.sum() > 20
+        assert (code[shadow, middle] == 1).all()
+        assert (code[(radius > lit_again + 0.1) & (radius < HEIGHT / np.sin(np.radians(20)) - 0.1), middle] == 0).all()
+    else:
+        shadow = radius > np.hypot(4.3, 2.5) + 0.1
+        assert (code[shadow, middle] == 2).all()
+    # past the lit floor nothing travels on, unless the upper rays pass over the floor's end
+    assert (code[beyond, side] == (2 if half > 50 else 1)).all()
+
+
+# ---------------------------------------------------------------- warnings
+
+
+def test_nothing_to_warn_of(flat: Any) -> None:
+    """MitsonarWarning is an error in these tests."""
+    Simulator(flat, SMALL).render([POSE] * 3, gain=1e-3)
+    Simulator(flat, SMALL.replace(model="thesis", rays_per_beam=4000)).render([POSE], gain=1e-3)
+
+
+def test_warned_when_nothing_is_hit(flat: Any) -> None:
+    with pytest.warns(MitsonarWarning, match=r"no ray hit anything in 2 frames: check the pose"):
+        frames = Simulator(flat, SMALL).render([Pose(0, 0, 2.5, -1.0)] * 2)
+    assert (frames.image == 0).all()
+
+
+def test_warned_of_returns_outside_the_window(flat: Any) -> None:
+    """Their number, share, and the ranges of the frame that loses most."""
+    sonar = SMALL.replace(range_min=3.4, range_max=5.0)
+    simulator = Simulator(flat, sonar)
+    poses = [POSE, Pose(0, 0, 2.0, PITCH)]
+    lost, total, frames = 0, 0, []
+    for number, pose in enumerate(poses):
+        echoes = simulator.tracer.film_echoes(pose, number)
+        ranges = echoes.range_m[(echoes.far_m <= 3.4) | (echoes.near_m >= 5.0)]
+        lost, total = lost + ranges.size, total + int(echoes.hit.sum())
+        frames.append((ranges.size, number, ranges.min(), ranges.max()))
+    _, worst, near, far = max(frames)
+    wanted = (
+        rf"{lost:,} of {total:,} returns \({100 * lost / total:.2g} %\) lie outside the window 3\.4\.\.5 m, "
+        rf"in frame {worst} at {near:.2f}\.\.{far:.2f} m"
+    )
+    assert lost > 100
+    with pytest.warns(MitsonarWarning, match=wanted):
+        simulator.render(poses, gain=1e-3)
+
+
+def test_warned_of_saturation(flat: Any) -> None:
+    raw = levels(flat, SMALL)
+    for share, warned in ((0.013, True), (0.008, False)):
+        gain = 1 / np.quantile(raw, 1 - share)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            image = Simulator(flat, SMALL).render([POSE], gain=float(gain)).image
+        said = [str(warning.message) for warning in caught if issubclass(warning.category, MitsonarWarning)]
+        assert ((image >= 1).mean() > 0.01) == warned
+        assert len(said) == warned
+        assert all("% of pixels are at the maximum (more than 1 %)" in text for text in said)
+
+
+def test_warned_of_too_few_rays_for_points(flat: Any) -> None:
+    """Fewer than ten rays a filled bin: the model `thesis` says so, `physical` has footprints."""
+    few = SMALL.replace(rays_per_beam=100, range_bins=512)
+    Simulator(flat, few).render([POSE], gain=1e-3)
+    with pytest.warns(MitsonarWarning, match=r"1\.\d rays a bin on average, below 10: .* raise rays_per_beam"):
+        Simulator(flat, few.replace(model="thesis")).render([POSE], gain=1e-3)
+
+
+def test_warned_of_surfaces_without_reflectivity() -> None:
+    glass = scene(floor=floor({"type": "dielectric"}))
+    with pytest.warns(MitsonarWarning, match=r"the BSDF of floor has no diffuse reflectance: reflectivity 0\.5 is taken"):
+        frames = Simulator(glass, SMALL).render([POSE], gain=1.0)
+    np.testing.assert_allclose(frames.image[0], levels(scene(floor=floor(diffuse(0.5))), SMALL)[0], rtol=1e-6)
+
+
+# ---------------------------------------------------------------- the simulator
+
+
+def test_a_launch_is_recorded_once_and_not_for_every_call(flat: Any) -> None:
+    """Whatever poses and first ping."""
+    gc.collect()  # it would also record again as scenes of other tests go
+    simulator = Simulator(flat, SMALL)
+    for k in range(12):
+        list(simulator.pings([Pose(k, 0, 2.5 + 0.01 * k, PITCH, 0, 0.3 * k)] * 2, first=7 * k))
+    (launch,) = simulator._launches.values()
+    assert getattr(launch, "func", launch).n_recordings == 1
+    list(simulator.pings([POSE] * 3))
+    list(simulator.pings([POSE] * 3, labels=True))
+    assert len(simulator._launches) == 3
+
+
+def test_a_replayed_launch_gives_what_a_new_one_gives(flat: Any) -> None:
+    """Poses, ping numbers and jitter are inputs of the recording, not constants in it."""
+    old = Simulator(flat, SMALL)
+    list(old.pings([POSE] * 2))
+    poses = [Pose(1, 2, 2.7, 0.5, 0.1, 1.0), Pose(-1, 0, 2.3, 0.6, 0, -2.0)]
+    (again,), (new,) = (list(simulator.pings(poses, first=9)) for simulator in (old, Simulator(flat, SMALL)))
+    np.testing.assert_array_equal(again.levels, new.levels)
+    np.testing.assert_array_equal(again.height_m, new.height_m)
+
+
+def test_python_may_collect_garbage_at_any_time() -> None:
+    """One simulator after another: freeing the arrays of the first while a launch of the second is recorded would end the
+    process, for Dr.Jit cannot record it."""
+    run_python("""
+        import gc, mitsonar
+        from mitsonar.simulation.variant import ensure_variant
+        ensure_variant("llvm_ad_mono")
+        import mitsuba as mi
+        gc.set_threshold(10**9)  # only where this test collects
+
+        def look(simulator):
+            ours = simulator.tracer.echoes
+
+            def echoes(*arguments):
+                if gc.isenabled():  # Python itself would collect here sooner or later
+                    gc.collect()
+                return ours(*arguments)
+
+            simulator.tracer.echoes = echoes  # a cycle: the simulator is garbage, not gone, when this function ends
+            return next(simulator.pings([mitsonar.Pose.from_degrees([0, 0, 2.5, 35, 0, 0])])).levels.max()
+
+        floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100), "bsdf": {"type": "diffuse"}}
+        for _ in range(2):
+            assert look(mitsonar.Simulator(mi.load_dict({"type": "scene", "floor": floor}), mitsonar.Sonar(beams=4))) > 0
+        assert gc.isenabled()
+    """)
+
+
+def test_earlier_batches_outlive_later_launches(flat: Any) -> None:
+    """Batches may be kept: what they hold is not memory that the next launch writes to."""
+    simulator = Simulator(flat, SMALL, rays_per_launch=SMALL.rays)
+    poses = descent(12).poses
+    kept, copies = [], []
+    for batch in simulator.pings(poses):
+        kept.append(batch.levels)
+        copies.append(batch.levels.copy())
+    for k, (view, copy) in enumerate(zip(kept, copies, strict=True)):
+        np.testing.assert_array_equal(view, copy, err_msg=f"ping {k}")
+
+
+def test_the_sonar_of_the_scene_is_the_default() -> None:
+    import mitsuba as mi
+
+    sensor = {"type": "imaging_sonar", "beams": 5, "rays_per_beam": 30, "preset": "didson300"}
+    with_sonar = mi.load_dict({"type": "scene", "camera": {"type": "perspective"}, "sonar": sensor, "floor": floor()})
+    assert (Simulator(with_sonar).sonar.beams, Simulator(with_sonar).sonar.bearing) == (5, "cone")
+    assert Simulator(with_sonar, SMALL).sonar == SMALL
+    with pytest.raises(MitsonarError, match=r"no sensor of type imaging_sonar: add one, or name a sonar"):
+        Simulator(scene(floor=floor()))
+
+
+@pytest.mark.parametrize("poses", [np.zeros((2, 5)), np.full((1, 6), np.nan), np.zeros((1, 2, 6))])
+def test_poses_that_are_none(flat: Any, poses: np.ndarray) -> None:
+    with pytest.raises(MitsonarError, match=r"poses must be finite numbers \(frames, 6\)"):
+        list(Simulator(flat, SMALL).pings(poses))

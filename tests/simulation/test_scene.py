@@ -1,0 +1,83 @@
+"""Scenes from files: parameters, shipped names, the sonar in them, and errors of one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Trajectory
+from mitsonar.simulation.scene import find_scene, load_scene, shipped_scenes, shipped_trajectory, sonar_in
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+XML = """<scene version="3.0.0">
+    <default name="value" value="0.5"/>
+    <sensor type="perspective"/>
+    <sensor type="imaging_sonar">
+        <integer name="beams" value="3"/>
+        <transform name="to_world"><lookat origin="1, 2, 3" target="1, 5, 3" up="0, 0, 1"/></transform>
+    </sensor>
+    <sensor type="imaging_sonar"><integer name="beams" value="4"/></sensor>
+    <shape type="sphere"><bsdf type="diffuse"><float name="reflectance" value="$value"/></bsdf></shape>
+</scene>"""
+
+
+def test_load_with_parameters(tmp_path: Path) -> None:
+    import mitsuba as mi
+
+    (tmp_path / "mine.xml").write_text(XML)
+    for given, value in (({}, 0.5), ({"value": 0.25}, 0.25)):
+        scene = load_scene(tmp_path / "mine.xml", **given)
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0, 0, 5), mi.Vector3f(0, 0, -1)))
+        assert float(si.bsdf().eval_diffuse_reflectance(si)[0][0]) == pytest.approx(value)
+
+
+def test_sonars_are_found_and_cameras_ignored(tmp_path: Path) -> None:
+    (tmp_path / "mine.xml").write_text(XML)
+    scene = load_scene(tmp_path / "mine.xml")
+    first, second = sonar_in(scene), sonar_in(scene, 1)
+    assert first is not None
+    assert second is not None
+    assert (first[0], second[0]) == (Sonar(beams=3), Sonar(beams=4))
+    np.testing.assert_allclose(first[1], (1, 2, 3, 0, 0, 0), atol=1e-6)
+    assert sonar_in(scene, 2) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (XML.replace("</scene>", ""), r"cannot load scene .*bad\.xml"),
+        (XML.replace('"beams" value="3"', '"beams" value="0"'), r"bad\.xml: .*sonar beams: .* got 0"),
+        (XML.replace('name="beams"', 'name="beems"'), r"bad\.xml: .*beems"),
+        (XML.replace('type="sphere"', 'type="spere"'), r"bad\.xml: .*spere"),
+        (XML.replace("diffuse", "cell_noise"), r"bad\.xml"),
+        ('<shape version="3.0.0" type="sphere"/>', r"bad\.xml holds a \w+, not a scene: wrap it in <scene>"),
+        ("", r"cannot load scene .*bad\.xml"),
+    ],
+    ids=["cut off", "bad value", "slip", "unknown plugin", "wrong place", "no scene", "empty"],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.xml").write_text(text)
+    with pytest.raises(MitsonarError, match=message) as caught:
+        load_scene(tmp_path / "bad.xml")
+    assert "\n" not in str(caught.value)
+
+
+def test_names_that_are_no_scene(tmp_path: Path) -> None:
+    with pytest.raises(
+        MitsonarError, match=r"no scene file .*absent\.xml: give a Mitsuba XML file or the name of a shipped"
+    ):
+        load_scene(tmp_path / "absent.xml")
+    with pytest.raises(MitsonarError, match="is a folder: give the XML file in it"):
+        find_scene(tmp_path)
+
+
+def test_shipped_scenes_have_a_trajectory_of_their_name() -> None:
+    assert shipped_scenes()
+    for name, path in shipped_scenes().items():
+        assert find_scene(name) == path
+        assert len(Trajectory.load_tum(shipped_trajectory(name))) > 1

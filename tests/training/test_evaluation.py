@@ -1,0 +1,585 @@
+"""Checkpoints in use: as estimators of `odometry` and `compare`, by `mitsonar evaluate`, and as ONNX."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import Command, refused, run_python, tiny_recipe
+from test_odometry import over_ground, sway
+
+from mitsonar.datasets.generation import make_dataset
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.pose import motions
+from mitsonar.records.sonar_frames import SonarFrames
+
+torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
+pytestmark = [
+    pytest.mark.learn,
+    pytest.mark.usefixtures("variant"),
+    pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
+]
+
+from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
+from mitsonar.estimation.learned.image_network import Network  # noqa: E402
+from mitsonar.estimation.named_estimators import create_estimator, estimator_from  # noqa: E402
+from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
+from mitsonar.networks.create import create_network, options_for  # noqa: E402
+from mitsonar.networks.onnx_export import onnx_of  # noqa: E402
+from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
+
+SAYS = np.array([0.004, -0.006, np.radians(0.1)])
+"""What the networks here answer, whatever they see."""
+
+SIZE = {"sonar__beams": 48, "sonar__range_bins": 256, "sonar__rays_per_beam": 300, "world__a_side": [25, 25]}
+
+
+def constant(pairs: SonarPairs, says: Any = SAYS, name: str = "posenet", **about: Any) -> Checkpoint:
+    """The checkpoint of a network that always gives one answer [m, m, rad]."""
+    inputs, label = pairs[0]
+    batch = tuple(part[None] for part in inputs) if isinstance(inputs, tuple) else inputs[None]
+    network: Any = create_network(name, width=1 / 16, **options_for(name, batch, label[None]))
+    with torch.no_grad():
+        network.regression.weight.zero_()
+        network.regression.bias.copy_(torch.from_numpy(pairs.labels.encode(says)))
+    return Checkpoint.of(network, pairs, **about)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three small scenes of six pairs, fine enough to match."""
+    url = tmp_path_factory.mktemp("made") / "small.zarr"
+    make_dataset(tiny_recipe(scenes=[{"count": 3, "sequences": 6}], flight={"pings": 2}, **SIZE), str(url))
+    return url
+
+
+@pytest.fixture(scope="module")
+def checkpoint(made: Path) -> Checkpoint:
+    about = {"metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}, "trained": {"pairs": 100}}
+    return constant(SonarPairs(made, part="all", labels="normx10"), **about)
+
+
+@pytest.fixture(scope="module")
+def run(checkpoint: Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a training run."""
+    folder = tmp_path_factory.mktemp("run")
+    checkpoint.save(folder / "network.ckpt")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pairs(made: Path) -> SonarPairs:
+    return SonarPairs(made, part="all", one_a_sequence=True)
+
+
+# ---------------------------------------------------------------- as an estimator
+
+
+def test_it_answers_what_the_network_says(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
+    estimator = Network(checkpoint)
+    for number in range(3):
+        found = estimator.estimate(pairs.sonar_frames(number))
+        assert found.valid, found.reason
+        assert np.allclose(found.motion, SAYS, atol=1e-7)
+        assert found.covariance is not None
+        assert np.allclose(np.sqrt(np.diag(found.covariance)), [3e-3, 2e-3, np.radians(0.1)])
+    assert estimator.inputs == "nothing; height 2.5 m, pitch 35 deg fixed by training"
+
+
+def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
+    """Frames reach the network as the data set's own arrangement gives them, fans too."""
+    for name, words in {
+        "posenet": {"layout": "stack"},
+        "posenet_dual": {"coordinates": "both", "cartesian_rows": 64},
+    }.items():
+        own = SonarPairs(made, part="all", one_a_sequence=True, labels="quantised", **words)
+        inputs, label = own[0]
+        batch = tuple(part[None] for part in inputs) if isinstance(inputs, tuple) else inputs[None]
+        torch.manual_seed(4)
+        network: Any = create_network(name, width=1 / 16, **options_for(name, batch, label[None]))
+        with torch.no_grad():  # without training little of an image reaches the end
+            for layer in network.modules():
+                if isinstance(layer, torch.nn.Conv2d):
+                    layer.weight.mul_(2)
+        trained = Checkpoint.of(network, own)
+        wanted, _ = predictions(trained, own, numbers=[2, 5])
+        found = [Network(trained).estimate(pairs.sonar_frames(number)).motion for number in (2, 5)]
+        assert np.allclose(found, wanted, rtol=1e-4, atol=1e-7)
+        assert not np.allclose(found[0], found[1], rtol=1e-3), "it looks at the frames"
+
+
+def test_another_process_gets_the_same(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
+    estimator = Network(checkpoint, force=True)
+    copied = pickle.loads(pickle.dumps(estimator))
+    assert (copied.digest, copied.force, copied.inputs) == (estimator.digest, True, estimator.inputs)
+    assert copied.estimate(pairs.sonar_frames(1)).motion == estimator.estimate(pairs.sonar_frames(1)).motion
+
+
+def changed(frames: SonarFrames, **fields: Any) -> SonarFrames:
+    return SonarFrames(**{**vars(frames), **fields})
+
+
+def posed(frames: SonarFrames, column: int, value: float, **fields: Any) -> SonarFrames:
+    assert frames.poses is not None
+    poses = frames.poses.copy()
+    poses[:, column] = value
+    return changed(frames, poses=poses, **fields)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: changed(f, image=f.image * 0), "nothing in the frames"),
+        (lambda f: changed(f, image=np.stack([f.image[0], np.full_like(f.image[0], 0.5)])), "nothing in the frames"),
+        (lambda f: changed(f, image=np.random.default_rng(0).random(f.image.shape, dtype=np.float32)), "correlate by"),
+        (lambda f: changed(f, image=np.stack([f.image[0], f.image[0, ::-1]])), "correlate by"),
+        (lambda f: posed(f, 2, 2.1, height_m=np.full(2, 2.1)), "stood at 2.10 m: height 2.5 m"),
+        (lambda f: posed(f, 3, np.radians(38)), "a pitch of 38.0 deg: height 2.5 m, pitch 35 deg"),
+        (lambda f: posed(f, 4, np.radians(-4)), "a roll of -4.0 deg"),
+    ],
+)
+def test_it_doubts(
+    checkpoint: Checkpoint, pairs: SonarPairs, change: Callable[[SonarFrames], SonarFrames], words: str
+) -> None:
+    found = Network(checkpoint).estimate(change(pairs.sonar_frames(2)))
+    assert not found.valid
+    assert words in found.reason
+
+
+def test_what_it_does_not_doubt(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
+    """A rock straight below, an altimeter that agrees where z does not count from the ground, no poses, a still sonar."""
+    frames = pairs.sonar_frames(2)
+    nan = np.full(2, np.nan)
+    for fine in (
+        changed(frames, height_m=np.full(2, 2.05)),
+        posed(frames, 2, 0.0, height_m=np.full(2, 2.6)),
+        changed(frames, poses=None, height_m=None),
+        changed(frames, height_m=nan),
+        posed(frames, 3, np.radians(36.5)),
+        changed(frames, image=np.stack([frames.image[0], frames.image[0]])),
+    ):
+        assert Network(checkpoint).estimate(fine).valid
+
+
+def test_answers_beyond_the_box_are_not_believed(made: Path, pairs: SonarPairs) -> None:
+    own = SonarPairs(made, part="all")
+    for size, believed in ((0.0235, True), (0.0245, False), (np.nan, False)):
+        trained = constant(own, [0.0, -size, 0.0])
+        if np.isnan(size):
+            trained = replace(constant(own), weights={k: v * float("inf") for k, v in constant(own).weights.items()})
+        found = Network(trained).estimate(pairs.sonar_frames(2))
+        assert found.valid == believed, found
+    assert "not finite" in found.reason
+    assert "forward -24.5 mm is beyond the motions of training, -20..20 mm" in (
+        Network(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
+    )
+
+
+def test_another_sonar_is_refused_unless_forced(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
+    frames = pairs.sonar_frames(2)
+    other = frames.sonar.replace(name="mine", elevation_fov_deg=20, bearing="cone")
+    with pytest.raises(MitsonarError) as error:
+        Network(checkpoint).estimate(changed(frames, sonar=other, range_m=frames.range_m + 0.5))
+    for words in (
+        "DIDSON",
+        "mine",
+        "bearing cone, not azimuth",
+        "elevation_fov_deg 20, not 14",
+        "window 3.7..6.1 m, not 3.2..5.6 m",
+    ):
+        assert words.lower() in str(error.value).lower()
+    assert Network(checkpoint, force=True).estimate(changed(frames, sonar=other)).valid
+    assert Network(checkpoint).estimate(changed(frames, range_m=frames.range_m * 1.01)).valid, "sound speed errs"
+    coarse = changed(frames, image=frames.image[:, ::2], range_m=frames.range_m[::2])
+    with pytest.raises(MitsonarError, match="bins 128, not 256"):
+        Network(checkpoint).estimate(coarse)
+    with pytest.raises(MitsonarError, match=r"\(1, 1, 128, 96\)"):
+        Network(checkpoint, force=True).estimate(coarse)
+
+
+def test_checkpoints_that_two_frames_cannot_serve(checkpoint: Checkpoint) -> None:
+    words = checkpoint.arrangement
+    for change in ({"frames": 3}, {"views": ["left", "right"]}, {"kind": "vector", "views": ["q1", "q2"]}):
+        with pytest.raises(MitsonarError, match=r"two frames of one view.*evaluate"):
+            Network(replace(checkpoint, arrangement={**words, **change}))
+    with pytest.raises(MitsonarError, match=r"given no geometry: height 2\.5 m, pitch 35 deg are fixed by training"):
+        Network(checkpoint, height_m=2.0)
+
+
+# ---------------------------------------------------------------- with the geometry of the ground
+
+
+@pytest.fixture(scope="module")
+def geometric(made: Path) -> Checkpoint:
+    """A corrnet as it begins."""
+    torch.manual_seed(1)
+    own = SonarPairs(made, part="all", ground=True, layout="channels")
+    return Checkpoint.of(create_network("corrnet", width=0.5), own)
+
+
+def test_networks_that_know_the_geometry_are_given_it(
+    geometric: Checkpoint, made: Path, pairs: SonarPairs, tmp_path: Path
+) -> None:
+    """As an estimator it says what it says of the data set's own samples; another sonar and height are welcome."""
+    estimator = Network(geometric)
+    wanted, laws = predictions(geometric, samples_for(geometric, made, part="all"), numbers=[2, 5])
+    assert laws is not None
+    for place, number in enumerate((2, 5)):
+        found = estimator.estimate(pairs.sonar_frames(number))
+        assert np.allclose(found.motion, wanted[place], rtol=1e-3, atol=1e-7)
+        assert found.covariance is not None
+        assert np.allclose(found.covariance, laws[place], rtol=1e-3, atol=1e-12)
+    frames = pairs.sonar_frames(2)
+    assert estimator.inputs.startswith("pitch; height")
+    assert geometric.sonar == {}
+    bare = changed(frames, poses=None, height_m=None)
+    with pytest.raises(MitsonarError, match="corrnet needs height and pitch"):
+        estimator.estimate(bare)
+    geometric.save(tmp_path / "network.ckpt")
+    told = estimator_from(f"{tmp_path}:height_m=2.5:pitch_deg=35").estimate(bare)
+    assert np.allclose(told.motion, estimator.estimate(frames).motion, rtol=1e-3, atol=1e-7)
+    other = frames.sonar.replace(beams=40)
+    fewer = changed(frames, image=frames.image[:, :, 4:44], bearing_rad=frames.bearing_rad[4:44], sonar=other)
+    assert np.isfinite(estimator.estimate(fewer).motion).all()
+    wrong = estimator.estimate(changed(frames, height_m=np.full(2, 6.0)))
+    assert not wrong.valid
+    assert "first echoes tell a height" in wrong.reason
+
+
+def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: SonarPairs) -> None:
+    """By name: as an estimator, here and in other processes, and for `evaluate`; a path is a path."""
+    checkpoint = Checkpoint.load("corrnet")
+    assert (checkpoint.network, checkpoint.recipe["data"]) == ("corrnet", "rocky-field")
+    assert checkpoint.trained["pairs"] > 10_000
+    estimator = create_estimator("corrnet")
+    assert estimator_from("corrnet:force=0").digest == checkpoint.digest  # type: ignore[attr-defined]
+    frames = pairs.sonar_frames(2)
+    there = pickle.loads(pickle.dumps(estimator)).estimate(frames)
+    assert there.motion == estimator.estimate(frames).motion
+    assert there.covariance is not None
+    done = mitsonar("evaluate", "corrnet", made, "--part", "all", "--pairs", "4", "--noise", "none")
+    assert done.returncode == 0, done.stderr
+    assert "corrnet" in done.stdout
+    refused(mitsonar("evaluate", "./corrnet", made), "no checkpoint", "or corrnet")
+
+
+def test_its_own_covariances_are_judged(geometric: Checkpoint, made: Path) -> None:
+    row, _ = evaluate(geometric, made, noise=["none"], part="all")["tables"][0]["rows"]
+    own = samples_for(geometric, made, part="all")
+    said, laws = predictions(geometric, own)
+    assert laws is not None
+    error = said - np.array([own.target(k) for k in range(len(own))])
+    nees = np.mean([e @ np.linalg.solve(law, e) for e, law in zip(error, laws, strict=True)]) / 3
+    assert row["nees"] == pytest.approx(nees, rel=1e-6)
+    assert row["inputs"].startswith("pitch; height")
+
+
+# ---------------------------------------------------------------- on the command line
+
+
+def test_estimators_are_named_by_checkpoint_or_folder(
+    run: Path, pairs: SonarPairs, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    frames = pairs.sonar_frames(2)
+    monkeypatch.chdir(run.parent)
+    for text in (f"{run}/network.ckpt", str(run), run.name, f"{run}:force=1"):
+        assert np.allclose(estimator_from(text).estimate(frames).motion, SAYS, atol=1e-7)
+    for text, words in {
+        f"{run}:force=2": "force must be 0 or 1",
+        f"{run}:levels=2": "takes force, height_m, pitch_deg, relief_m",
+        f"{run}:height_m=2": "given no geometry",
+        f"{run}/absent.ckpt": "no checkpoint",
+        str(tmp_path): "holds no network.ckpt",
+        "dierct": "did you mean direct.*or give a checkpoint",
+    }.items():
+        with pytest.raises(MitsonarError, match=words):
+            estimator_from(text)
+    with pytest.raises(MitsonarError, match="unknown estimator"):
+        create_estimator(str(run))
+
+
+def test_without_torch_the_extra_is_named(run: Path) -> None:
+    said = run_python(
+        f"""
+        from mitsonar.errors import MitsonarError
+        from mitsonar.estimation.named_estimators import estimator_from
+        estimator_from("direct")
+        try:
+            estimator_from({str(run)!r})
+        except MitsonarError as error:
+            print(error)
+        """,
+        block=("torch",),
+    )
+    assert "pip install 'mitsonar[learn]'" in said
+
+
+def test_odometry_and_compare_take_checkpoints(
+    mitsonar: Command, checkpoint: Checkpoint, made: Path, run: Path, tmp_path: Path
+) -> None:
+    """Motions are the constant answer, and errors those that follow; another network is not gone on with."""
+    sonar = Sonar(bearing="azimuth", beams=48, range_bins=256, range_min=3.2, range_max=5.6)
+    over_ground(sway(12), sonar).save(tmp_path / "frames.npz")
+    done = mitsonar("odometry", tmp_path / "frames.npz", "--estimator", run, "-o", tmp_path / "out1")
+    assert done.returncode == 0, done.stderr
+    assert "fixed by training" in done.stdout
+    told = [json.loads(line) for line in (tmp_path / "out1" / "estimates.jsonl").read_text().splitlines()]
+    assert len(told) == 11
+    assert all(np.allclose(one["motion"], SAYS, atol=1e-7) and one["valid"] for one in told)
+    stated = json.loads((tmp_path / "out1" / "run.json").read_text())
+    assert stated["recipe"]["options"]["digest"] == checkpoint.digest
+    table = ("compare", made, "--part", "all", "--limit", 0, "--estimators", f"zero,{run}")
+    done = mitsonar(*table, "-o", tmp_path / "table", "--json")
+    assert done.returncode == 0, done.stderr
+    _, row = json.loads(done.stdout)["tables"][0]["rows"]
+    truth = SonarPairs(made, part="all", one_a_sequence=True)
+    believed = [Network(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
+    answers = np.where(np.array(believed)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
+    errors = in_units(answers - np.array([motions(truth.pose[truth.frame_numbers(k)])[0] for k in range(len(truth))]))
+    assert row["failures"] == believed.count(False) <= 2
+    assert np.allclose(row["rmse"], np.sqrt((errors**2).mean(axis=0)), rtol=1e-5)
+    again = mitsonar(*table, "-o", tmp_path / "table", "--json")
+    assert json.loads(again.stdout)["tables"][0]["rows"][1] == row
+    constant(truth, SAYS / 2).save(run / "network.ckpt")
+    try:
+        refused(mitsonar(*table, "-o", tmp_path / "table"), "other networks", "choose another -o")
+        refused(
+            mitsonar("odometry", tmp_path / "frames.npz", "--estimator", run, "-o", tmp_path / "out1", "--resume"),
+            "differs in options",
+        )
+    finally:
+        checkpoint.save(run / "network.ckpt")
+
+
+@pytest.mark.slow
+def test_workers_of_odometry_say_the_same(mitsonar: Command, run: Path, tmp_path: Path) -> None:
+    sonar = Sonar(bearing="azimuth", beams=48, range_bins=256, range_min=3.2, range_max=5.6)
+    over_ground(sway(20), sonar).save(tmp_path / "frames.npz")
+    for workers in (1, 2):
+        words = ("--estimator", run, "--workers", workers, "-o", tmp_path / f"out{workers}")
+        assert mitsonar("odometry", tmp_path / "frames.npz", *words).returncode == 0
+    first, second = ((tmp_path / f"out{workers}" / "estimates.jsonl").read_bytes() for workers in (1, 2))
+    assert first == second
+
+
+def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, run: Path, tmp_path: Path) -> None:
+    words = ("evaluate", run, made, "--part", "all", "--noise", "none,high")
+    done = mitsonar(*words, "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    for said in (
+        "18 samples of 3 scenes, thesis model",
+        "noise high",
+        "| posenet",
+        "| zero",
+        "fixed by training",
+        "trained on",
+    ):
+        assert said in done.stdout
+    assert "holds pairs that training has seen" in done.stderr
+    assert "3 scenes only" in done.stderr
+    report = json.loads((tmp_path / "out" / "table.json").read_text())
+    truth = SonarPairs(made, part="all", one_a_sequence=True)
+    motion = np.array([truth.target(k) for k in range(len(truth))])
+    error, power = in_units(SAYS - motion), (motion**2).sum(axis=0)
+    assert [table["noise"] for table in report["tables"]] == ["none", "high"]
+    for table in report["tables"]:
+        row, zero = table["rows"]
+        assert np.allclose(row["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
+        assert np.allclose(row["thesis"], np.array(row["rmse"]) * [1, 1, 100])
+        assert np.allclose(row["median"], np.median(np.abs(error), axis=0), rtol=1e-5)
+        assert np.allclose(row["bias"], error.mean(axis=0), rtol=1e-5)
+        assert np.allclose(row["slope"], (SAYS * motion).sum(axis=0) / power, rtol=1e-4, atol=1e-7)
+        assert np.allclose(zero["rmse"], np.sqrt((in_units(motion) ** 2).mean(axis=0)))
+        assert (np.array(row["rmse_low"]) < row["rmse"]).all()
+        assert table["beyond"] == {"true": 0.0, "answers": 0.0}
+        assert row["ms"] > 0
+    refused(mitsonar(*words, "-o", tmp_path / "out"), "exists and is kept", "--overwrite")
+    assert mitsonar(*words, "-o", tmp_path / "out", "--overwrite").returncode == 0
+    parts = json.loads(mitsonar("evaluate", run, made, "--noise", "none", "--pairs", 1, "--json").stdout)
+    assert (parts["part"], parts["pairs"]) == ("validation", 1)
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Small data sets of other kinds: three frames at several heights with vectors, two sensors, another sonar."""
+    folder = tmp_path_factory.mktemp("many")
+    two = [{"name": name, "starboard_m": side, "sonar": {"beams": 12}} for name, side in (("left", -0.5), ("right", 0.5))]
+    recipes = {
+        "high": tiny_recipe(flight={"pings": 4, "height_m": [2.2, 3.0]}, store="both"),
+        "two": tiny_recipe(receivers=two, flight={"pings": 2}, sonar__beams=96, sonar__jitter=True),
+        "other": tiny_recipe(sonar__beams=16, sonar__range_max=6.0, flight={"pings": 2}, mount={"pitch_deg": 30.0}),
+    }
+    for name, recipe in recipes.items():
+        make_dataset(recipe, str(folder / f"{name}.zarr"))
+    return {name: folder / f"{name}.zarr" for name in recipes}
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ("high", {"frames": 3}),
+        ("high", {"frames": 2, "kind": "vector"}),
+        ("high", {"frames": 2, "coordinates": "cartesian", "cartesian_rows": 24, "layout": "channels"}),
+        ("two", {"frames": 2}),
+        ("two", {"views": ["right"], "layout": "stack"}),
+    ],
+)
+def test_all_arrangements_are_evaluated(many: dict[str, Path], data: str, words: dict[str, Any]) -> None:
+    own = SonarPairs(many[data], part="all", labels="normx10", one_a_sequence=True, **words)
+    report = evaluate(constant(own), many[data], noise=["low"], part="all")
+    error = in_units(SAYS - np.array([own.target(k) for k in range(len(own))]))
+    assert np.allclose(report["tables"][0]["rows"][0]["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
+
+
+def test_heights_are_evaluated_in_mm(many: dict[str, Path], mitsonar: Command, tmp_path: Path) -> None:
+    own = SonarPairs(many["high"], part="all", labels="normx10", frames=1, one_a_sequence=True)
+    trained = constant(own, [2.5])
+    trained.save(tmp_path / "network.ckpt")
+    done = mitsonar("evaluate", tmp_path, many["high"], "--part", "all", "--noise", "none", "-o", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "height mm" in done.stdout
+    row, zero = json.loads((tmp_path / "out" / "table.json").read_text())["tables"][0]["rows"]
+    truth = np.array([own.target(k)[0] for k in range(len(own))])
+    assert row["rmse"] == pytest.approx([1e3 * np.sqrt(((2.5 - truth) ** 2).mean())], rel=1e-5)
+    assert row["bias"] == pytest.approx([1e3 * (2.5 - truth).mean()], rel=1e-5)
+    assert zero["rmse"] == pytest.approx([1e3 * np.sqrt(((2.6 - truth) ** 2).mean())], rel=1e-5)
+    assert row["slope"] == pytest.approx([(-0.1 * (truth - 2.6)).sum() / ((truth - 2.6) ** 2).sum()], rel=1e-4)
+
+
+def test_data_that_do_not_fit_are_refused(
+    mitsonar: Command, many: dict[str, Path], run: Path, checkpoint: Checkpoint, made: Path, tmp_path: Path
+) -> None:
+    done = mitsonar("evaluate", run, many["other"])
+    refused(done, "beams 16, not 48", "window 3.2..6 m, not 3.2..5.6 m", "--force", "didson300")
+    # what any sonar may serve: the same network, made for sizes that fit
+    own = SonarPairs(many["other"], part="all", one_a_sequence=True)
+    other = replace(constant(own), sonar=checkpoint.sonar)
+    with pytest.raises(MitsonarError, match="beams 16, not 48"):
+        evaluate(other, many["other"], part="all")
+    report = evaluate(other, many["other"], noise=["none"], part="all", force=True)
+    assert "beams 16, not 48" in report["notes"][0]
+    elsewhere = evaluate(
+        replace(other, sonar={}, trained_at={**other.trained_at, "pitch_deg": 35.0}),
+        many["other"],
+        noise=["none"],
+        part="all",
+    )
+    assert "pitch 30 deg" in elsewhere["notes"][1]
+    refused(mitsonar("evaluate", run, many["other"], "--force"), "(1, 1, 40, 32)", "(batch, 1, 256, 96)")
+    refused(mitsonar("evaluate", run, many["two"]), "unknown view image")
+    refused(mitsonar("evaluate", run, tmp_path / "none.zarr"), "none.zarr")
+    refused(mitsonar("evaluate", run, made, "--noise", "loud"), "noise must be")
+    refused(mitsonar("evaluate", run, made, "--part", "test"), "no test part")
+    refused(mitsonar("evaluate", tmp_path, made), "holds no network.ckpt")
+    vectors = tmp_path / "vectors.zarr"
+    make_dataset(tiny_recipe(store="vectors", flight={"pings": 2}, **SIZE), str(vectors))
+    refused(mitsonar("evaluate", run, vectors), "holds vectors only")
+    broken = tmp_path / "broken.zarr"
+    shutil.copytree(made, broken)
+    shutil.rmtree(broken / "motion")
+    refused(mitsonar("evaluate", run, broken), "motion")
+    (tmp_path / "newer.ckpt").write_bytes(replace(checkpoint, format=2, version="9.9").to_bytes())
+    refused(mitsonar("evaluate", tmp_path / "newer.ckpt", made), "format 2", "mitsonar 9.9")
+
+
+def test_the_split_is_that_of_the_training(made: Path, checkpoint: Checkpoint) -> None:
+    by_scene = replace(checkpoint, recipe={"split": {"by": "scene", "train": 0.34, "validation": 0.33, "test": 0.33}})
+    found = samples_for(by_scene, made)
+    assert len(set(found.scene[found.first])) == 1
+    report = evaluate(by_scene, made, noise=["none"])
+    assert (report["part"], report["split"], report["scenes"]) == ("test", "scene", 1)
+
+
+# ---------------------------------------------------------------- ONNX
+
+
+def trained_like(name: str, **words: Any) -> Checkpoint:
+    """Of a random network whose statistics are not 0 and 1, made for 64 x 64 cells."""
+    sizes = {"size": (64, 64)} | ({"cartesian_size": (48, 40)} if name == "posenet_dual" else {})
+    torch.manual_seed(2)
+    network: Any = create_network(name, width=1 / 4 if name == "cnn4b" else 1 / 16, **sizes)
+    for layer in network.modules():
+        if isinstance(layer, torch.nn.BatchNorm2d):
+            layer.running_mean.uniform_(-0.1, 0.1)
+            layer.running_var.uniform_(0.5, 2)
+    return Checkpoint.of(network, Samples(tiny_recipe(), labels="normx10", **words))
+
+
+def agrees(content: bytes, checkpoint: Checkpoint, batch: int) -> dict[str, str]:
+    """What the file tells of itself, once onnxruntime gave what torch gives."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    rng = np.random.default_rng(3)
+    inputs = {one.name: rng.random((batch, *one.shape[1:]), dtype=np.float32) for one in session.get_inputs()}
+    wanted = checkpoint.build()(*(torch.from_numpy(values) for values in inputs.values())).numpy()
+    (found,) = session.run(["labels"], inputs)
+    assert found.shape == (batch, 3)
+    assert np.abs(found - wanted).max() < 1e-4 * np.abs(wanted).max()
+    about: dict[str, str] = session.get_modelmeta().custom_metadata_map
+    return about
+
+
+def test_onnx_says_the_same() -> None:
+    checkpoint = trained_like("cnn4b")
+    about = agrees(onnx_of(checkpoint, 2), checkpoint, 2)
+    assert json.loads(about["labels"]) == checkpoint.labels
+    assert json.loads(about["sonar"])["image"]["beams"] == 12
+    assert (about["network"], about["mitsonar_version"]) == ("cnn4b", checkpoint.version)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["posenet", "sfmnet", "cnn1b", "cnn4posenet", "posenet_dual"])
+def test_every_network_becomes_onnx(name: str) -> None:
+    checkpoint = trained_like(name, coordinates="both" if name == "posenet_dual" else "polar", cartesian_rows=48)
+    agrees(onnx_of(checkpoint, None), checkpoint, 3)
+    agrees(onnx_of(checkpoint), checkpoint, 1)
+
+
+@pytest.mark.slow
+def test_the_geometry_goes_into_onnx(geometric: Checkpoint, made: Path) -> None:
+    """Motion and covariance, for any number of samples, on ground that the tracer has not seen."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(onnx_of(geometric, None), providers=["CPUExecutionProvider"])
+    samples = samples_for(geometric, made, part="all")
+    for numbers in ([3], [0, 4, 7, 9]):
+        images, grounds = zip(*(samples[number][0] for number in numbers), strict=True)
+        image, ground = torch.stack(images), {name: torch.stack([one[name] for one in grounds]) for name in grounds[0]}
+        table = {name: values.numpy() for name, values in {"image": image, **ground}.items()}
+        found = session.run(["motion", "covariance"], {one.name: table[one.name] for one in session.get_inputs()})
+        wanted = geometric.build()(image, ground)
+        for got, want in zip(found, wanted, strict=True):
+            assert np.abs(got - want.numpy()).max() < 1e-4 * np.abs(want.numpy()).max()
+
+
+def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = trained_like("posenet")
+    checkpoint.save(tmp_path / "network.ckpt")
+    path = tmp_path / "network.onnx"
+    words = ("export", tmp_path, "--onnx")
+    done = mitsonar(*words, path, "--batch", "dynamic")
+    assert done.returncode == 0, done.stderr
+    assert str(path) in done.stdout
+    assert not done.stderr
+    before = path.read_bytes()
+    agrees(before, checkpoint, 5)
+    refused(mitsonar(*words, path), "exists and is kept", "--overwrite")
+    refused(mitsonar(*words, tmp_path / "network.txt"), ".onnx")
+    refused(mitsonar(*words, tmp_path / "no" / "network.onnx"), "folder")
+    refused(mitsonar(*words, path, "--batch", "none", "--overwrite"), "--batch")
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "onnxscript" else find_spec(name))
+    refused(mitsonar(*words, path, "--overwrite"), "writing ONNX needs onnxscript", "mitsonar[learn]")
+    assert path.read_bytes() == before
+    monkeypatch.setattr("mitsonar.networks.onnx_export.onnx_of", lambda checkpoint, batch: b"new")
+    assert mitsonar(*words, path, "--overwrite").returncode == 0
+    assert path.read_bytes() == b"new"
