@@ -35,8 +35,7 @@ from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, Simulato
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.response_packing import with_noise
-from mitsonar.estimation.channel.named_channel_estimators import create_impulse_estimator
-from mitsonar.estimation.channel_crlb import channel_crlb
+from mitsonar.estimation.crlb.channel_crlb import channel_crlb
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.response_source import ResponseSource
@@ -148,7 +147,7 @@ def told(work: tuple[str, dict[str, Any], ImpulseResponses]) -> list[float]:
     name, options, responses = work
     begun = time.perf_counter()
     try:
-        found = create_impulse_estimator(name, **options).estimate(responses)
+        found = create_estimator(name, **options).estimate(responses)
     except MitsonarError:
         return [0.0] * 6 + [0.0, time.perf_counter() - begun]
     spread = np.full(3, np.nan) if found.covariance is None else np.sqrt(np.abs(np.diag(found.covariance)))
@@ -314,7 +313,7 @@ def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseR
     believed; the last column whether it is."""
     path = asked.out / f"{label}-{name}.json"
     if not path.exists():
-        found = odometry(ResponseSource(label, responses), create_impulse_estimator(name), workers=asked.processes)
+        found = odometry(ResponseSource(label, responses), create_estimator(name), workers=asked.processes)
         rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.believed])
         path.write_text(json.dumps(rows.tolist()))
     return np.array(json.loads(path.read_text()))

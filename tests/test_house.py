@@ -111,7 +111,8 @@ def test_every_module_has_its_room() -> None:
 def test_modules_import_from_their_own_and_earlier_rooms_only(name: str) -> None:
     for other in HOUSE[name] - set(DATA):
         assert other, f"{name} imports from mitsonar itself: import from the module that holds the name"
-        assert other not in PACKAGES or room(name) in ("cli", "__main__"), f"{name} imports the package {other}: import from its modules"
+        command = room(name) in ("cli", "__main__")
+        assert other not in PACKAGES or command, f"{name} imports the package {other}: import from its modules"
         assert ROOMS.index(room(other)) <= ROOMS.index(room(name)), f"{name} imports from {other}, a later room"
 
 

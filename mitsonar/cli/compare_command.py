@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["compare", "markdown", "table_lines"]
 
-METHODS = "zero,ecc,flow,phase,direct"
-IMPULSE_METHODS = "zero,correlation,likelihood"
 
 FEWEST_SCENES = 10
 """With fewer, clustered intervals hold much less than they say."""
@@ -40,7 +39,7 @@ def compare(
         str | None,
         typer.Option(
             help="Names, or checkpoints of networks, with commas between them, each NAME or NAME:key=value:key=value "
-            f"(default: {METHODS}; of impulse responses: {IMPULSE_METHODS})."
+            "(default: zero,ecc,flow,phase,direct; of impulse responses: zero,correlation,likelihood)."
         ),
     ] = None,
     noise: Annotated[
@@ -70,43 +69,31 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print for programs.")] = False,
 ) -> None:
     """Errors of all methods on the same pairs; failures count as zero motion; bootstrap by scene, then sequence."""
-    try:
-        from mitsonar.datasets.torch_pairs import SonarPairs
-    except ModuleNotFoundError:
-        raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'") from None
-    from mitsonar.acoustics.noise import load_noise
+    if find_spec("torch") is None:
+        raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'")
     from mitsonar.datasets.modalities import modality_of
-    from mitsonar.datasets.response_samples import ImpulseSamples
     from mitsonar.datasets.store import DataStore
     from mitsonar.estimation.benchmark import VARIATIONS, answers_of, bounds_of_pairs, chosen, rows_of, with_prior
-    from mitsonar.estimation.channel.named_channel_estimators import impulse_estimator_from
-    from mitsonar.estimation.learned.image_network import Network
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.motion.motion_errors import cluster_resamples, in_units
     from mitsonar.motion.pose import motions
 
     recipe = DataStore.open(data).recipe
-    received = recipe.channel is not None
-    made: Callable[[str], Any] = impulse_estimator_from if received else estimator_from
-    asked_for = estimators or (IMPULSE_METHODS if received else METHODS)
-    methods = {text: made(text) for text in dict.fromkeys(asked_for.split(",")) if text}
+    modality = modality_of(recipe)
+    methods = {text: estimator_from(text) for text in dict.fromkeys((estimators or modality.estimators).split(",")) if text}
     if not methods or (reference is not None and reference not in methods):
         raise MitsonarError(f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {reference!r}")
-    if received and (perturb or jitter or prior):
+    if not modality.variations and (perturb or jitter or prior):
         raise MitsonarError("--perturb, --jitter and --prior are for data sets of images: leave them out")
     names = list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
-    levels: dict[str, Any] = dict.fromkeys(names) if received else {name: load_noise(name) for name in names}
-    limit = 0 if received else limit
+    levels = {name: modality.noise_model(name) for name in names}
+    limit = limit if modality.variations else 0
     changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if perturb else []
     asked = ["as told", *changed, *(["jitter"] if jitter else [])]
-    reader = ImpulseSamples if received else SonarPairs
-    # pairs of images, or as many responses as the recipe has, one sample a sequence
-    asked_of: dict[str, Any] = {
-        "part": part or recipe.split.unseen,
-        "frames": recipe.frames if received else 2,
-        "seed": seed,
+    part_read = part or recipe.split.unseen
+    samples: dict[str, Any] = {
+        name: modality.samples(data, noise=name, one_a_sequence=True, part=part_read, seed=seed) for name in names
     }
-    samples: dict[str, Any] = {name: reader(data, noise=name, one_a_sequence=True, **asked_of) for name in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
         raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
@@ -128,11 +115,11 @@ def compare(
         "seed": seed,
         "version": version("mitsonar"),
     }
-    networks = {name: method.digest for name, method in methods.items() if isinstance(method, Network)}
+    networks = {name: method.digest for name, method in methods.items() if method.digest}
     if networks:
         settings["networks"] = networks
     store = _Kept(out, settings)
-    model_name = modality_of(recipe).sonar.model
+    model_name = modality.sonar.model
     report: dict[str, Any] = {"data": data, "model": model_name, **settings, "tables": []}
     with progress_bar("comparing", len(levels) * len(asked) * len(numbers), "pairs") as progress:
         answers = {
@@ -151,7 +138,7 @@ def compare(
     inputs = {name: method.inputs for name, method in methods.items()}
     for level, model in levels.items():
         bounds = store.limits(_key(level, model), limit)
-        if limit and bounds is None:
+        if limit and bounds is None and model is not None:
             few = [numbers[k] for k in np.linspace(0, len(numbers) - 1, min(limit, len(numbers))).astype(int)]
             with progress_bar("limit", len(few), "pairs") as progress:
                 bounds = bounds_of_pairs(samples[level], few, model, progress)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.odometry_command import Frames, frames_from, views_from
+from mitsonar.cli.odometry_command import Frames
 from mitsonar.errors import MitsonarError
 from mitsonar.io.whole_files import write_whole
 
@@ -44,20 +45,23 @@ def height(
     """
     from mitsonar.estimation.height.named_height_estimators import height_estimator_from
     from mitsonar.mapping.measured_heights import measured
+    from mitsonar.mapping.open_source import Reading, frames_for, views_for
 
     if out is not None and out.exists() and not overwrite:
         raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or --overwrite")
     estimator = height_estimator_from(by)
     source: FrameSource | ViewSource
+    pitch = None if pitch_deg is None else math.radians(pitch_deg)
+    reading = Reading(sequence, view, noise, seed, pitch_rad=pitch)
     portions = _portions(frames, view) if estimator.views is None else (estimator.views, estimator.kind)
     if estimator.views is not None and view is not None:
         raise MitsonarError(f"--view is not for {by}, which reads {', '.join(estimator.views)}: leave it out")
     if portions is not None:
         if pitch_deg is not None:
             raise MitsonarError("--pitch-deg is for frames without poses: a data set tells them")
-        source = views_from(frames, *portions, sequence, noise, seed)
+        source = views_for(frames, *portions, reading)
     else:
-        source = frames_from(frames, sequence, view, noise, seed, None, pitch_deg)
+        source = frames_for(frames, reading)
     if source.note:
         say(source.note)
     said: list[HeightEstimate] = []

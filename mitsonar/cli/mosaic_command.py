@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +11,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.odometry_command import Frames, frames_from
+from mitsonar.cli.odometry_command import Frames
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -48,11 +49,13 @@ def mosaic(
 ) -> None:
     """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
     from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
+    from mitsonar.mapping.open_source import Reading, frames_for
 
     quality = _checked_out(out, true, overwrite)
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
     paths, told_height = _paths(trajectory, true)
-    source = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
+    pitch = None if pitch_deg is None else math.radians(pitch_deg)
+    source = frames_for(frames, Reading(sequence, view, noise, seed, height, pitch))
     if source.note:
         say(source.note)
     if source.height_m is None and told_height is not None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -12,12 +13,7 @@ from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
 from mitsonar.cli.render_command import SIX
 from mitsonar.errors import MitsonarError
 
-if TYPE_CHECKING:
-    from mitsonar.mapping.frame_source import FrameSource
-    from mitsonar.mapping.odometry import Method, Source
-    from mitsonar.mapping.view_source import ViewSource
-
-__all__ = ["Frames", "frames_from", "odometry", "views_from"]
+__all__ = ["Frames", "odometry"]
 
 Frames = Annotated[
     str, typer.Argument(metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, or a data set.")
@@ -71,44 +67,25 @@ def odometry(
     Writes into OUT: estimated.tum, true.tum where poses are known, motions.csv, covariances.npz, table.md, table.json,
     path.png, run.json, and estimates.jsonl, from which --resume goes on.
     """
+    from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
-    from mitsonar.mapping.response_source import holds_responses
+    from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at
     from mitsonar.motion.pose import Pose
+    from mitsonar.records.sonar_frames import SonarFrames
 
     factors = scale if scale is None or scale == "fit" else numbers(scale, 3, "--scale (or fit)")
     first = numbers(start, 6, "--from")
-    source: Source
-    method: Method
-    if holds_responses(frames):
-        if any(option is not None for option in (sequence, view, pitch_deg, height_by)):
-            raise MitsonarError(
-                "--sequence, --view, --height-by and --pitch-deg belong to frames; impulse responses have none of them"
-            )
-        estimator = estimator or "likelihood"
-        source, method = _responses(frames, estimator, noise, seed, height)
-    else:
-        from mitsonar.estimation.named_estimators import estimator_from
-
-        estimator = estimator or "direct"
-        try:
-            method = estimator_from(estimator)
-        except MitsonarError:
-            frames_from(frames, sequence, view, noise, seed, height, pitch_deg)  # what is wrong with them is said first
-            raise
-        views, kind = getattr(method, "views", None), getattr(method, "kind", "image")
-        if views is not None:
-            if any(option is not None for option in (view, height, pitch_deg)):
-                raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")
-            seen: FrameSource | ViewSource = views_from(frames, views, kind, sequence, noise, seed)
-        else:
-            if height is not None and height_by is not None:
-                raise MitsonarError("--height tells the height and --height-by measures it: give one of them")
-            seen = frames_from(frames, sequence, view, noise, seed, height, pitch_deg)
-        if height_by is not None:
-            from mitsonar.estimation.height.named_height_estimators import height_estimator_from
-
-            seen = seen.with_heights_by(height_estimator_from(height_by))
-        source = seen
+    pitch = None if pitch_deg is None else math.radians(pitch_deg)
+    reading = Reading(sequence, view, noise, seed, height, pitch, height_by)
+    images = record_at(frames) is SonarFrames
+    estimator = estimator or ("direct" if images else "likelihood")
+    try:
+        method = estimator_from(estimator)
+    except MitsonarError:
+        if images:
+            frames_for(frames, reading)  # what is wrong with them is said first
+        raise
+    source = open_source(frames, method, reading)
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
@@ -138,49 +115,3 @@ def odometry(
     count, lost = len(found.estimates), int((~found.believed).sum())
     say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} not believed and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")
-
-
-def _responses(where: str, estimator: str, noise: str, seed: int, height: float | None) -> tuple[Source, Method]:
-    """Impulse responses and their estimator."""
-    from mitsonar.estimation.channel.named_channel_estimators import impulse_estimator_from
-    from mitsonar.mapping.response_source import open_responses
-
-    return open_responses(where).told(noise, seed, height), impulse_estimator_from(estimator)
-
-
-def views_from(where: str, views: tuple[str, ...], kind: str, sequence: int | None, noise: str, seed: int) -> ViewSource:
-    """The views of a data set that a network reads.
-
-    Raises:
-        MitsonarError: none there.
-    """
-    from mitsonar.acoustics.noise import load_noise
-    from mitsonar.mapping.view_source import open_views
-
-    return open_views(where, views, kind, sequence=sequence).with_noise(load_noise(noise), seed)
-
-
-def frames_from(
-    where: str,
-    sequence: int | None,
-    view: str | None,
-    noise: str,
-    seed: int,
-    height: float | None,
-    pitch_deg: float | None,
-) -> FrameSource:
-    """The frames that the options say.
-
-    Raises:
-        MitsonarError: none there, or options that do not fit them.
-    """
-    import math
-
-    from mitsonar.acoustics.noise import load_noise
-    from mitsonar.mapping.frame_source import open_frames
-
-    added = load_noise(noise)
-    source = open_frames(where, sequence=sequence, view=view)
-    if not len(source):
-        raise MitsonarError(f"{source.name} holds no frames: give those of a finished run")
-    return source.with_noise(added, seed).with_geometry(height, None if pitch_deg is None else math.radians(pitch_deg))

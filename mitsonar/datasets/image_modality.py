@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.noise import NoiseModel, load_noise
 from mitsonar.config.data_recipe import Recipe, array_names
-from mitsonar.datasets.modality import Axis, Read, Stored, ground_reach
+from mitsonar.datasets.modality import Axis, Read, Renderer, Stored, ground_reach
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 from mitsonar.records.sonar_frames import LABELS
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.plan import Scene
 
 __all__ = ["ImageModality", "footprint"]
 
@@ -45,6 +50,8 @@ class ImageModality:
     settled: tuple[str, ...] = ("gain", "level_scale")
     planned: tuple[str, ...] = ()
     decided_by: tuple[str, ...] = ()
+    estimators = "zero,ecc,flow,phase,direct"
+    variations = True
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe, self.sonar = recipe, recipe.instrument
@@ -94,6 +101,31 @@ class ImageModality:
         """The type of an array of this kind."""
         known = {"image": self.recipe.pixel, "vector": np.float32, "nonzero": np.uint32}
         return np.dtype(known[kind] if kind in known else LABELS[kind])
+
+    # ---------------------------------------------------------------- simulation and samples
+
+    def renderer(self, scene: Scene) -> Renderer:
+        """Return what renders the frames of one scene."""
+        from mitsonar.datasets.scene_rendering import SceneRenderer
+
+        return SceneRenderer(self.recipe, scene)
+
+    def settled_values(self) -> dict[str, Any]:
+        """Return the gain and its inverse."""
+        from mitsonar.datasets.scene_rendering import calibrate
+
+        gain = calibrate(self.recipe)
+        return {"gain": gain, "level_scale": 1 / gain}
+
+    def noise_model(self, name: str) -> NoiseModel:
+        """Return the noise model of a name."""
+        return load_noise(name)
+
+    def samples(self, url: str | Path, **options: Any) -> Any:
+        """Open pairs of frames."""
+        from mitsonar.datasets.torch_pairs import SonarPairs
+
+        return SonarPairs(url, **{"frames": 2, **options})
 
     # ---------------------------------------------------------------- checks
 

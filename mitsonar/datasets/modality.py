@@ -1,10 +1,11 @@
-"""What the instrument of a data set records of each ping, and where it looks: all that planning and storing need of it."""
+"""A modality: one object that says what an instrument records of a ping, how it is simulated, checked, read and compared."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -14,9 +15,11 @@ from scipy.spatial import ConvexHull
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
+    from mitsonar.acoustics.noise import NoiseModel
+    from mitsonar.datasets.plan import Scene
     from mitsonar.instruments.imaging_sonar import Instrument
 
-__all__ = ["Axis", "Modality", "Read", "Stored", "ground_reach"]
+__all__ = ["Axis", "Modality", "Read", "Renderer", "Stored", "ground_reach"]
 
 Array = NDArray[np.float64]
 Read = Callable[..., NDArray[Any]]
@@ -49,8 +52,21 @@ class Axis:
     about: str
 
 
+class Renderer(Protocol):
+    """One scene, loaded."""
+
+    def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
+        """Return what is stored of consecutive pings of the scene, by name.
+
+        Args:
+            planned: what the plan says of them: ``pose``, and what the modality names.
+            first: number of the first in the scene.
+            about: attributes of the store.
+        """
+
+
 class Modality(Protocol):
-    """What a recipe's instrument records.
+    """What a recipe's instrument records, from simulation to comparison.
 
     Attributes:
         what: one ping's record is called.
@@ -62,12 +78,16 @@ class Modality(Protocol):
         planned: arrays of the plan that are stored beside the poses.
         decided_by: packages whose versions decide what is recorded, beside those that always do.
         ping_bytes: of one ping, about.
+        estimators: that a comparison asks unless others are named, by name with commas between.
+        variations: whether estimators can be told something wrong of its samples, in a comparison.
     """
 
     what: str
     settled: tuple[str, ...]
     planned: tuple[str, ...]
     decided_by: tuple[str, ...]
+    estimators: str
+    variations: bool
 
     @property
     def sonar(self) -> Instrument: ...
@@ -85,6 +105,30 @@ class Modality(Protocol):
 
         Raises:
             MitsonarError: no ground is seen.
+        """
+
+    def renderer(self, scene: Scene) -> Renderer:
+        """Return what renders one scene of the recipe."""
+
+    def settled_values(self) -> dict[str, Any]:
+        """Return the values of ``settled``.
+
+        Raises:
+            MitsonarError: the first frames are empty.
+        """
+
+    def noise_model(self, name: str) -> NoiseModel | None:
+        """Return the noise of a name; None where the name is all there is to it.
+
+        Raises:
+            MitsonarError: unknown.
+        """
+
+    def samples(self, url: str | Path, **options: Any) -> Any:
+        """Open the samples of a store, as estimators are compared on them; options of its reader.
+
+        Raises:
+            MitsonarError: options that do not fit, no samples in that part.
         """
 
     def faults(self, read: Read, here: slice) -> list[str]:

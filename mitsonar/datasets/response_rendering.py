@@ -27,7 +27,7 @@ class ResponseRenderer:
         self.simulator = ChannelSimulator(loaded_world(recipe, scene), recipe.channel_sonar)
 
     def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        """Responses where and as fast as the plan has them; see :class:`~mitsonar.datasets.renderers.Renderer`."""
+        """Responses where and as fast as the plan has them; see :class:`~mitsonar.datasets.modality.Renderer`."""
         parts = list(self.simulator.pings(planned["pose"], planned["velocity"], first=first))
         names = ("response", "height_m", "echoes", "dropped")
         return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}

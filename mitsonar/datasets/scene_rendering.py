@@ -57,7 +57,7 @@ class SceneRenderer:
         return values
 
     def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        """Frames where the plan has them; see :class:`~mitsonar.datasets.renderers.Renderer`."""
+        """Frames where the plan has them; see :class:`~mitsonar.datasets.modality.Renderer`."""
         return self.frames(planned["pose"], first, float(about["gain"]))
 
     def _empty(self, frames: int) -> dict[str, NDArray[Any]]:

@@ -18,9 +18,8 @@ from mitsonar.datasets.response_samples import ImpulseSamples
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.channel.channel_estimator import ImpulseEstimator
 from mitsonar.estimation.crlb.image_crlb import bounds_at, overall
-from mitsonar.estimation.estimator import Estimator
+from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
@@ -70,7 +69,7 @@ class Answers:
         """Which pairs have been asked for ``(n,)``."""
         return np.isfinite(self.ms)
 
-    def ask(self, place: int, estimator: Estimator | ImpulseEstimator, frames: Any) -> None:
+    def ask(self, place: int, estimator: AnyEstimator, frames: Any) -> None:
         """Put an estimate in its place."""
         begun = time.process_time()
         estimate = estimator.estimate(frames)
@@ -137,7 +136,7 @@ def _told(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
 
 
 def answers_of(
-    estimators: Mapping[str, Estimator] | Mapping[str, ImpulseEstimator],
+    estimators: Mapping[str, AnyEstimator],
     pairs: SonarPairs | ImpulseSamples,
     numbers: Sequence[int],
     variation: str = "as told",
@@ -168,7 +167,7 @@ def answers_of(
 
 
 def _answers_of(
-    estimators: Mapping[str, Estimator] | Mapping[str, ImpulseEstimator],
+    estimators: Mapping[str, AnyEstimator],
     pairs: SonarPairs | ImpulseSamples,
     numbers: Sequence[int],
     variation: str,

@@ -1,9 +1,9 @@
-"""The estimator protocol: two consecutive frames in, the motion between them out, and whether to believe it."""
+"""The estimator protocol: consecutive records in, the motion between them out, its covariance, and whether it is valid."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +18,7 @@ __all__ = [
     "INPUTS",
     "LEAST_AT_BEST",
     "LEAST_CORRELATION",
+    "AnyEstimator",
     "Estimate",
     "Estimator",
     "blank",
@@ -68,21 +69,35 @@ def rejected(reason: str) -> Estimate:
     return Estimate(Motion(0.0, 0.0, 0.0), None, False, reason)
 
 
-class Estimator(Protocol):
-    """From two frames to the motion between them.
+Record_contra = TypeVar("Record_contra", contravariant=True)
+
+
+class Estimator(Protocol[Record_contra]):
+    """Consecutive records (frames, views or impulse responses) to the motion from the first to the last.
 
     Attributes:
-        inputs: what it needs beside the images: ``nothing``, ``height and pitch`` ...
+        consumes: the class of the records: ``SonarFrames``, ``ViewFrames`` or ``ImpulseResponses``; ``object`` for any.
+        inputs: what it needs beside them: ``nothing``, ``height and pitch`` ...
+        digest: of the weights of a trained one; empty for the others.
     """
 
-    inputs: str
+    @property
+    def consumes(self) -> type: ...
+    @property
+    def inputs(self) -> str: ...
+    @property
+    def digest(self) -> str: ...
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion from the first to the second of two frames.
+    def estimate(self, records: Record_contra, /) -> Estimate:
+        """Estimate the motion from the first to the last record.
 
         Raises:
-            MitsonarError: not two frames, or frames without what the estimator needs.
+            MitsonarError: too few or too many records, or records without what the estimator needs.
         """
+
+
+AnyEstimator = Estimator[Any]
+"""An estimator of whatever it consumes."""
 
 
 def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.estimation.estimator import Estimator
+from mitsonar.estimation.channel.correlation import Correlation
+from mitsonar.estimation.channel.likelihood import Likelihood
+from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.flow import Flow
 from mitsonar.estimation.image.phase import Phase
-from mitsonar.estimation.image.zero import Zero
+from mitsonar.estimation.zero import Zero
 from mitsonar.networks.shipped import SHIPPED, shipped_path
 
 if TYPE_CHECKING:
@@ -31,19 +33,21 @@ __all__ = [
     "options_from",
 ]
 
-ESTIMATORS: dict[str, Callable[..., Estimator]] = {
+ESTIMATORS: dict[str, type[Any]] = {
     "zero": Zero,
     "ecc": Ecc,
     "flow": Flow,
     "phase": Phase,
     "direct": Direct,
+    "correlation": Correlation,
+    "likelihood": Likelihood,
 }
-"""Those that nothing was trained for."""
+"""Those that nothing was trained for, of sonar frames and of impulse responses: ``consumes`` says which."""
 
 NAMES = (*ESTIMATORS, *SHIPPED)
 
 
-def create_estimator(name: str, **options: Any) -> Estimator:
+def create_estimator(name: str, **options: Any) -> AnyEstimator:
     """The estimator of that name.
 
     Raises:
@@ -57,7 +61,7 @@ def create_estimator(name: str, **options: Any) -> Estimator:
         raise MitsonarError(f"estimator {name}: {error}") from None
 
 
-def estimator_from(text: str) -> Estimator:
+def estimator_from(text: str) -> AnyEstimator:
     """What the command line says: ``NAME``, a checkpoint or the folder of a training run, or either with options,
     ``NAME:key=value:key=value``; angles as ``..._deg``. Several checkpoints with commas between them: the one trained
     nearest to the height of the frames answers.
@@ -77,14 +81,14 @@ def estimator_from(text: str) -> Estimator:
     return made(**options_from(name, words, made))
 
 
-def _nearest(texts: list[str]) -> Estimator:
+def _nearest(texts: list[str]) -> AnyEstimator:
     """Of several checkpoints.
 
     Raises:
         MitsonarError: none of them, or estimators that are no networks.
     """
     made = [estimator_from(text) for text in texts]
-    plain = [text for text, one in zip(texts, made, strict=True) if not hasattr(one, "heights")]
+    plain = [text for text, one in zip(texts, made, strict=True) if not one.digest]
     if plain or len(made) < 2:
         said = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
         raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {said}")
@@ -93,12 +97,12 @@ def _nearest(texts: list[str]) -> Estimator:
     return HeightEnsemble(made)
 
 
-def _maker(name: str) -> Callable[..., Estimator]:
+def _maker(name: str) -> Callable[..., AnyEstimator]:
     """What makes the estimator of that name, from options."""
     return ESTIMATORS[name] if name in ESTIMATORS else _trained(shipped_path(name))
 
 
-def _trained(path: str | Path) -> Callable[..., Estimator]:
+def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
     """What makes an estimator of a checkpoint, from options.
 
     Raises:

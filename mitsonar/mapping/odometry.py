@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.estimation.channel.channel_estimator import ImpulseEstimator
-from mitsonar.estimation.estimator import Estimate, Estimator, rejected
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, rejected
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.measured_heights import without_height
 from mitsonar.mapping.mode_continuity import continued
-from mitsonar.mapping.response_source import ResponseSource
+from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.trajectory_smoothing import (
     MotionSeries,
     fit_scale,
@@ -36,13 +35,12 @@ from mitsonar.mapping.trajectory_smoothing import (
     scaled,
     spline_smoothed,
 )
-from mitsonar.mapping.view_source import ViewSource
 from mitsonar.motion.motion_errors import AXES, in_units, motion_errors
 from mitsonar.motion.pose import Pose, Trajectory, motions
 from mitsonar.motion.trajectory_errors import assess, path_length
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["Method", "Odometry", "Row", "Smoothing", "Source", "bridged", "estimate_motions", "odometry", "series_of"]
+__all__ = ["Odometry", "Row", "Smoothing", "bridged", "estimate_motions", "odometry", "series_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -50,11 +48,6 @@ Row = tuple[str, float, str]
 """Name, value, unit."""
 
 Smoothing = Literal["none", "spline", "kalman"]
-
-Source = FrameSource | ResponseSource | ViewSource
-Method = Estimator | ImpulseEstimator
-"""Frames with an estimator of frames (views of a data set with a network that reads them), or pings with one of impulse
-responses."""
 
 PAIRS_A_BATCH = 8
 """What a worker is given at a time, and what a kill may cost."""
@@ -141,7 +134,7 @@ class Odometry:
 
 def odometry(
     frames: Source | SonarFrames,
-    estimator: Method,
+    estimator: AnyEstimator,
     *,
     smooth: Smoothing = "none",
     scale: ArrayLike | Literal["fit"] | None = None,
@@ -285,7 +278,7 @@ def _usual(reasons: list[str]) -> str:
 
 def estimate_motions(
     source: Source,
-    estimator: Method,
+    estimator: AnyEstimator,
     frames: ArrayLike,
     *,
     workers: int = 1,
@@ -334,7 +327,7 @@ def _batches(pairs: list[int]) -> list[range]:
 
 
 def _made_here(
-    source: Source, estimator: Method, numbers: Index, batches: list[range], workers: int
+    source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimates of this process."""
     with _one_opencv_thread():
@@ -343,7 +336,7 @@ def _made_here(
 
 
 def _made_beside(
-    source: Source, estimator: Method, numbers: Index, batches: list[range], workers: int
+    source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimates of processes that are started anew; this one reads the frames."""
     with _one_thread_each():
@@ -399,11 +392,11 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-_worker: Method
+_worker: AnyEstimator
 """Of this process, where it is a worker."""
 
 
-def _begin_worker(estimator: Method) -> None:
+def _begin_worker(estimator: AnyEstimator) -> None:
     global _worker
     _worker = estimator
     cv2.setNumThreads(1)

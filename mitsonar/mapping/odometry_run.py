@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.io.whole_files import read_json, write_json, write_whole
-from mitsonar.mapping.odometry import Method, Odometry, Row, Smoothing, Source, odometry
+from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
+from mitsonar.mapping.open_source import Source
 from mitsonar.motion.motion_errors import AXES, in_units
 from mitsonar.motion.pose import Motion, Pose, Trajectory
 from mitsonar.plotting.map_figure import path_figure, save_figure
@@ -164,7 +165,7 @@ class OdometryFolder:
 def run_odometry(
     source: Source,
     name: str,
-    estimator: Method,
+    estimator: AnyEstimator,
     out: str | Path,
     *,
     smooth: Smoothing = "none",

@@ -74,23 +74,30 @@ class ResponseSource:
         """Where the transmitter was, where that is known."""
         return None if self.poses is None else Trajectory(self.poses, self.time_s)
 
-    def told(self, snr: str = "none", seed: int = 0, height_m: float | None = None) -> Self:
-        """The same pings with noise at a ratio as ``20 dB``, and with a height [m] where they lack it.
+    def with_noise(self, snr: str, seed: int = 0) -> Self:
+        """Return the same pings with noise at a ratio of signal to noise such as ``20 dB``.
 
         Raises:
-            MitsonarError: a ratio that is none; a height that cannot be or that would not be used.
+            MitsonarError: a ratio that is none.
         """
         ratio = snr_of(snr)
-        if height_m is not None and not 0 < height_m < np.inf:
+        return replace(self, noise=None if ratio is None else ResponseNoise(ratio), seed=seed)
+
+    def with_height(self, height_m: float | None) -> Self:
+        """Return the same pings with a height [m] where they lack it.
+
+        Raises:
+            MitsonarError: a height that cannot be or that would not be used.
+        """
+        if height_m is None:
+            return self
+        if not 0 < height_m < np.inf:
             raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
         known = self.responses.height_m
-        if height_m is not None and known is not None and np.isfinite(known).all():
+        if known is not None and np.isfinite(known).all():
             raise MitsonarError(f"{self.name} tells its heights, so that {height_m:g} m would not be used: leave it out")
-        responses = self.responses
-        if height_m is not None:
-            responses = replace(responses, height_m=np.full(len(responses), height_m))
-        noise = None if ratio is None else ResponseNoise(ratio)
-        return replace(self, responses=responses, told_height_m=height_m, noise=noise, seed=seed)
+        responses = replace(self.responses, height_m=np.full(len(self), height_m))
+        return replace(self, responses=responses, told_height_m=height_m)
 
     def check_times(self) -> None:
         """Pings follow each other.

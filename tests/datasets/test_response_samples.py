@@ -22,8 +22,8 @@ from mitsonar.datasets.response_packing import Packing, noise_power, packed, wit
 from mitsonar.datasets.response_samples import ImpulseSamples, displacement_labels
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.channel.named_channel_estimators import create_impulse_estimator
 from mitsonar.estimation.learned.regressors import REGRESSORS, Turned, flattened, score_all
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.motion.pose import Motion, Pose, Trajectory, compose, motions, steady, velocities
 from mitsonar.plotting.data_sheet import info
 from mitsonar.simulation.scene import load_scene
@@ -371,7 +371,7 @@ def test_the_wrong_kind_of_data_set_is_one_sentence(made: Path) -> None:
     pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
     from mitsonar.datasets.torch_pairs import SonarPairs
 
-    with pytest.raises(MitsonarError, match="the data set heard is of impulse responses, this needs one of images"):
+    with pytest.raises(MitsonarError, match="the data set received is of impulse responses, this needs one of images"):
         SonarPairs(made)
 
 
@@ -385,7 +385,7 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
     assert [table["noise"] for table in tables] == ["none", "20 dB"]
     for table in tables:
         samples = ImpulseSamples(straight, part="all", noise=table["noise"], seed=3, one_a_sequence=True)
-        answers = [create_impulse_estimator("correlation").estimate(samples.responses(k)) for k in range(len(samples))]
+        answers = [create_estimator("correlation").estimate(samples.responses(k)) for k in range(len(samples))]
         said = np.array([one.motion[:2] if one.valid else (0, 0) for one in answers])
         wanted = 1e3 * np.sqrt(((said - samples.targets()) ** 2).mean(axis=0))
         row = next(row for row in table["rows"] if row["method"] == "correlation")

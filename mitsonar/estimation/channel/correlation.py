@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from mitsonar.estimation.channel.channel_estimator import assumed_height, pings_of, reach_of
+from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.motion.pose import Motion
@@ -75,7 +75,9 @@ class Correlation:
     height_m: float | None = None
     speed: float = 2.1
 
+    consumes = ImpulseResponses
     inputs = "height"
+    digest = ""
 
     def estimate(self, responses: ImpulseResponses) -> Estimate:
         """The motion, and whether to believe it."""

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter
 
-from mitsonar.estimation.channel.channel_estimator import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.motion_search import ReceiverBand, Search, receiver_bands_of
+from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.response_covariance import block_toeplitz
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.estimator import Estimate, rejected
@@ -136,7 +136,9 @@ class Likelihood:
     turn_rate: float = 0.4
     modes: int = 5
 
+    consumes = ImpulseResponses
     inputs = "height"
+    digest = ""
 
     def estimate(self, responses: ImpulseResponses) -> Estimate:
         """The motion, how sure it is, and whether to believe it."""

@@ -142,7 +142,9 @@ class Direct:
     heave_std_m: float = 0.0
     levels: tuple[Level, ...] = LEVELS
 
+    consumes = SonarFrames
     inputs = INPUTS
+    digest = ""
 
     def __post_init__(self) -> None:
         if not 0 <= self.heave_std_m < np.inf or (self.height_m is not None and not self.height_m > 0):

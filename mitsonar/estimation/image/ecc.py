@@ -34,7 +34,9 @@ class Ecc:
     height_m: float | None = None
     pitch_rad: float | None = None
 
+    consumes = SonarFrames
     inputs = INPUTS
+    digest = ""
 
     def estimate(self, frames: SonarFrames) -> Estimate:
         """The motion, and whether to believe it; zero motion where OpenCV finds none."""

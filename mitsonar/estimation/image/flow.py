@@ -141,7 +141,9 @@ class Flow:
     height_std: float | None = None
     levels: tuple[Level, ...] = LEVELS
 
+    consumes = SonarFrames
     inputs = INPUTS
+    digest = ""
 
     def __post_init__(self) -> None:
         if self.match not in ("map", "vector"):

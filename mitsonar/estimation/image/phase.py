@@ -50,7 +50,9 @@ class Phase:
     height_m: float | None = None
     pitch_rad: float | None = None
 
+    consumes = SonarFrames
     inputs = INPUTS
+    digest = ""
 
     def estimate(self, frames: SonarFrames) -> Estimate:
         """The motion, and whether to believe it."""

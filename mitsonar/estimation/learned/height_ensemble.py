@@ -11,6 +11,8 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.learned.image_network import Network
 from mitsonar.estimation.learned.view_network import ViewNetwork
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.view_frames import ViewFrames
 
 __all__ = ["HeightEnsemble"]
 
@@ -40,6 +42,16 @@ class HeightEnsemble:
             said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
             raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
         ((_, self.views, self.kind),) = reads
+
+    @property
+    def consumes(self) -> type:
+        """The class of records that its networks read."""
+        return ViewFrames if self.views else SonarFrames
+
+    @property
+    def digest(self) -> str:
+        """Of all its networks."""
+        return " ".join(one.digest for one in self.networks)
 
     def estimate(self, frames: Any) -> Estimate:
         """What the chosen network says.

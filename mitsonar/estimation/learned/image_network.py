@@ -56,6 +56,11 @@ class Network(Trained):
     pitch_rad: float | None
     relief_m: float | None
 
+    @property
+    def consumes(self) -> type:
+        """The class of records that it reads."""
+        return SonarFrames
+
     def __init__(
         self,
         checkpoint: Checkpoint,

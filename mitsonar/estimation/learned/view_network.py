@@ -52,6 +52,11 @@ class ViewNetwork(Trained):
 
     instead: ClassVar[str] = "a network of that sonar's views"
 
+    @property
+    def consumes(self) -> type:
+        """The class of records that it reads."""
+        return ViewFrames
+
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 2:
             raise MitsonarError(

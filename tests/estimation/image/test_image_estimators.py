@@ -13,8 +13,8 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.ground_view import GroundView
-from mitsonar.estimation.image.zero import Zero
 from mitsonar.estimation.named_estimators import ESTIMATORS, create_estimator, estimator_from
+from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -33,7 +33,7 @@ pytestmark = [
 
 START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
 UNITS = np.array([1e3, 1e3, 180 / np.pi])
-CLASSICAL = [name for name in ESTIMATORS if name != "zero"]
+CLASSICAL = [name for name, made in ESTIMATORS.items() if made.consumes is SonarFrames]
 METHODS = [*CLASSICAL, *(pytest.param(name, marks=pytest.mark.learn) for name in SHIPPED)]
 
 ALLOWED = {
@@ -222,7 +222,7 @@ def test_what_is_missing_is_said() -> None:
             create_estimator(method).estimate(bare)
         with pytest.raises(MitsonarError, match="takes two frames: got 1"):
             create_estimator(method, height_m=2.0, pitch_rad=0.6).estimate(bare.select(slice(0, 1)))
-    with pytest.raises(MitsonarError, match="takes two frames: got 1"):
+    with pytest.raises(MitsonarError, match="takes two frames, or two pings or more: got 1"):
         Zero().estimate(bare.select(slice(0, 1)))
     with pytest.raises(MitsonarError, match="did you mean direct"):
         create_estimator("dierct")

@@ -1,37 +1,19 @@
-"""The protocol of estimators of impulse responses: pings in, the motion from the first to the last out."""
+"""What estimators of impulse responses share: pings fit to be compared, reach and height."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate
 from mitsonar.records.impulse_responses import ImpulseResponses
 
-__all__ = ["ImpulseEstimator", "Pings", "assumed_height", "pings_of", "reach_of"]
+__all__ = ["Pings", "assumed_height", "pings_of", "reach_of"]
 
 UNEVEN = 0.01
 """Part of an interval by which pings may come too early or late."""
-
-
-class ImpulseEstimator(Protocol):
-    """From the impulse responses of a few pings to the motion from the first to the last.
-
-    Attributes:
-        inputs: what it needs beside the responses: ``nothing``, ``height`` ...
-    """
-
-    inputs: str
-
-    def estimate(self, responses: ImpulseResponses) -> Estimate:
-        """The motion from the first to the last ping.
-
-        Raises:
-            MitsonarError: fewer than two pings, or responses without what the estimator needs.
-        """
 
 
 class Pings(NamedTuple):
