@@ -15,6 +15,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from mitsonar import plugins
+from mitsonar.errors import explain_missing
 
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import load_noise
@@ -109,7 +110,10 @@ def __getattr__(name: str) -> Any:
         return version("mitsonar")
     if name not in _MODULES:
         raise AttributeError(f"module 'mitsonar' has no attribute {name!r}")
-    return getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
+    try:
+        return getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
+    except ModuleNotFoundError as error:
+        raise explain_missing(error) from None
 
 
 def __dir__() -> list[str]:

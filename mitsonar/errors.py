@@ -9,7 +9,25 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError
 
-__all__ = ["MitsonarError", "MitsonarWarning", "complaint", "nearest_names"]
+__all__ = ["MitsonarError", "MitsonarWarning", "complaint", "explain_missing", "nearest_names"]
+
+EXTRAS = {
+    "distributed": ("data", "making a data set on several processes"),
+    "dask": ("data", "making a data set on several processes"),
+    "trimesh": ("meshes", "worlds and models"),
+    "collada": ("meshes", "reading a .dae model"),
+    "lxml": ("meshes", "reading a .dae model"),
+    "cv2": ("odometry", "estimating motion and laying mosaics"),
+    "tifffile": ("odometry", "writing GeoTIFF"),
+    "torch": ("learn", "networks, and reading data sets for them,"),
+    "lightning": ("learn", "training"),
+    "torchmetrics": ("learn", "training"),
+    "onnx": ("learn", "writing ONNX"),
+    "onnxscript": ("learn", "writing ONNX"),
+    "sklearn": ("learn", "classical regression"),
+    "s3fs": ("s3", "object storage"),
+}
+"""Packages that a plain installation lacks: the extra that brings them, and what needs them."""
 
 
 class MitsonarError(ValueError):
@@ -18,6 +36,19 @@ class MitsonarError(ValueError):
 
 class MitsonarWarning(UserWarning):
     """A result that stands, but that the user should know something about."""
+
+
+def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
+    """Turn an absent optional package into a sentence that names the extra which brings it.
+
+    Raises:
+        ModuleNotFoundError: the error itself, where no extra brings that module.
+    """
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRAS:
+        raise error
+    extra, what = EXTRAS[package]
+    return MitsonarError(f"{what} needs {package}, which is not installed: pip install 'mitsonar[{extra}]'")
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:

@@ -130,7 +130,7 @@ def test_no_name_of_a_file_stands_twice() -> None:
 
 
 def test_packages_import_nothing_but_the_register_of_plugins() -> None:
-    allowed = {"": {"plugins"}, "networks": {"networks.create"}}
+    allowed = {"": {"errors", "plugins"}, "networks": {"networks.create"}}
     found = {name: imported(MODULES[name]) for name in PACKAGES if name != "cli"}
     assert found == {name: allowed.get(name, set()) for name in found}
 
@@ -216,7 +216,45 @@ def test_rendering_works_without_torch() -> None:
         frames = simulator.render([pose], noise=mitsonar.load_noise("high"), seed=1)
         assert frames.image.max() > 0.5
     """
-    run_python(script, block=("torch",))
+    run_python(script, block=("torch", "cv2", "trimesh", "distributed", "dask", "tifffile"))
+
+
+@pytest.mark.parametrize(
+    ("package", "use", "extra"),
+    [
+        ("cv2", 'mitsonar.create_estimator("direct")', "odometry"),
+        ("torch", "mitsonar.SonarPairs", "learn"),
+        ("torch", 'mitsonar.load_checkpoint("corrnet")', "learn"),
+    ],
+)
+def test_a_missing_package_is_one_sentence_that_names_the_extra(package: str, use: str, extra: str) -> None:
+    script = f"""
+        import mitsonar
+        try:
+            {use}
+        except mitsonar.MitsonarError as error:
+            assert "{package}" in str(error) and "pip install 'mitsonar[{extra}]'" in str(error), error
+        else:
+            raise AssertionError("it must be missed")
+    """
+    run_python(script, block=(package,))
+
+
+def test_a_command_names_the_extra_that_it_lacks(tmp_path: Path) -> None:
+    script = """
+        import sys
+        from mitsonar.cli import main
+        sys.stderr = sys.stdout
+        sys.argv = ["mitsonar", "world", "rocky-field", "--size-m", "5", "-o", "%s"]
+        try:
+            main()
+        except SystemExit as end:
+            assert end.code == 2, end.code
+    """
+    said = run_python(script % (tmp_path / "rocks"), block=("trimesh",))
+    assert not (tmp_path / "rocks").exists()
+    assert "trimesh" in said
+    assert "pip install 'mitsonar[meshes]'" in said
 
 
 def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:

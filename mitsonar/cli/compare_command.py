@@ -8,7 +8,6 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -69,9 +68,8 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print for programs.")] = False,
 ) -> None:
     """Errors of all methods on the same pairs; failures count as zero motion; bootstrap by scene, then sequence."""
-    if find_spec("torch") is None:
-        raise MitsonarError("comparing reads data sets through torch: pip install 'mitsonar[learn]'")
     from mitsonar.datasets.modalities import modality_of
+    from mitsonar.datasets.modality import samples_of
     from mitsonar.datasets.store import DataStore
     from mitsonar.estimation.benchmark import VARIATIONS, answers_of, bounds_of_pairs, chosen, rows_of, with_prior
     from mitsonar.estimation.named_estimators import estimator_from
@@ -92,7 +90,7 @@ def compare(
     asked = ["as told", *changed, *(["jitter"] if jitter else [])]
     part_read = part or recipe.split.unseen
     samples: dict[str, Any] = {
-        name: modality.samples(data, noise=name, one_a_sequence=True, part=part_read, seed=seed) for name in names
+        name: samples_of(modality, data, noise=name, one_a_sequence=True, part=part_read, seed=seed) for name in names
     }
     first = next(iter(samples.values()))
     if len(first) < 2:

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import typer
 
-from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.errors import MitsonarError, MitsonarWarning, explain_missing
 
 __all__ = ["answered", "numbers", "progress_bar", "say", "say_stopped", "warn"]
 
@@ -50,6 +50,8 @@ def answered(command: Callable[P, R]) -> Callable[P, R]:
             return command(*args, **kwargs)
         except MitsonarError as error:
             typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        except ModuleNotFoundError as error:
+            typer.echo(f"error: {explain_missing(error)}", err=True)
         except BrokenPipeError:  # the reader of our output has gone: nothing is wrong here
             raise typer.Exit(0) from None
         except OSError as error:

@@ -94,12 +94,8 @@ def checkpoint_from(run: str) -> Checkpoint:
     Raises:
         MitsonarError: no torch, or no checkpoint there that can be used.
     """
-    try:
-        from mitsonar.networks.checkpoint import Checkpoint
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "torch":
-            raise
-        raise MitsonarError("networks compute with torch: pip install 'mitsonar[learn]'") from None
+    from mitsonar.networks.checkpoint import Checkpoint
+
     return Checkpoint.load(run)
 
 

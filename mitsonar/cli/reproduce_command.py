@@ -55,11 +55,9 @@ def reproduce(
 
     wanted = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
     rows_named(table_named(table), wanted)
-    try:
-        from mitsonar.training.reproduce import Effort
-        from mitsonar.training.reproduce import reproduce as reproduced
-    except ModuleNotFoundError as error:
-        raise MitsonarError(f"training needs torch and Lightning ({error}): pip install 'mitsonar[learn]'") from None
+    from mitsonar.training.reproduce import Effort
+    from mitsonar.training.reproduce import reproduce as reproduced
+
     effort = Effort(scale, minutes or None, batch, changes_of(change or [], None))
     crew = len(os.sched_getaffinity(0)) if workers is None else workers
     words: dict[str, Any] = {"rows": wanted, "workers": crew, "accelerator": accelerator, "devices": devices}

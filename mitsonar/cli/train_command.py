@@ -15,7 +15,6 @@ import typer
 
 from mitsonar.cli.console import answered, say
 from mitsonar.cli.dataset_command import changes_of
-from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
     from mitsonar.training.training_run import Report
@@ -48,12 +47,10 @@ def train(
     state_minutes: Annotated[float, typer.Option(help="Minutes between states: what a kill may cost.")] = 5.0,
 ) -> None:
     """Train a network. Killed at any moment, the same command with --resume goes on, on a CPU to the same bits."""
-    try:
-        from mitsonar.config.training_recipe import load_training_recipe
-        from mitsonar.training.training_run import leads
-        from mitsonar.training.training_run import train as train_network
-    except ModuleNotFoundError as error:
-        raise MitsonarError(f"training needs torch and Lightning ({error}): pip install 'mitsonar[learn]'") from None
+    from mitsonar.config.training_recipe import load_training_recipe
+    from mitsonar.training.training_run import leads
+    from mitsonar.training.training_run import train as train_network
+
     told = load_training_recipe(recipe, changes_of(change or [], None))
     with asked_to_stop() as stop, TrainingBar() as bar:
         made = train_network(

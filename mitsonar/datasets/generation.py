@@ -10,6 +10,7 @@ import numpy as np
 
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.modalities import modality_of
+from mitsonar.datasets.modality import renderer_of
 from mitsonar.datasets.plan import Plan, scenes_of
 from mitsonar.datasets.split import PARTS, deal, world_of
 from mitsonar.datasets.store import DataStore, versions
@@ -115,7 +116,7 @@ def _begun_or_new(place: Storage, recipe: Recipe, sequences: int | None, variant
             if verify:
                 store.mend_known(Plan.of(recipe, count))
             return store
-    about = {**modality_of(recipe).settled_values(), "variant": variant, "versions": versions()}
+    about = {**renderer_of(modality_of(recipe)).settled(recipe), "variant": variant, "versions": versions()}
     return DataStore.create(place, recipe, Plan.of(recipe, count), about)
 
 

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise
 from mitsonar.config.data_recipe import Recipe, array_names
-from mitsonar.datasets.modality import Axis, Read, Renderer, Stored, ground_reach
+from mitsonar.datasets.modality import Axis, Read, Stored, ground_reach
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 from mitsonar.records.sonar_frames import LABELS
-
-if TYPE_CHECKING:
-    from mitsonar.datasets.plan import Scene
 
 __all__ = ["ImageModality", "footprint"]
 
@@ -50,6 +46,8 @@ class ImageModality:
     settled: tuple[str, ...] = ("gain", "level_scale")
     planned: tuple[str, ...] = ()
     decided_by: tuple[str, ...] = ()
+    renderer_class = "mitsonar.datasets.scene_rendering:SceneRenderer"
+    samples_class = "mitsonar.datasets.torch_pairs:SonarPairs"
     estimators = "zero,ecc,flow,phase,direct"
     variations = True
 
@@ -93,6 +91,11 @@ class ImageModality:
         each = sum(len(view.bearing_rad) * view.sonar.range_bins * size for view in self.recipe.views)
         return each + len(self.recipe.labels) * 4 * each // size
 
+    @property
+    def sample_frames(self) -> int:
+        """Records of a sample."""
+        return 2
+
     def reach(self, height: float) -> NDArray[np.float64]:
         """Corners of the footprint, or of that of the field of view that the flight names."""
         return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg)
@@ -102,30 +105,11 @@ class ImageModality:
         known = {"image": self.recipe.pixel, "vector": np.float32, "nonzero": np.uint32}
         return np.dtype(known[kind] if kind in known else LABELS[kind])
 
-    # ---------------------------------------------------------------- simulation and samples
-
-    def renderer(self, scene: Scene) -> Renderer:
-        """Return what renders the frames of one scene."""
-        from mitsonar.datasets.scene_rendering import SceneRenderer
-
-        return SceneRenderer(self.recipe, scene)
-
-    def settled_values(self) -> dict[str, Any]:
-        """Return the gain and its inverse."""
-        from mitsonar.datasets.scene_rendering import calibrate
-
-        gain = calibrate(self.recipe)
-        return {"gain": gain, "level_scale": 1 / gain}
+    # ---------------------------------------------------------------- noise
 
     def noise_model(self, name: str) -> NoiseModel:
         """Return the noise model of a name."""
         return load_noise(name)
-
-    def samples(self, url: str | Path, **options: Any) -> Any:
-        """Open pairs of frames."""
-        from mitsonar.datasets.torch_pairs import SonarPairs
-
-        return SonarPairs(url, **{"frames": 2, **options})
 
     # ---------------------------------------------------------------- checks
 

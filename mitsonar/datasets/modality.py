@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -16,10 +17,11 @@ from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import NoiseModel
+    from mitsonar.config.data_recipe import Recipe
     from mitsonar.datasets.plan import Scene
     from mitsonar.instruments.imaging_sonar import Instrument
 
-__all__ = ["Axis", "Modality", "Read", "Renderer", "Stored", "ground_reach"]
+__all__ = ["Axis", "Modality", "Read", "Renderer", "Stored", "ground_reach", "renderer_of", "samples_of"]
 
 Array = NDArray[np.float64]
 Read = Callable[..., NDArray[Any]]
@@ -55,6 +57,16 @@ class Axis:
 class Renderer(Protocol):
     """One scene, loaded."""
 
+    def __init__(self, recipe: Recipe, scene: Scene) -> None: ...
+
+    @staticmethod
+    def settled(recipe: Recipe) -> dict[str, Any]:
+        """Return numbers of the whole data set, which are set before its first ping is recorded.
+
+        Raises:
+            MitsonarError: the first frames are empty.
+        """
+
     def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
         """Return what is stored of consecutive pings of the scene, by name.
 
@@ -78,6 +90,9 @@ class Modality(Protocol):
         planned: arrays of the plan that are stored beside the poses.
         decided_by: packages whose versions decide what is recorded, beside those that always do.
         ping_bytes: of one ping, about.
+        renderer_class: what renders a scene of the recipe, ``module:class``; see :func:`renderer_of`.
+        samples_class: what reads the samples that estimators are compared on, ``module:class``.
+        sample_frames: records of a sample in a comparison.
         estimators: that a comparison asks unless others are named, by name with commas between.
         variations: whether estimators can be told something wrong of its samples, in a comparison.
     """
@@ -86,6 +101,8 @@ class Modality(Protocol):
     settled: tuple[str, ...]
     planned: tuple[str, ...]
     decided_by: tuple[str, ...]
+    renderer_class: str
+    samples_class: str
     estimators: str
     variations: bool
 
@@ -99,22 +116,14 @@ class Modality(Protocol):
     def attributes(self) -> dict[str, Any]: ...
     @property
     def ping_bytes(self) -> int: ...
+    @property
+    def sample_frames(self) -> int: ...
 
     def reach(self, height: float) -> Array:
         """Corners ``(n, 2)`` of what is seen of the ground z = 0, from a level vehicle so high, starboard, forward [m].
 
         Raises:
             MitsonarError: no ground is seen.
-        """
-
-    def renderer(self, scene: Scene) -> Renderer:
-        """Return what renders one scene of the recipe."""
-
-    def settled_values(self) -> dict[str, Any]:
-        """Return the values of ``settled``.
-
-        Raises:
-            MitsonarError: the first frames are empty.
         """
 
     def noise_model(self, name: str) -> NoiseModel | None:
@@ -124,18 +133,26 @@ class Modality(Protocol):
             MitsonarError: unknown.
         """
 
-    def samples(self, url: str | Path, **options: Any) -> Any:
-        """Open the samples of a store, as estimators are compared on them; options of its reader.
-
-        Raises:
-            MitsonarError: options that do not fit, no samples in that part.
-        """
-
     def faults(self, read: Read, here: slice) -> list[str]:
         """What is wrong with the values of some frames, a sentence each."""
 
     def warnings(self, read: Read) -> list[str]:
         """What the user should know of a finished data set, a sentence each."""
+
+
+def renderer_of(modality: Modality) -> type[Renderer]:
+    """Return the class that renders scenes; loaded here, so that reading a stored set enters no simulator."""
+    found: type[Renderer] = resolve_name(modality.renderer_class)
+    return found
+
+
+def samples_of(modality: Modality, url: str | Path, **options: Any) -> Any:
+    """Open the samples of a store, as estimators are compared on them.
+
+    Raises:
+        MitsonarError: options that do not fit, no samples in that part.
+    """
+    return resolve_name(modality.samples_class)(url, frames=modality.sample_frames, **options)
 
 
 def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:

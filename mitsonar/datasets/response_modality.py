@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.signal_to_noise import snr_of
 from mitsonar.config.data_recipe import Recipe
-from mitsonar.datasets.modality import Axis, Read, Renderer, Stored, ground_reach
+from mitsonar.datasets.modality import Axis, Read, Stored, ground_reach
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
-
-if TYPE_CHECKING:
-    from mitsonar.datasets.plan import Scene
 
 __all__ = ["ResponseModality"]
 
@@ -31,6 +27,8 @@ class ResponseModality:
     settled: tuple[str, ...] = ()
     planned: tuple[str, ...] = ("velocity",)
     decided_by: tuple[str, ...] = ("finufft",)
+    renderer_class = "mitsonar.datasets.response_rendering:ResponseRenderer"
+    samples_class = "mitsonar.datasets.response_samples:ImpulseSamples"
     estimators = "zero,correlation,likelihood"
     variations = False
 
@@ -66,29 +64,18 @@ class ResponseModality:
         """Responses of a ping."""
         return 8 * len(self.sonar.receivers) * self.sonar.taps
 
+    @property
+    def sample_frames(self) -> int:
+        """Records of a sample."""
+        return self.recipe.frames
+
     def reach(self, height: float) -> NDArray[np.float64]:
         """Corners of what any receiver sees."""
         return _reach(self.sonar, height)
 
-    def renderer(self, scene: Scene) -> Renderer:
-        """Return what simulates the responses of one scene."""
-        from mitsonar.datasets.response_rendering import ResponseRenderer
-
-        return ResponseRenderer(self.recipe, scene)
-
-    def settled_values(self) -> dict[str, Any]:
-        """Return nothing: responses have no gain."""
-        return {}
-
     def noise_model(self, name: str) -> None:
         """Check a ratio of signal to noise, whose name says all."""
         snr_of(name)
-
-    def samples(self, url: str | Path, **options: Any) -> Any:
-        """Open groups of responses, as many pings each as the recipe says."""
-        from mitsonar.datasets.response_samples import ImpulseSamples
-
-        return ImpulseSamples(url, **{"frames": self.recipe.frames, **options})
 
     def faults(self, read: Read, here: slice) -> list[str]:
         """Responses are finite; counts are none below zero."""

@@ -26,6 +26,11 @@ class ResponseRenderer:
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self.simulator = ChannelSimulator(loaded_world(recipe, scene), recipe.channel_sonar)
 
+    @staticmethod
+    def settled(recipe: Recipe) -> dict[str, Any]:
+        """Return nothing: responses have no gain."""
+        return {}
+
     def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
         """Responses where and as fast as the plan has them; see :class:`~mitsonar.datasets.modality.Renderer`."""
         parts = list(self.simulator.pings(planned["pose"], planned["velocity"], first=first))

@@ -38,6 +38,12 @@ class SceneRenderer:
         self.recipe, self.scene = recipe, scene
         self.simulator = Simulator(loaded_world(recipe, scene), recipe.instrument, views=recipe.views)
 
+    @staticmethod
+    def settled(recipe: Recipe) -> dict[str, Any]:
+        """Return the gain of the data set and its inverse; see :func:`calibrate`."""
+        gain = calibrate(recipe)
+        return {"gain": gain, "level_scale": 1 / gain}
+
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[Pings]]:
         """Levels of frames ``first``, ``first + 1`` ... of the scene, in batches, a part for each view."""
         return self.simulator.render_views(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)

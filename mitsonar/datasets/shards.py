@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.datasets.modality import Renderer
+from mitsonar.datasets.modality import Renderer, renderer_of
 from mitsonar.datasets.plan import Scene
 from mitsonar.datasets.store import DataStore
 from mitsonar.simulation.variant import ensure_variant, release_memory
@@ -63,5 +63,5 @@ def _renderer(store: DataStore, number: int) -> Renderer:
     key = (store.recipe.model_dump_json(), scene)
     if key not in _RENDERER:
         forget()  # before the next is loaded: two scenes would need twice the memory
-        _RENDERER[key] = store.modality.renderer(scene)
+        _RENDERER[key] = renderer_of(store.modality)(store.recipe, scene)
     return _RENDERER[key]

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, explain_missing, nearest_names
 from mitsonar.estimation.channel.correlation import Correlation
 from mitsonar.estimation.channel.likelihood import Likelihood
 from mitsonar.estimation.estimator import AnyEstimator
@@ -129,9 +129,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     try:
         from mitsonar.networks.checkpoint import Checkpoint
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "torch":
-            raise
-        raise MitsonarError("a network computes with torch: pip install 'mitsonar[learn]'") from None
+        raise explain_missing(error) from None
     return Checkpoint.load(path)
 
 

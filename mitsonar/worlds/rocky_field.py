@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import trimesh
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +23,9 @@ from mitsonar.worlds.world import (
     stream,
     whole,
 )
+
+if TYPE_CHECKING:
+    import trimesh
 
 __all__ = ["RockyField"]
 

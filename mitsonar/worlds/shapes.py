@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    import trimesh
 
 __all__ = ["Copies", "box", "capsule", "cylinder", "place", "slab"]
 
@@ -39,22 +42,30 @@ class Copies:
 
 def box() -> trimesh.Trimesh:
     """A cube, four triangles along each edge: 48."""
+    import trimesh
+
     return trimesh.creation.box().subdivide()
 
 
 def slab() -> trimesh.Trimesh:
     """A cube of 12 triangles."""
+    import trimesh
+
     return trimesh.creation.box()
 
 
 def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
     """A cylinder along z, its side cut into ``rings``."""
+    import trimesh
+
     side = [(0.5, z) for z in np.linspace(-0.5, 0.5, rings + 1)]
     return trimesh.creation.revolve([(0, -0.5), *side, (0, 0.5)], sections=sections)
 
 
 def capsule(sections: int = 12) -> trimesh.Trimesh:
     """A capsule along z, twice as long as wide before it is squeezed to one unit: half spheres of two bands."""
+    import trimesh
+
     turn = np.radians([-90, -45, 0])
     low = np.column_stack([0.5 * np.cos(turn), (0.5 * np.sin(turn) - 0.5) / 2])
     low[0, 0] = 0  # the pole lies on the axis
