@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from drawn_frames import as_zarr, over_ground, sway
 from helpers import Command, diffuse, files_of, floor, refused, scene
 from numpy.typing import NDArray
 from PIL import Image
-from test_odometry import as_zarr, over_ground, sway
 
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.trajectory_smoothing import path_of

@@ -517,8 +517,8 @@ def test_a_second_writer_is_told_and_changes_nothing(made: Path, tmp_path: Path)
     url = tmp_path / "tiny.zarr"
     script = f"""
 import time, sys
-from mitsonar.io.storage import Place
-with Place({str(url)!r}).locked():
+from mitsonar.io.storage import Storage
+with Storage({str(url)!r}).locked():
     print("locked", flush=True)
     time.sleep(60)
 """

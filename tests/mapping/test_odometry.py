@@ -12,16 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn_frames import SONAR, START, as_zarr, over_ground, sway
 from helpers import files_of, tiny_recipe
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping import odometry_run
 from mitsonar.mapping.frame_source import FrameSource, open_frames
@@ -29,39 +28,11 @@ from mitsonar.mapping.odometry import PAIRS_A_BATCH, bridged, estimate_motions, 
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
 from mitsonar.mapping.trajectory_smoothing import MotionSeries, path_of
 from mitsonar.motion.pose import Motion, Pose, Trajectory, motions
-from mitsonar.records.frame_store import FrameStore
 from mitsonar.records.sonar_frames import SonarFrames
 
 Array = NDArray[np.float64]
 
-SONAR = Sonar(bearing="azimuth", beams=96, range_bins=128, range_min=3.6, range_max=5.4)
-START = Pose.from_degrees([1.0, -2.0, 2.5, 35, 0, 40])
 STD = np.array([1e-3, 5e-4, 2e-4])
-
-
-def sway(frames: int) -> Trajectory:
-    """A path that turns and changes its speed, at uneven times."""
-    step = np.random.default_rng(1).uniform(0.08, 0.12, frames - 1)
-    time = np.concatenate([[5.0], 5.0 + np.cumsum(step)])
-    t = (time[1:] + time[:-1]) / 2
-    velocity = np.column_stack([0.1 * np.sin(t), 0.12 + 0.04 * np.cos(0.7 * t), np.radians(3) * np.sin(0.5 * t)])
-    return path_of(velocity * step[:, None], START, time)
-
-
-def over_ground(path: Trajectory, sonar: Sonar = SONAR, noise: float = 0.01) -> SonarFrames:
-    """Frames of a flat floor of smooth random reflectivity, drawn by geometry alone."""
-    cell, rng = 0.02, np.random.default_rng(7)
-    floor = ndimage.gaussian_filter(rng.uniform(0, 1, (700, 700)), 3)
-    floor = np.clip(0.4 + (floor - floor.mean()) / floor.std() * 0.15, 0.02, 1)
-    images = []
-    for pose in path.poses:
-        geometry = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, pose[2], pose[3], pose[4])
-        place = moved(geometry.points, (0.0, 0.0, -pose[5])) + pose[:2]
-        level = ndimage.map_coordinates(floor, np.moveaxis(place, -1, 0)[::-1] / cell + 350, order=1, mode="grid-wrap")
-        images.append(np.clip(level + noise * rng.normal(size=level.shape), 0, 1))
-    heights = path.poses[:, 2].copy()
-    image = np.array(images, np.float32)
-    return SonarFrames(image, sonar.range_m, sonar.bearing_rad, path.time_s, sonar, path.poses, heights)
 
 
 def numbered(path: Trajectory) -> SonarFrames:
@@ -353,11 +324,6 @@ def test_few_frames_are_in_memory_at_a_time() -> None:
     assert sum(sizes) < 100 + 100 / PAIRS_A_BATCH + 1
     big = replace(FrameSource.of(over_ground(sway(2))), time_s=np.arange(5000.0))
     assert big.frames_a_chunk * SONAR.range_bins * SONAR.beams * 4 <= 8 * 2**20
-
-
-def as_zarr(frames: SonarFrames, path: Path, done: int | None = None) -> None:
-    store = FrameStore.create(path, len(frames), frames)
-    store.write(0, frames.select(slice(done)))
 
 
 def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
