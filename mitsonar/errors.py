@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError
 
-__all__ = ["MitsonarError", "MitsonarWarning", "complaint", "explain_missing", "nearest_names"]
+
+__all__ = [
+    "MitsonarError",
+    "MitsonarWarning",
+    "argument",
+    "complaint",
+    "explain_missing",
+    "meant",
+    "nearest_names",
+]
 
 EXTRAS = {
     "distributed": ("data", "making a data set on several processes"),
@@ -29,9 +39,38 @@ EXTRAS = {
 }
 """Packages that a plain installation lacks: the extra that brings them, and what needs them."""
 
+MARK = "\x1f"
+"""Stands before and after an argument's name in a message, and is never shown."""
+
 
 class MitsonarError(ValueError):
     """An input that mitsonar cannot work with. The command line prints it and exits with code 2."""
+
+    def __str__(self) -> str:
+        return self.said({})
+
+    def said(self, options: Mapping[str, str]) -> str:
+        """The message with the words of who reads it.
+
+        Args:
+            options: what stands for arguments that :func:`argument` names, ``{"height_m": "--height"}``; others keep their
+                Python names.
+        """
+
+        def typed(found: re.Match[str]) -> str:
+            return options.get(found[1].rpartition(" ")[2], found[1])
+
+        return re.sub(f"{MARK}([^{MARK}]*){MARK}", typed, super().__str__())
+
+
+def argument(name: str) -> str:
+    """Name an argument in the message of a :class:`MitsonarError`: where the command line has an option for it, that is
+    printed instead.
+
+    Args:
+        name: of the argument, perhaps after words on what it belongs to, which an option does not need: ``sonar model``.
+    """
+    return f"{MARK}{name}{MARK}"
 
 
 class MitsonarWarning(UserWarning):
@@ -59,6 +98,12 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
     return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"
 
 
+def meant(wrong: object, names: Iterable[str]) -> str:
+    """Ask for the nearest of some names, for the end of a message that lists them; empty where none is near."""
+    near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
     """The first of pydantic's complaints as one sentence: what, got, allowed.
 
@@ -78,9 +123,16 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
         return f"{what} lacks {key}{see}"
     if first["type"] == "value_error":
         said = str(first["ctx"]["error"])
-        return f"{what} {key}: {said}" if where else said
+        return f"{argument(f'{what} {key}')}: {said}" if where else said
     message = first["msg"][0].lower() + first["msg"][1:]
-    return f"{what} {key}: {message}, got {first['input']!r}{see}"
+    return f"{argument(f'{what} {key}')}: {message}, got {first['input']!r}{_meant(first)}{see}"
+
+
+def _meant(error: Mapping[str, Any]) -> str:
+    """The nearest of the names that a key may have, where its value is none of them."""
+    if error["type"] != "literal_error":
+        return ""
+    return meant(error["input"], re.findall(r"'([^']*)'", str(error["ctx"]["expected"])))
 
 
 def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.special import ndtr
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, meant, nearest_names
 
 __all__ = ["NOISE_MODELS", "Information", "NoiseModel", "information", "information_of_sums", "load_noise", "uniform"]
 
@@ -319,4 +319,5 @@ def load_noise(text: str) -> NoiseModel:
             raise
         raise MitsonarError(
             f"noise must be {', '.join(NOISE_MODELS)}, three fractions mean,std,scale, or a YAML file: got {text!r}"
+            f"{meant(text, NOISE_MODELS)}"
         ) from None

@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
-__all__ = ["main"]
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import typer
+
+__all__ = ["application", "main"]
 
 
 def main() -> None:
     """``mitsonar`` and ``python -m mitsonar``."""
+    import typer
+
+    from mitsonar.cli.help_texts import with_plain_brackets
+
+    with_plain_brackets(typer.main.get_command(application()))()
+
+
+def application() -> typer.Typer:
+    """Collect all commands."""
     import typer
 
     from mitsonar.cli import (
@@ -53,4 +67,4 @@ def main() -> None:
     app.command()(reproduce_command.reproduce)
     app.add_typer(world_command.worlds(), name="world")
     app.add_typer(dataset_command.datasets(), name="dataset")
-    app()
+    return app

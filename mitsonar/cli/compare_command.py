@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,7 +80,10 @@ def compare(
     modality = modality_of(recipe)
     methods = {text: estimator_from(text) for text in dict.fromkeys((estimators or modality.estimators).split(",")) if text}
     if not methods or (reference is not None and reference not in methods):
-        raise MitsonarError(f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {reference!r}")
+        raise MitsonarError(
+            f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {reference!r}"
+            f"{meant(reference, methods)}"
+        )
     if not modality.variations and (perturb or jitter or prior):
         raise MitsonarError("--perturb, --jitter and --prior are for data sets of images: leave them out")
     names = list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import errno
 import functools
+import shlex
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ParamSpec, TypeVar
 
@@ -15,7 +16,7 @@ import typer
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, explain_missing
 
-__all__ = ["answered", "numbers", "progress_bar", "say", "say_stopped", "warn"]
+__all__ = ["answered", "command_line", "numbers", "progress_bar", "say", "say_stopped", "warn"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -39,8 +40,37 @@ def say_stopped() -> None:
     typer.echo(f"stopped; what is whole on disk stays, {AGAIN}", err=True)
 
 
-def answered(command: Callable[P, R]) -> Callable[P, R]:
-    """Answer a mistake with one sentence and exit code 2, and a full disk or Ctrl-C likewise; never with a traceback."""
+STANDS = {"height_m": "--height", "pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"}
+INSTRUMENT = {"model": "--model", "seed": "--seed"}
+
+OPTIONS: dict[str, dict[str, str]] = {
+    "render": INSTRUMENT,
+    "limit": INSTRUMENT,
+    "impulse": {**INSTRUMENT, "velocity": "--velocity"},
+    "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},
+    "odometry": {**STANDS, "every": "--every"},
+    "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},
+    "mosaic": {**STANDS, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
+    "compare": {"height_m": "NAME:height_m=METRES", "pitch_rad": "NAME:pitch_deg=DEGREES"},
+    "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
+    "reproduce": {"minutes": "--minutes"},
+}
+"""By command: the option that a user types for an argument that a message names (:func:`mitsonar.errors.argument`)."""
+
+
+def command_line(*words: object) -> str:
+    """A command of mitsonar that can be pasted into a shell: words with spaces are quoted."""
+    return shlex.join(["mitsonar", *map(str, words)])
+
+
+def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) -> Callable[P, R]:
+    """Answer a mistake with one sentence and exit code 2, and a full disk or Ctrl-C likewise; never with a traceback.
+
+    Args:
+        command: what is called.
+        options: what a user types for arguments that messages name; default: those of :data:`OPTIONS`.
+    """
+    typed = OPTIONS.get(command.__name__, {}) if options is None else options
 
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -49,7 +79,7 @@ def answered(command: Callable[P, R]) -> Callable[P, R]:
         try:
             return command(*args, **kwargs)
         except MitsonarError as error:
-            typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+            typer.echo(f"error: {' '.join(error.said(typed).split())}", err=True)
         except ModuleNotFoundError as error:
             typer.echo(f"error: {explain_missing(error)}", err=True)
         except BrokenPipeError:  # the reader of our output has gone: nothing is wrong here

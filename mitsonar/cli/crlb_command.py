@@ -13,7 +13,7 @@ import typer
 from numpy.typing import NDArray
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, _instrument, _path, scene_parameters
+from mitsonar.cli.render_command import SIX, Frame, _instrument, _path, scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -71,7 +71,8 @@ def limit(
     start: Annotated[str | None, typer.Option("--from", help=f"Pose: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help="Last pose: --poses are spread from --from to it.")] = None,
     poses: Annotated[int | None, typer.Option(help="How many poses (default: 1; of a trajectory 20).")] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="Poses of a TUM file, or `shipped`.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="Poses of a TUM or CSV file, or `shipped`.")] = None,
+    frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
     segments: Annotated[str | None, typer.Option(help="Portions of a looking-down sonar's view: q1,q2,q3,q4.")] = None,
@@ -98,16 +99,22 @@ def limit(
     window follow the nearest and farthest range of the floor, with as many bins.
     """
     from mitsonar.acoustics.noise import load_noise
+    from mitsonar.motion.conventions import convention_named
 
     added, name, values = load_noise(noise), *_variable(vary)
+    if height is not None and not height > 0:
+        raise MitsonarError(f"--height must be above 0: got {height:g} m")
     flown = {"start": start, "end": end, "count": poses, "file": trajectory}
+    convention_named(frame)
     if Path(source).suffix == ".zarr" or "://" in source:
         scene_only = {**flown, "--sonar": sonar, "--model": model, "--segments": segments, "-D": parameter}
         if any(value is not None for value in scene_only.values()):
             raise MitsonarError(f"{source} is a data set, which says sonar, poses and segments itself: give none of them")
         subject = _of_data(source, pairs, part, gain, seed)
     else:
-        subject = _of_scene(source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), flown)
+        subject = _of_scene(
+            source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), {**flown, "frame": frame}
+        )
     if name is not None and gain is None:
         subject = Subject(subject.sonar, subject.views, subject.places, subject.poses, None)
     rows: list[tuple[Value | None, Table]] = []
@@ -179,7 +186,7 @@ def _of_scene(
     loaded = load_scene(source, **parameters)
     instrument, attitude = _instrument(loaded, sonar, model, seed)
     count = flown["count"] or (20 if flown["file"] else None)
-    path = _path(instrument, attitude, source, count, flown["start"], flown["end"], flown["file"])
+    path = _path(instrument, attitude, source, count, flown["start"], flown["end"], flown["file"], flown["frame"])
     heights = np.concatenate([batch.height_m for batch in Simulator(loaded, instrument).pings(path.poses)])
     if not np.isfinite(heights).all():
         raise MitsonarError("nothing is below the sonar at some pose: give a pose over the scene with --from")

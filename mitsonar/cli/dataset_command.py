@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, say_stopped, warn
+from mitsonar.cli.console import answered, command_line, progress_bar, say, say_stopped, warn
 from mitsonar.errors import MitsonarError
 
 __all__ = ["changes_of", "datasets"]
@@ -69,7 +69,7 @@ def make(
         warn(sentence)
     there = made.shards - made.made
     say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
-    say(f"look at it: mitsonar dataset show {made.url}")
+    say(f"look at it: {command_line('dataset', 'show', made.url)}")
 
 
 @answered
@@ -155,7 +155,7 @@ def check(data: Data) -> None:
     if faults:
         raise MitsonarError(
             f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it goes on where it stopped, and with "
-            "--verify makes again what is damaged"
+            "--verify makes again what is damaged; empty frames stay until the recipe is another"
         )
     say(f"{len(store):,} frames in {store.shards} shards: all is well")
 

@@ -9,7 +9,7 @@ import typer
 
 from mitsonar.cli.console import answered, say
 from mitsonar.cli.evaluate_command import Run, checkpoint_from
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, meant
 
 __all__ = ["export"]
 
@@ -25,7 +25,7 @@ def export(
     from mitsonar.io.whole_files import write_whole
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
-        raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}")
+        raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}{meant(batch, ['dynamic'])}")
     if onnx.suffix.lower() != ".onnx" or not onnx.parent.is_dir():
         raise MitsonarError(f"--onnx must name an .onnx file in a folder that is there: got {onnx}")
     if onnx.exists() and not overwrite:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
+from mitsonar.cli.render_command import Frame
 from mitsonar.errors import MitsonarError
 
 __all__ = ["image"]
@@ -21,15 +22,19 @@ def image(
     noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
+    frame: Frame = "mitsonar",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
     """Bin the echoes of a run again: other bins, another window, other noise."""
     from mitsonar.acoustics.noise import load_noise
+    from mitsonar.motion.conventions import convention_named
     from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
 
-    outputs = Outputs(load_noise(noise), cartesian=cartesian)
+    outputs = Outputs(load_noise(noise), cartesian=cartesian, frame=convention_named(frame).name)
     ends = numbers(window, 2, "--range")
+    if ends and not 0 <= ends[0] < ends[1]:
+        raise MitsonarError(f"--range takes from,to in m, the near end first: got {window}")
     source = StoredEchoes(run_folder, bins=bins, window=(ends[0], ends[1]) if ends else None)
     folder = out or run_folder / "rebinned"
     if run_folder.resolve().is_relative_to(folder.resolve()):

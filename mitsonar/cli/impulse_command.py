@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, scene_parameters
-from mitsonar.errors import MitsonarError
+from mitsonar.cli.render_command import SIX, Frame, scene_parameters
+from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,8 +35,9 @@ def impulse(
     ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     trajectory: Annotated[
-        str | None, typer.Option(help="Poses to fly: a TUM file, or a course (square, stairs, zigzag, circle ...).")
+        str | None, typer.Option(help="Poses to fly: a TUM or CSV file, or a course (square, stairs, zigzag, circle ...).")
     ] = None,
+    frame: Frame = "mitsonar",
     model: Annotated[
         str | None, typer.Option(help="scatterers (of the world) or rays (of the vehicle, the thesis's).")
     ] = None,
@@ -57,7 +58,7 @@ def impulse(
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     sonar, attitude = _instrument(channel_sonar_in(loaded), model, seed, set_ or [])
-    flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory)
+    flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory, frame)
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
     simulator = ChannelSimulator(loaded, sonar)
@@ -109,8 +110,8 @@ def _listening(sonar: ChannelSonar, names: str) -> list[dict[str, Any]]:
     for name in wanted:
         if name not in known:
             raise MitsonarError(
-                f"--set receivers=NAME,NAME chooses of the receivers {', '.join(known)}: got {name!r}; others are described "
-                "in the scene's channel_sonar"
+                f"--set receivers=NAME,NAME chooses of the receivers {', '.join(known)}: got {name!r}{meant(name, known)}; "
+                "others are described in the scene's channel_sonar"
             )
     return [known[name].model_dump() for name in wanted]
 
@@ -122,13 +123,16 @@ def _path(
     frames: int | None,
     start: str | None,
     path: str | None,
+    frame: str,
 ) -> tuple[Trajectory, NDArray[np.float64]]:
     """Poses and velocities that the options say."""
     import numpy as np
 
+    from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.courses import COURSES, course
     from mitsonar.motion.pose import Pose, Trajectory, steady, velocities
 
+    convention_named(frame)
     if frames is not None and frames < 1:
         raise MitsonarError(f"--frames must be at least 1: got {frames}")
     first = numbers(start, 6, "--from")
@@ -139,7 +143,7 @@ def _path(
                 "--trajectory and --velocity contradict each other, and --from is only the middle of a course: give one"
             )
         named = path in COURSES or not Path(path).suffix
-        flown = course(path, begin or Pose(0.0, 0.0, 10.0)) if named else Trajectory.load_tum(path)
+        flown = course(path, begin or Pose(0.0, 0.0, 10.0)) if named else Trajectory.load(path, frame, looks_ahead=False)
         speeds = velocities(flown)
         if frames is not None:  # fewer pings do not make the vehicle cut corners
             few = flown.resample(frames)

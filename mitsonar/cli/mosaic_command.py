@@ -12,7 +12,8 @@ import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
-from mitsonar.errors import MitsonarError
+from mitsonar.cli.render_command import Frame
+from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +30,7 @@ __all__ = ["mosaic"]
 def mosaic(
     frames: Frames,
     trajectory: Annotated[
-        str, typer.Argument(help="TUM file, the folder of an odometry, or `true`: where the frames say they were.")
+        str, typer.Argument(help="TUM or CSV file, the folder of an odometry, or `true`: where the frames say they were.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="OUT.png, a figure, and OUT.quality.png; or OUT.tif, a GeoTIFF.")],
     cell_mm: Annotated[float, typer.Option(help="Edge of a cell of the map.")] = 10.0,
@@ -38,7 +39,8 @@ def mosaic(
     flatten: Annotated[
         bool, typer.Option("--flatten/--no-flatten", help="Take out how the sonar lights the ground.")
     ] = True,
-    true: Annotated[Path | None, typer.Option(help="TUM file of the true path, to be drawn too.")] = None,
+    true: Annotated[Path | None, typer.Option(help="TUM or CSV file of the true path, to be drawn too.")] = None,
+    frame: Frame = "mitsonar",
     height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
@@ -53,7 +55,7 @@ def mosaic(
 
     quality = _checked_out(out, true, overwrite)
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
-    paths, told_height = _paths(trajectory, true)
+    paths, told_height = _paths(trajectory, true, frame)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
     source = frames_for(frames, Reading(sequence, view, noise, seed, height, pitch))
     if source.note:
@@ -64,7 +66,9 @@ def mosaic(
         raise MitsonarError(f"{source.name} does not tell how high the sonar is over the ground: give --height")
     if trajectory == "true":
         if source.true is None:
-            raise MitsonarError(f"{source.name} does not tell where the sonar was: give a TUM file or an odometry's folder")
+            raise MitsonarError(
+                f"{source.name} does not tell where the sonar was: give a TUM or CSV file, or an odometry's folder"
+            )
         paths = {"true": source.true}
     laid_along = next(iter(paths))
     index, poses = source.along(paths[laid_along])
@@ -116,11 +120,13 @@ def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
     return quality
 
 
-def _paths(trajectory: str, true: Path | None) -> tuple[dict[str, Trajectory], float | None]:
+def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Trajectory], float | None]:
     """Paths by name, the one to lay frames along first, and the height that an odometry was told."""
     from mitsonar.mapping.odometry_run import OdometryFolder
+    from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.pose import Trajectory
 
+    convention_named(frame)
     height = None
     paths: dict[str, Trajectory] = {}
     if Path(trajectory).is_dir():
@@ -130,11 +136,16 @@ def _paths(trajectory: str, true: Path | None) -> tuple[dict[str, Trajectory], f
         if folder.true is not None:
             paths["true"] = folder.true
     elif trajectory != "true":
-        paths["estimated"] = Trajectory.load_tum(trajectory)
+        if not Path(trajectory).exists():
+            raise MitsonarError(
+                f"there is no trajectory {trajectory}: give a TUM or CSV file, the folder of an odometry, or "
+                f"`true`{meant(trajectory, ['true'])}"
+            )
+        paths["estimated"] = Trajectory.load(trajectory, frame)
     if true is not None:
         if trajectory == "true":
             raise MitsonarError("--true and TRAJECTORY true are one path: leave --true out")
-        paths["true"] = Trajectory.load_tum(true)
+        paths["true"] = Trajectory.load(true, frame)
     return paths, height
 
 

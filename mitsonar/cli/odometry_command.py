@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX
+from mitsonar.cli.render_command import SIX, Frame
 from mitsonar.errors import MitsonarError
 
 __all__ = ["Frames", "odometry"]
@@ -45,6 +45,7 @@ def odometry(
     scale: Annotated[str | None, typer.Option(help="Factors for sideways,forward,yaw, or `fit` to the true path.")] = None,
     every: Annotated[int, typer.Option(help="Use every so many frames only.")] = 1,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX} (default: the true one, or 0).")] = None,
+    frame: Frame = "mitsonar",
     height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
     height_by: Annotated[
         str | None, typer.Option(help="Measure it in each frame: direct, or a checkpoint that was trained on heights.")
@@ -102,6 +103,7 @@ def odometry(
             method,
             out,
             **words,
+            frame=frame,
             every=every,
             workers=crew,
             overwrite=overwrite,

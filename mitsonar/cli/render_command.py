@@ -8,15 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.motion.pose import Pose, Trajectory
 
-__all__ = ["SIX", "render", "scene_parameters"]
+__all__ = ["SIX", "Frame", "render", "scene_parameters"]
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
+
+Frame = Annotated[
+    str,
+    typer.Option(help="Convention of pose files, read and written: mitsonar, ros-enu or ned (not of --from)."),
+]
 
 
 @answered
@@ -26,7 +31,8 @@ def render(
     frames: Annotated[int | None, typer.Option(help="Number of frames.")] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM file, or `shipped`.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM or CSV file, or `shipped`.")] = None,
+    frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
     noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
@@ -41,17 +47,18 @@ def render(
 ) -> None:
     """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise
+    from mitsonar.motion.conventions import convention_named
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.render_run import Outputs, run, scene_digest
     from mitsonar.simulation.scene import find_scene, load_scene
 
     if overwrite and resume:
         raise MitsonarError("--overwrite and --resume contradict each other: give one")
-    outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr)
+    outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=convention_named(frame).name)
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     instrument, attitude = _instrument(loaded, sonar, model, seed)
-    path = _path(instrument, attitude, scene, frames, start, end, trajectory)
+    path = _path(instrument, attitude, scene, frames, start, end, trajectory, frame)
     folder = out or Path("out") / find_scene(scene).stem
     simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
@@ -97,6 +104,7 @@ def _path(
     start: str | None,
     end: str | None,
     file: Path | None,
+    frame: str,
 ) -> Trajectory:
     """The poses that the options say."""
     from mitsonar.motion.pose import Pose, Trajectory
@@ -107,7 +115,12 @@ def _path(
     if file is not None:
         if start or end:
             raise MitsonarError("--trajectory and --from/--to contradict each other: give one")
-        flown = Trajectory.load_tum(shipped_trajectory(scene) if str(file) == "shipped" else file)
+        shipped = str(file) == "shipped"
+        if not shipped and not file.exists():
+            raise MitsonarError(
+                f"there is no trajectory {file}: give a TUM or CSV file, or `shipped`{meant(file, ['shipped'])}"
+            )
+        flown = Trajectory.load_tum(shipped_trajectory(scene)) if shipped else Trajectory.load(file, frame)
         return flown if frames is None else flown.resample(frames)
     first = numbers(start, 6, "--from")
     last = numbers(end, 6, "--to")

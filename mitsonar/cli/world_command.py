@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 import typer
 from typer.core import TyperGroup
 
-from mitsonar.cli.console import answered, say, warn
+from mitsonar.cli.console import answered, command_line, say, warn
+from mitsonar.cli.help_texts import with_plain_brackets
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -40,10 +41,14 @@ class _Families(TyperGroup):
         for name, family in FAMILIES.items():
             app.command(name, help=inspect.cleandoc(family.__doc__ or ""))(_command(name, family))
         app.command("mesh")(mesh)
-        return typer.main.get_command(app)
+        return with_plain_brackets(typer.main.get_command(app))
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(self.known.list_commands(ctx))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        self.commands = self.known.commands  # of which a wrong name's neighbours are told
+        return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         return self.known.get_command(ctx, cmd_name)
@@ -52,7 +57,6 @@ class _Families(TyperGroup):
 def _command(name: str, family: type[Family]) -> Callable[..., None]:
     """A command whose options are the fields of a family."""
 
-    @answered
     def command(seed: int, out: Path, **fields: Any) -> None:
         from mitsonar.worlds.families import create_family
 
@@ -69,14 +73,13 @@ def _command(name: str, family: type[Family]) -> Callable[..., None]:
     parameters += [_option(key, field) for key, field in family.model_fields.items()]
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return command
+    return answered(command, {key: f"--{key.replace('_', '-')}" for key in family.model_fields})
 
 
 def _option(key: str, field: FieldInfo) -> inspect.Parameter:
     """The option of one field; intervals and triples are numbers with commas between them."""
     default = "drawn" if field.default is None else _shown(field.default)
-    # brackets are markup in a help text
-    text = f"{field.description} [default: {default}]".replace("[", r"\[")
+    text = f"{field.description} [default: {default}]"
     kind = next((kind for kind in (int, float) if field.annotation in (kind, kind | None)), str)
     places = ",".join("N" * len(get_args(field.annotation))) if get_origin(field.annotation) is tuple else None
     option = typer.Option(f"--{key.replace('_', '-')}", help=text, show_default=False, metavar=places)
@@ -130,4 +133,4 @@ def mesh(
 def _write(world: World, out: Path) -> None:
     scene = world.write(out)
     say(world.about)
-    say(f"{world.faces:,} triangles in {scene}; see it with: mitsonar render {scene} --cartesian")
+    say(f"{world.faces:,} triangles in {scene}; see it with: {command_line('render', scene, '--cartesian')}")

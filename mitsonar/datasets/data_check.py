@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.datasets.modality import empty_sentence
 from mitsonar.datasets.plan import Plan, footprints_at
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
@@ -32,6 +33,7 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
     """Every file against its seal, and what is in it against what may be."""
     wrong: list[str] = []
     unwritten: list[int] = []
+    empty: list[int] = []
     sizes, seals = store.place.sizes(), store.seals()
     for shard in range(store.shards):
         here = store.frames_of(shard)
@@ -49,7 +51,10 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
                 )
             if not damaged:
                 wrong += store.modality.faults(store.read, here)
+                empty += (here.start + np.flatnonzero(store.modality.empty(store.read, here))).tolist()
         progress(here.stop - here.start)
+    if empty:
+        wrong.append(empty_sentence(empty, len(store)))
     if unwritten:
         which = ", ".join(map(str, unwritten[:10])) + (" ..." if len(unwritten) > 10 else "")
         state = "is damaged" if store.finished else "is not finished"

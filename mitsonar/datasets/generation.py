@@ -10,7 +10,7 @@ import numpy as np
 
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.modalities import modality_of
-from mitsonar.datasets.modality import renderer_of
+from mitsonar.datasets.modality import empty_sentence, renderer_of
 from mitsonar.datasets.plan import Plan, scenes_of
 from mitsonar.datasets.split import PARTS, deal, world_of
 from mitsonar.datasets.store import DataStore, versions
@@ -189,4 +189,23 @@ def _warnings(store: DataStore) -> list[str]:
             f"nothing is below the sonar in {over_nothing:,} of {len(store):,} frames: world.size_m is larger than what the "
             "scene holds"
         )
-    return sentences + store.modality.warnings(store.read)
+    return [*sentences, *_empty(store), *store.modality.warnings(store.read)]
+
+
+SHARDS_TO_LOOK_AT = 32
+"""Of a large data set: to read all of it again would take minutes, and `mitsonar dataset check` does."""
+
+
+def _empty(store: DataStore) -> list[str]:
+    """Whether frames hold no echo, in shards spread evenly over the data set."""
+    shards = np.unique(np.linspace(0, store.shards - 1, min(SHARDS_TO_LOOK_AT, store.shards)).round().astype(int))
+    empty, frames = [], 0
+    for shard in shards:
+        here = store.frames_of(int(shard))
+        try:
+            empty += (here.start + np.flatnonzero(store.modality.empty(store.read, here))).tolist()
+        except MitsonarError:  # damaged: `mitsonar dataset check` says which
+            continue
+        frames += here.stop - here.start
+    looked_at = "" if frames == len(store) else f" that were looked at (of {len(store):,})"
+    return [empty_sentence(empty, frames, looked_at)] if empty else []

@@ -113,6 +113,14 @@ class ImageModality:
 
     # ---------------------------------------------------------------- checks
 
+    def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
+        """Frames without a pixel above 0 in any view ``(frames,)``."""
+        dark = np.ones(here.stop - here.start, dtype=bool)
+        for name, (kind, _) in array_names(self.recipe).items():
+            if kind in ("image", "vector"):
+                dark &= ~read(name, here).reshape(len(dark), -1).any(axis=1)
+        return dark
+
     def faults(self, read: Read, here: slice) -> list[str]:
         """Ranges of pixels, sums and labels."""
         wrong = []

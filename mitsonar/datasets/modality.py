@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mitsonar.datasets.plan import Scene
     from mitsonar.instruments.imaging_sonar import Instrument
 
-__all__ = ["Axis", "Modality", "Read", "Renderer", "Stored", "ground_reach", "renderer_of", "samples_of"]
+__all__ = ["Axis", "Modality", "Read", "Renderer", "Stored", "empty_sentence", "ground_reach", "renderer_of", "samples_of"]
 
 Array = NDArray[np.float64]
 Read = Callable[..., NDArray[Any]]
@@ -133,6 +133,9 @@ class Modality(Protocol):
             MitsonarError: unknown.
         """
 
+    def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
+        """Which of some pings hold no echo at all, in no view and at no receiver ``(pings,)``."""
+
     def faults(self, read: Read, here: slice) -> list[str]:
         """What is wrong with the values of some frames, a sentence each."""
 
@@ -182,3 +185,19 @@ def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
     unit = directions[:, :2] / np.maximum(level, 1e-12)[:, None]
     points = eye[:2] + unit * distance[:, None]
     return np.asarray(points[ConvexHull(points).vertices])
+
+
+def empty_sentence(empty: Sequence[int], frames: int, looked_at: str = "") -> str:
+    """What to say of frames without echoes.
+
+    Args:
+        empty: their numbers.
+        frames: how many were looked at.
+        looked_at: which these are, where not all.
+    """
+    which = ", ".join(f"{number:,}" for number in empty[:6]) + (" ..." if len(empty) > 6 else "")
+    return (
+        f"{len(empty):,} of {frames:,} frames{looked_at} are empty, without a single echo ({which}): there the sonar sees "
+        "nothing of the scene within its window; check world.size_m, flight.height_m, mount, range_min and range_max, and "
+        "make another data set"
+    )

@@ -77,6 +77,10 @@ class ResponseModality:
         """Check a ratio of signal to noise, whose name says all."""
         snr_of(name)
 
+    def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
+        """Pings of which no receiver heard an echo ``(pings,)``."""
+        return np.asarray((read("echoes", here) == 0).all(axis=1))
+
     def faults(self, read: Read, here: slice) -> list[str]:
         """Responses are finite; counts are none below zero."""
         wrong = [

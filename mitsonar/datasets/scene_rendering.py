@@ -20,7 +20,7 @@ from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, co
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import release_memory
 
-__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world"]
+__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_small_worlds"]
 
 FRAMES_A_SCENE = 10_000_000
 """Pings are numbered by scene times this, plus their place in it: jitter does not depend on the size of the data set."""
@@ -41,6 +41,7 @@ class SceneRenderer:
     @staticmethod
     def settled(recipe: Recipe) -> dict[str, Any]:
         """Return the gain of the data set and its inverse; see :func:`calibrate`."""
+        refuse_small_worlds(recipe)
         gain = calibrate(recipe)
         return {"gain": gain, "level_scale": 1 / gain}
 
@@ -91,10 +92,30 @@ class SceneRenderer:
 
 
 def loaded_world(recipe: Recipe, scene: Scene) -> Any:
-    """A scene's world, built in a folder that is gone again once it is loaded."""
+    """A scene's world, built in a folder that is gone again once it is loaded.
+
+    Raises:
+        MitsonarError: a scene of the user's own that is smaller than the recipe says.
+    """
     with tempfile.TemporaryDirectory(prefix="mitsonar-world-") as folder:
-        path, parameters = recipe.family(scene.group).prepare(scene.seed, Path(folder) / "world")
-        return load_scene(path, **parameters)
+        family = recipe.family(scene.group)
+        path, parameters = family.prepare(scene.seed, Path(folder) / "world")
+        loaded = load_scene(path, **parameters)
+        extent = loaded.bbox()
+        family.refuse_smaller(np.array(extent.min, dtype=float).ravel(), np.array(extent.max, dtype=float).ravel())
+        return loaded
+
+
+def refuse_small_worlds(recipe: Recipe) -> None:
+    """Refuse scenes of the user's own that are smaller than the recipe says, before anything is rendered.
+
+    Raises:
+        MitsonarError: one is smaller than its ``size_m``, or cannot be loaded.
+    """
+    own = {repr(recipe.family(group)): group for group in range(len(recipe.scenes)) if not recipe.family(group).seeded}
+    for group in own.values():
+        loaded_world(recipe, Scene(0, group, 0, 1))
+    release_memory()
 
 
 def calibrate(recipe: Recipe) -> float:

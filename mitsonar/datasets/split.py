@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mitsonar.config.data_recipe import Recipe, Split
 from mitsonar.datasets.plan import Scene
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, meant
 
 __all__ = ["PARTS", "deal", "world_of"]
 
@@ -36,7 +36,7 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
     if part == "all":
         return np.ones(len(world), dtype=bool)
     if part not in PARTS:
-        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}")
+        raise MitsonarError(f"part must be {', '.join(PARTS)} or all: got {part!r}{meant(part, (*PARTS, 'all'))}")
     shares = np.array([getattr(split, name) for name in PARTS])
     if shares[PARTS.index(part)] == 0:
         raise MitsonarError(f"the split by {split.by} has no {part} part: {_said(split)}; give another split")

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mitsonar.errors import MitsonarError, explain_missing, nearest_names
+from mitsonar.errors import MitsonarError, explain_missing, meant, nearest_names
 from mitsonar.estimation.channel.correlation import Correlation
 from mitsonar.estimation.channel.likelihood import Likelihood
 from mitsonar.estimation.estimator import AnyEstimator
@@ -145,7 +145,7 @@ def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[
         if not value:
             raise MitsonarError(f"an estimator is NAME or NAME:key=value:key=value: got {':'.join([name, *words])!r}")
         if key not in known:
-            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}")
+            raise MitsonarError(f"unknown option {key!r}: {name} takes {', '.join(known) or 'none'}{meant(key, known)}")
         try:
             number = float(value)
         except ValueError:

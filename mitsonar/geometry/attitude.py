@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
@@ -84,10 +84,11 @@ def attitude_of(
     told = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (told is None and relief_m is not None):
         raise MitsonarError(
-            f"{name} needs height and pitch: the frames lack height_m or poses; give height_m and pitch_rad to it"
+            f"{name} needs height and pitch, and the frames do not tell both: give {argument('height_m')} and "
+            f"{argument('pitch_rad')}"
         )
     if told is not None and not 0 < told < np.inf:
-        raise MitsonarError(f"{name} needs a height above 0 m: got {told:g}; give height_m")
+        raise MitsonarError(f"{name} needs a height above 0 m: got {told:g}; give {argument('height_m')}")
     roll = 0.0 if pose is None else float(pose[4])
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     if told is not None and pitch + half > np.pi / 2:
@@ -101,8 +102,8 @@ def attitude_of(
     if told is None:
         if seen is None:
             raise MitsonarError(
-                f"{name} needs height and pitch: the frames lack height_m, and their window shows no first echoes; give "
-                "height_m to it"
+                f"{name} needs height and pitch: the frames tell no height, and their window shows no first echoes; give "
+                f"{argument('height_m')}"
             )
         return Attitude(seen.height_m, STD_SEEN * seen.height_m, pitch, roll, even=seen.even)
     if seen is None:

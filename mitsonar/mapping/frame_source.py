@@ -123,12 +123,12 @@ class FrameSource:
         if height_m is not None and not lacking:
             raise MitsonarError(
                 f"{self.name}: the frames tell their heights, so that {height_m:g} m would not be used: leave it out, "
-                "or give height_m to the estimator"
+                "or give it to the estimator, as NAME:height_m=2.5"
             )
         if pitch_rad is not None and self.poses is not None:
             raise MitsonarError(
                 f"{self.name}: the frames tell their pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
-                "it out, or give pitch_deg to the estimator"
+                "it out, or give it to the estimator, as NAME:pitch_deg=35"
             )
         if height_m is not None and not 0 < height_m < np.inf:
             raise MitsonarError(f"the height must be above 0: got {height_m:g} m")

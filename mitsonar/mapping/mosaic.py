@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.io.whole_files import write_whole
@@ -134,12 +134,13 @@ class Mosaic:
         illumination: Floats | None = None,
     ) -> None:
         if not (math.isfinite(cell_m) and cell_m > 0):
-            raise MitsonarError(f"cell_m must be above 0: got {cell_m:g} m; 0.01 suits range bins of 5 mm")
+            raise MitsonarError(f"{argument('cell_m')} must be above 0: got {cell_m:g} m; 0.01 m suits range bins of 5 mm")
         if blend not in get_args(Blend):
             raise MitsonarError(f"unknown blend {blend!r}: {nearest_names(blend, get_args(Blend))}")
         if centre_beams < 2 or most_cells < 1:
             raise MitsonarError(
-                f"centre_beams must be at least 2 and most_cells at least 1: got {centre_beams} and {most_cells}"
+                f"{argument('centre_beams')} must be at least 2 and {argument('most_cells')} at least 1: got {centre_beams} "
+                f"and {most_cells:,}"
             )
         if illumination is not None and not (np.isfinite(illumination).all() and np.all(illumination > 0)):
             raise MitsonarError("an illumination must be finite and above 0 everywhere: take it from `illumination`")
@@ -437,7 +438,7 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
     mean = _levels(frames).mean(axis=0)
     over_ground = np.isfinite(heights)
     if not over_ground.any():
-        raise MitsonarError("the illumination needs frames over ground: got no known height_m; give height_m")
+        raise MitsonarError(f"the illumination needs frames over ground, of known height: give {argument('height_m')}")
     fan = _fan(frames, table[over_ground].mean(axis=0), float(heights[over_ground].mean()))
     points = fan.ground.points
     lit = np.abs(fan.ground.elevation(points)) <= fan.half_elevation
@@ -515,7 +516,9 @@ def _placed(
     if poses is None and frames.poses is None:
         raise MitsonarError("the frames have no poses: give poses, such as those of an estimated path")
     if height_m is None and frames.height_m is None:
-        raise MitsonarError("the frames have no height_m: give height_m, the sonar's height over the ground")
+        raise MitsonarError(
+            f"the frames do not tell their height: give {argument('height_m')}, the sonar's height over the ground"
+        )
     table = _poses(frames.poses if poses is None else poses)
     if len(table) != len(frames):
         raise MitsonarError(f"each frame needs a pose: got {len(table)} poses for {len(frames)} frames")
@@ -526,9 +529,11 @@ def _heights(height_m: ArrayLike | None, count: int) -> NDArray[np.float64]:
     """One height a frame ``(count,)``; nan where unknown."""
     heights = np.asarray(height_m, dtype=float)
     if heights.shape not in ((), (count,)):
-        raise MitsonarError(f"height_m must be one number, or one for each of {count} frames: got {heights.shape}")
+        raise MitsonarError(
+            f"{argument('height_m')} must be one number, or one for each of {count} frames: got {heights.shape}"
+        )
     if (heights <= 0).any():
-        raise MitsonarError(f"height_m must be above 0: got {np.nanmin(heights):g} m")
+        raise MitsonarError(f"{argument('height_m')} must be above 0: got {np.nanmin(heights):g} m")
     return np.broadcast_to(heights, count)
 
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, rejected
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.measured_heights import without_height
@@ -192,7 +192,7 @@ def odometry(
 def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int) -> Index:
     """Numbers of the frames; what cannot work is refused before hours of estimating."""
     if every < 1:
-        raise MitsonarError(f"every must be at least 1: got {every}")
+        raise MitsonarError(f"{argument('every')} must be at least 1: got {every}")
     numbers = np.arange(0, len(source), every)
     if len(numbers) < 2:
         used = f", {len(numbers)} of them used" if every > 1 else ""

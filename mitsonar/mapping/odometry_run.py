@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import time
+import warnings
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,11 +16,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source
+from mitsonar.motion.conventions import convention_named
 from mitsonar.motion.motion_errors import AXES, in_units
 from mitsonar.motion.pose import Motion, Pose, Trajectory
 from mitsonar.plotting.map_figure import path_figure, save_figure
@@ -63,13 +65,18 @@ class OdometryFolder:
     @property
     def estimated(self) -> Trajectory:
         """The path."""
-        return Trajectory.load_tum(self.path / "estimated.tum")
+        return self._path("estimated.tum")
 
     @property
     def true(self) -> Trajectory | None:
         """The true path, where it was known."""
-        there = self.path / "true.tum"
-        return Trajectory.load_tum(there) if there.exists() else None
+        return self._path("true.tum") if (self.path / "true.tum").exists() else None
+
+    def _path(self, name: str) -> Trajectory:
+        """A path in the convention in which it was written; what it looks at was known then."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MitsonarWarning)
+            return Trajectory.load(self.path / name, str(self.state.get("frame", "mitsonar")))
 
     # ---------------------------------------------------------------- beginning
 
@@ -148,9 +155,10 @@ class OdometryFolder:
         """All results; the last one is run.json, which says that they are whole."""
         self.state |= more | {"finished": False}
         write_json(self.path / "run.json", self.state)
-        _save_tum(self.path / "estimated.tum", found.path)
+        frame = str(self.state.get("frame", "mitsonar"))
+        _save_tum(self.path / "estimated.tum", found.path, frame)
         if found.true is not None:
-            _save_tum(self.path / "true.tum", found.true)
+            _save_tum(self.path / "true.tum", found.true, frame)
         write_whole(self.path / "motions.csv", _motions_csv(found).encode())
         write_whole(self.path / "covariances.npz", _covariances(found))
         rows = found.rows()
@@ -171,6 +179,7 @@ def run_odometry(
     smooth: Smoothing = "none",
     scale: ArrayLike | Literal["fit"] | None = None,
     start: Pose | None = None,
+    frame: str = "mitsonar",
     every: int = 1,
     workers: int = 1,
     overwrite: bool = False,
@@ -181,7 +190,8 @@ def run_odometry(
 
     ``estimated.tum``, and ``true.tum`` where poses are known; ``motions.csv``; ``covariances.npz``; ``table.md`` and
     ``table.json``; ``path.png``; ``run.json``, the settings; and ``estimates.jsonl``, what the estimator said, a line a
-    pair, from which a killed one goes on; that may be with another ``smooth``, ``scale``, ``start`` and ``workers``.
+    pair, from which a killed one goes on; that may be with another ``smooth``, ``scale``, ``start``, ``frame`` and
+    ``workers``.
 
     Args:
         source: of the frames.
@@ -191,6 +201,7 @@ def run_odometry(
         smooth: see :func:`~mitsonar.mapping.odometry.odometry`.
         scale: see there.
         start: see there.
+        frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
         every: see there.
         workers: see there.
         overwrite: replace an odometry that is there.
@@ -202,6 +213,7 @@ def run_odometry(
     """
     if overwrite and resume:
         raise MitsonarError("--overwrite and --resume contradict each other: give one")
+    convention_named(frame)
     recipe = {
         "estimator": name,
         "options": dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {},  # type: ignore[arg-type]
@@ -240,6 +252,7 @@ def run_odometry(
     settings = {
         "smooth": smooth,
         "scale": scale if isinstance(scale, str) else None if scale is None else np.asarray(scale, dtype=float).tolist(),
+        "frame": frame,
         "factors": found.factors.tolist(),
         "from": list(found.path.poses[0]),
         "not_believed": int((~found.believed).sum()),
@@ -271,9 +284,9 @@ def _estimate_in(line: bytes) -> tuple[int, Estimate]:
     return int(said["pair"]), Estimate(motion, covariance, bool(said["valid"]), str(said["reason"]), about)
 
 
-def _save_tum(path: Path, trajectory: Trajectory) -> None:
+def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
     part = path.with_name(f".{path.name}.part")
-    trajectory.save_tum(part)
+    trajectory.save(part, frame)
     part.replace(path)
 
 

@@ -1,4 +1,4 @@
-"""Pose, motion and trajectory: conventions, composition (Almanza-Medina, eq. 3.4), sampling, TUM files.
+"""Pose, motion and trajectory: conventions, composition (Almanza-Medina, eq. 3.4), sampling, files of poses.
 
 World: right-handed, z up. Vehicle: x sideways to starboard, y forward, z up. Heading is 0 along +y and grows
 clockwise seen from above; pitch > 0 looks down; roll > 0 puts starboard down. Rotation = heading, then pitch, then
@@ -7,6 +7,7 @@ roll, intrinsic.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -16,7 +17,9 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.motion.conventions import CONVENTIONS, Convention, convention_named, sideways_or_up
+from mitsonar.motion.trajectory_files import read_csv, read_tum, write_csv, write_tum
 
 __all__ = [
     "Motion",
@@ -228,46 +231,99 @@ class Trajectory:
         return Trajectory(poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time)), time)
 
     @classmethod
+    def load(cls, path: str | Path, frame: str = "mitsonar", *, looks_ahead: bool = True) -> Self:
+        """Read a TUM file, or a CSV file where the name ends with ``.csv``.
+
+        A CSV file names its columns in its first line: ``time_s`` (or ``time``, ``timestamp``), ``x``, ``y``, ``z`` (or
+        ``x_m`` ...), and either ``qx``, ``qy``, ``qz``, ``qw`` or ``roll``, ``pitch`` and ``heading`` (or ``yaw``; in
+        ``ros-enu`` only ``yaw``), each with ``_deg`` or ``_rad``; other columns are not read.
+
+        Args:
+            path: of the file.
+            frame: its convention: ``mitsonar``, ``ros-enu`` or ``ned`` (:mod:`mitsonar.motion.conventions`).
+            looks_ahead: False where the sonar looks down from a level vehicle; only decides what is warned of.
+
+        Raises:
+            MitsonarError: unknown convention; unreadable file, or a broken line, with its number.
+
+        Warns:
+            MitsonarWarning: in most frames the sonar would look sideways or at the sky, as in a wrong convention.
+        """
+        convention = convention_named(frame)
+        if Path(path).suffix.lower() != ".csv":
+            table = read_tum(path, convention)
+            read = {name: _posed(table, one) for name, one in CONVENTIONS.items()}
+        else:
+            placed, attitude, angles = read_csv(path, convention)
+            table = np.column_stack([placed, attitude])
+            told = _posed if angles is None else _posed_by_angles
+            read = {name: told(table, one) for name, one in CONVENTIONS.items()}
+        _warn_of_attitude(path, read, frame, looks_ahead)
+        return cls(read[frame], table[:, 0])
+
+    def save(self, path: str | Path, frame: str = "mitsonar") -> None:
+        """Write a TUM file, or a CSV file where the name ends with ``.csv``; :meth:`load` reads it back to 1e-9 m and deg.
+
+        Args:
+            path: is replaced.
+            frame: the file's convention: ``mitsonar``, ``ros-enu`` or ``ned``.
+
+        Raises:
+            MitsonarError: unknown convention.
+        """
+        convention = convention_named(frame)
+        position, rotation = self.poses[:, :3], vehicle_rotation(self.poses)
+        if frame != "mitsonar":  # whose numbers stay as they are, to the bit
+            position, rotation = convention.from_ours(position, rotation)
+        if Path(path).suffix.lower() == ".csv":
+            angles = convention.angles_from_ours(self.poses[:, 3:])
+            write_csv(path, np.column_stack([self.time_s, position, angles]), convention)
+        else:
+            table = np.column_stack([self.time_s, position, rotation.as_quat(canonical=True)])
+            write_tum(path, table, convention)
+
+    @classmethod
     def load_tum(cls, path: str | Path) -> Self:
-        """A TUM file: ``time x y z qx qy qz qw`` a line, the quaternion turning (starboard, forward, up) to the world.
+        """A TUM file in mitsonar's convention: the quaternion turns (starboard, forward, up) to the world.
 
         Raises:
             MitsonarError: unreadable file, or a broken line, with its number.
         """
-        try:
-            lines = Path(path).read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not text"
-            raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM file") from None
-        rows: list[list[float]] = []
-        for number, line in enumerate(lines, start=1):
-            if line.strip() and not line.lstrip().startswith("#"):
-                rows.append(_tum_row(path, number, line))
-                if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
-                    raise MitsonarError(
-                        f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:g} s after "
-                        f"{rows[-2][0]:g} s; sort the lines"
-                    )
-        if not rows:
-            raise MitsonarError(f"trajectory {path} holds no pose: give lines of `time x y z qx qy qz qw`")
-        table = np.array(rows)
-        return cls(poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:])), table[:, 0])
+        table = read_tum(path, CONVENTIONS["mitsonar"])
+        return cls(_posed(table, CONVENTIONS["mitsonar"]), table[:, 0])
 
     def save_tum(self, path: str | Path) -> None:
-        """Write a TUM file; :meth:`load_tum` reads it back to 1e-9."""
+        """Write a TUM file in mitsonar's convention; :meth:`load_tum` reads it back to 1e-9."""
         quaternions = vehicle_rotation(self.poses).as_quat(canonical=True)
-        table = np.column_stack([self.time_s, self.poses[:, :3], quaternions])
-        np.savetxt(path, table, fmt="%.9f", header="time_s x y z qx qy qz qw (starboard, forward, up to world)")
+        write_tum(path, np.column_stack([self.time_s, self.poses[:, :3], quaternions]), CONVENTIONS["mitsonar"])
 
 
-def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
-    try:
-        row = [float(word) for word in line.split()]
-    except ValueError:
-        row = []
-    if len(row) != 8 or not np.isfinite(row).all() or np.linalg.norm(row[4:]) < 1e-6:
-        raise MitsonarError(
-            f"trajectory {path}, line {number}: expected `time x y z qx qy qz qw` as finite numbers with a "
-            f"quaternion other than zero, got {line.strip()[:60]!r}"
-        )
-    return row
+def _posed(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
+    """Poses ``(n, 6)`` of times, positions and quaternions ``(n, 8)`` in a convention."""
+    if convention.name == "mitsonar":
+        return poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:]))
+    return poses_from(*convention.to_ours(table[:, 1:4], Rotation.from_quat(table[:, 4:])))
+
+
+def _posed_by_angles(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
+    """Poses ``(n, 6)`` of times, positions, pitch, roll and turn about the vertical ``(n, 7)`` in a convention."""
+    position, _ = convention.to_ours(table[:, 1:4], Rotation.identity(len(table)))
+    return np.column_stack([position, convention.angles_to_ours(table[:, 4:])])
+
+
+def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], frame: str, looks_ahead: bool) -> None:
+    """Warn where most frames would look sideways or at the sky; ``read`` has the poses by convention."""
+    share = {name: sideways_or_up(poses, looks_ahead=looks_ahead).mean() for name, poses in read.items()}
+    if share[frame] <= 0.5:
+        return
+    others = [name for name in read if name != frame and share[name] <= 0.5]
+    better = f"read as {' or '.join(others)} it would not" if others else "nor would it look down in another convention"
+    pitch, roll, heading = np.degrees(read[frame][0, 3:])
+    count = round(share[frame] * len(read[frame]))
+    warnings.warn(
+        f"the sonar looks sideways or at the sky in {count} of {len(read[frame])} frames of {path}, read as {frame} (first "
+        f"pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's convention by "
+        f"--frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
+        MitsonarWarning,
+        stacklevel=3,
+    )

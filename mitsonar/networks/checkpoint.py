@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from mitsonar.datasets.arrangement import LABELS, Labels
 from mitsonar.datasets.batches import Batches
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, meant, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import write_whole
@@ -277,6 +277,7 @@ class Checkpoint:
         except FileNotFoundError:
             raise MitsonarError(
                 f"no checkpoint {path}: give a {FILE}, the folder of `mitsonar train`, or {' or '.join(SHIPPED)}"
+                f"{meant(path, SHIPPED)}"
             ) from None
         return cls.from_bytes(content, str(path))
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
 from mitsonar.motion.pose import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses
@@ -95,6 +95,7 @@ class ChannelSimulator:
 
         self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer)
         self.notes = self.tracer.notes
+        self.reset()
 
     def responses(
         self, flown: Trajectory, velocity: ArrayLike | None = None, progress: Callable[[int], None] = lambda pings: None
@@ -126,6 +127,36 @@ class ChannelSimulator:
             echoes=np.concatenate([part.echoes for part in parts]),
             dropped=np.concatenate([part.dropped for part in parts]),
         )
+
+    def step(self, pose: ArrayLike, velocity: ArrayLike, *, time_s: float | None = None) -> ImpulseResponses:
+        """Measure the next ping of a closed loop.
+
+        Stepping over the poses and velocities of a trajectory gives what :meth:`responses` gives for it, bit for bit. The
+        velocity is told each time: one pose alone does not say it. Nothing is drawn anew for a ping, and responses have no
+        gain: only the pings are counted, for their times.
+
+        Args:
+            pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
+            velocity: in the vehicle's axes ``(4,)``, starboard, forward, up [m/s], turn to starboard [rad/s].
+            time_s: of the ping [s]; default: its number / ``frame_rate_hz``.
+
+        Returns:
+            One ping.
+
+        Raises:
+            MitsonarError: not one pose, or a velocity that cannot be.
+        """
+        table = np.atleast_2d(np.asarray(pose, dtype=float))
+        if table.shape != (1, 6):
+            raise MitsonarError(f"a step takes one pose x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
+        time = self._stepped / self.sonar.frame_rate_hz if time_s is None else time_s
+        made = self.responses(Trajectory(table, np.array([time])), velocity)
+        self._stepped += 1
+        return made
+
+    def reset(self) -> None:
+        """Begin a new loop: the next :meth:`step` is ping 0."""
+        self._stepped = 0
 
     def pings(self, poses: ArrayLike, velocity: ArrayLike | None = None, *, first: int = 0) -> Iterator[Channels]:
         """Responses of consecutive pings, some at a time: memory does not grow with their number.
@@ -263,12 +294,13 @@ def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDAr
         table = np.repeat(table, pings, axis=0)
     if table.shape != (pings, 4) or not np.isfinite(table).all():
         raise MitsonarError(
-            f"velocity must be finite numbers (pings, 4) = ({pings}, 4), starboard, forward, up in m/s and turn in rad/s: "
-            f"got {table.shape}"
+            f"{argument('velocity')} must be finite numbers (pings, 4) = ({pings}, 4), starboard, forward, up in m/s and "
+            f"turn in rad/s: got {table.shape}"
         )
     fastest, most = float(np.linalg.norm(table[:, :3], axis=1).max(initial=0)), 0.1 * sound_speed
     if fastest > most:
         raise MitsonarError(
-            f"velocity is in m/s and must stay below a tenth of the sound speed, {most:g} m/s: got {fastest:g} m/s"
+            f"{argument('velocity')} is in m/s and must stay below a tenth of the sound speed, {most:g} m/s: got "
+            f"{fastest:g} m/s"
         )
     return table

@@ -18,6 +18,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames
 from mitsonar.simulation.variant import ensure_variant, garbage_stays
 
 if TYPE_CHECKING:
@@ -63,6 +64,9 @@ class Simulator:
         views: makes the images of a ping from its echoes; default: one, of all of them.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
+    Attributes:
+        gain: of the closed loop that :meth:`step` renders; None before its first ping.
+
     Raises:
         MitsonarError: no sonar given and none in the scene.
     """
@@ -96,6 +100,8 @@ class Simulator:
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
         self.pings_per_launch = max(1, rays_per_launch // max(sonar.rays, cells))
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
+        self._stepped, self._gain_from, self._told = 0, "", set[str]()
+        self.gain: float | None = None
 
     def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
         """Levels of consecutive pings in the first view; see :meth:`looks`."""
@@ -212,9 +218,10 @@ class Simulator:
             poses = np.atleast_2d(np.asarray(trajectory, dtype=float))
             trajectory = Trajectory(poses, np.arange(len(poses)) / self.sonar.frame_rate_hz)
         batches = self.pings(trajectory.poses, labels=labels)
+        calibrated = gain is None
         if gain is None:
             gain, batches = constant_gain(batches)
-        tally = Tally(self.sonar)
+        tally = Tally(self.sonar) if calibrated else Tally(self.sonar, "as given")
         images, heights, truth = [], [], []
         for pings in batches:
             image = to_image(pings, gain)
@@ -237,6 +244,80 @@ class Simulator:
             level_scale=1 / gain,
             **labelled,
         )
+
+    def step(
+        self,
+        pose: ArrayLike,
+        *,
+        time_s: float | None = None,
+        noise: NoiseModel | None = None,
+        seed: int = 0,
+        labels: bool = False,
+        gain: float | None = None,
+    ) -> SonarFrames:
+        """Render the next ping of a closed loop, in which each pose follows from the frame before it.
+
+        The simulator counts its pings, so that each draws its own jitter and noise, and keeps one gain. Stepping over poses
+        gives the images that ``render(poses, gain=simulator.gain)`` gives afterwards, bit for bit. Where no gain is given,
+        the first frame with echoes sets it (:meth:`render` uses 20 frames); frames before that one are black, with a gain of
+        1. Each warning of :meth:`render` is given once in a loop. :meth:`reset` begins a new loop.
+
+        Args:
+            pose: of the sonar: x, y, z [m], pitch, roll, heading [rad].
+            time_s: of the ping [s]; default: its number / ``frame_rate_hz``.
+            noise: drawn from (seed, number of the ping, cell); default none.
+            seed: of the noise; the jitter's is the sonar's.
+            labels: per-pixel truth as well.
+            gain: the constant that levels are multiplied by; default: set on the first frame with echoes.
+
+        Returns:
+            One frame.
+
+        Raises:
+            MitsonarError: not one pose; a gain other than that of the steps before.
+        """
+        table = np.atleast_2d(np.asarray(pose, dtype=float))
+        if table.shape != (1, 6):
+            raise MitsonarError(f"a step takes one pose x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
+        if gain is not None and self.gain is not None and gain != self.gain:
+            raise MitsonarError(
+                f"a loop keeps its gain, {self.gain:g}: got {gain:g}; leave gain out, or call reset() to begin a new loop"
+            )
+        number = self._stepped
+        (pings,) = self.pings(table, first=number, labels=labels)
+        if self.gain is None and (gain is not None or pings.levels.any()):
+            self._gain_from = "set on the first frame with echoes" if gain is None else "as given"
+            self.gain = constant_gain([pings])[0] if gain is None else gain
+        kept = 1.0 if self.gain is None else self.gain
+        self._stepped = number + 1
+        image = to_image(pings, kept)
+        self._warn_once(pings, image, table)
+        return SonarFrames(
+            image=image if noise is None else noise.apply(image, seed=seed, frames=np.array([number])),
+            range_m=self.sonar.range_m,
+            bearing_rad=self.sonar.bearing_rad,
+            time_s=np.array([number / self.sonar.frame_rate_hz if time_s is None else time_s]),
+            sonar=self.sonar,
+            poses=table,
+            height_m=pings.height_m,
+            level_scale=1 / kept,
+            **pings.labels,
+        )
+
+    def reset(self) -> None:
+        """Begin a new loop: the next :meth:`step` is ping 0, sets the gain anew, and may warn again."""
+        self._stepped = 0
+        self._gain_from, self.gain = "", None
+        self._told.clear()
+
+    def _warn_once(self, pings: Pings, image: NDArray[np.float32], pose: NDArray[np.float64]) -> None:
+        """Warn of what a step shows, each kind once in a loop."""
+        tally = Tally(self.sonar, self._gain_from)
+        tally.add(pings, image)
+        found = {note: note for note in self.notes} | tally.findings(self, pose, pings.first)
+        for kind in [kind for kind in found if kind not in self._told]:
+            self._told.add(kind)
+            warnings.warn(found[kind], MitsonarWarning, stacklevel=3)
 
 
 def constant_gain(batches: Iterable[Pings]) -> tuple[float, Iterator[Pings]]:
@@ -291,20 +372,30 @@ class Tally:
     """What a run adds up to warn of."""
 
     sonar: Sonar
+    gain_from: str = "set on the first 20 frames"
     frames: int = 0
     rays: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("inside", "nearer", "farther", "missed"), 0))
     pixels: int = 0
     filled: int = 0
     saturated: int = 0
     worst: tuple[int, int] = (0, 0)
+    empty: int = 0
+    first_empty: tuple[int, ...] = ()
+    """Number of the first empty frame, then of its rays those inside the window, nearer, farther, missed."""
 
     def add(self, pings: Pings, image: NDArray[np.float32]) -> None:
         """Count a batch; ``image`` before noise."""
         self.frames += len(pings)
+        filled = np.count_nonzero(image, axis=(1, 2))
+        empty = np.flatnonzero(filled < NEARLY_EMPTY * image[0].size)
+        if len(empty) and not self.empty:
+            rays = (int(getattr(pings.counts, name)[empty[0]].sum()) for name in self.rays)
+            self.first_empty = (pings.first + int(empty[0]), *rays)
+        self.empty += len(empty)
         for name in self.rays:
             self.rays[name] += int(getattr(pings.counts, name).sum())
         self.pixels += image.size
-        self.filled += int(np.count_nonzero(image))
+        self.filled += int(filled.sum())
         self.saturated += int(np.count_nonzero(image >= 1))
         outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1)
         if outside.max() > self.worst[0]:
@@ -312,41 +403,52 @@ class Tally:
 
     def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
         """A sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
+        return list(self.findings(source, poses).values())
+
+    def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0) -> dict[str, str]:
+        """The sentences of :meth:`warnings`, each by the name of what it is about.
+
+        Args:
+            source: finds the ranges of the worst frame.
+            poses: of the frames ``(frames, 6)``.
+            first: number of the first of them.
+        """
         sonar, rays = self.sonar, self.rays
         outside = rays["nearer"] + rays["farther"]
         hits = rays["inside"] + outside
-        sentences = []
-        if hits == 0:
-            sentences.append(
-                f"no ray hit anything in {self.frames} frames: check the pose (x, y, z in m; pitch > 0 looks down) and "
-                "the scene's units"
-            )
+        found = {}
+        if self.empty:
+            number, *its_rays = self.first_empty
+            pose = poses[number - first]
+            window = (sonar.range_min, sonar.range_max)
+            beside = source.window_range(pose, number)
+            found["empty"] = empty_frames(self.empty, self.frames, (number, pose), its_rays, window, beside)
         if outside > 0:
             frame = self.worst[1]
-            found = source.window_range(poses[frame], frame)
-            where = f", in frame {frame} at {found[0]:.2f}..{found[1]:.2f} m" if found else ""
-            sentences.append(
+            ends = source.window_range(poses[frame - first], frame)
+            where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""
+            found["window"] = (
                 f"{outside:,} of {hits:,} returns ({100 * outside / hits:.2g} %) lie outside the window "
                 f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen the window if they matter"
             )
         if self.saturated > 0.01 * self.pixels:
-            sentences.append(
-                f"{100 * self.saturated / self.pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, set "
-                "on the first 20 frames, is too high for the rest"
+            found["saturated"] = (
+                f"{100 * self.saturated / self.pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, "
+                f"{self.gain_from}, is too high for the rest"
             )
         if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:
-            sentences.append(
+            found["rays"] = (
                 f"{rays['inside'] / self.filled:.1f} rays a bin on average, below 10: point deposits make the levels "
                 "noisy; raise rays_per_beam, lower range_bins, or use the model physical"
             )
-        return sentences
+        return found
 
     def state(self) -> dict[str, Any]:
         """As JSON can hold it; :meth:`restore` reads it back."""
-        names = ("frames", "rays", "pixels", "filled", "saturated", "worst")
+        names = ("frames", "rays", "pixels", "filled", "saturated", "worst", "empty", "first_empty")
         return {name: getattr(self, name) for name in names}
 
     @classmethod
     def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
         """The tally of a run that was broken off."""
-        return cls(sonar, **{**state, "worst": tuple(state["worst"])})
+        return cls(sonar, **{**state, "worst": tuple(state["worst"]), "first_empty": tuple(state["first_empty"])})

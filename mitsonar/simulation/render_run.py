@@ -55,6 +55,8 @@ class Outputs:
     labels: bool = False
     cartesian: bool = False
     exr: bool = False
+    frame: str = "mitsonar"
+    """The convention of ``poses.tum``."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ def run(
     folder = Path(folder)
     recipe = _recipe(source, trajectory, outputs, origin)
     state = begin(folder, recipe, "frames", overwrite=overwrite, resume=resume)
-    trajectory.save_tum(folder / "poses.tum")
+    trajectory.save(folder / "poses.tum", outputs.frame)
     if not state["finished"]:
         progress(int(state["frames_done"]))
         store = _make_frames(source, trajectory, folder, outputs, state, progress)
@@ -224,6 +226,7 @@ def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: di
         "labels": outputs.labels,
         "cartesian": outputs.cartesian,
         "exr": outputs.exr,
+        "frame": outputs.frame,
     }
 
 

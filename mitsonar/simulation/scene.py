@@ -63,7 +63,7 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
         # merged meshes would lose their ids; in parallel, one load in some 150 failed on a good file, and none is faster
         scene = mi.load_file(str(path), optimize=False, parallel=False, **texts)
     except Exception as error:
-        raise MitsonarError(f"cannot load scene {path}: {_reason(error)}") from error
+        raise MitsonarError(f"cannot load scene {path}: {_reason(error)}{_parameters(path, error)}") from error
     if not isinstance(scene, mi.Scene):
         raise MitsonarError(f"{path} holds a {type(scene).__name__.lower()}, not a scene: wrap it in <scene>")
     return scene
@@ -83,6 +83,15 @@ def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pos
 
     found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
     return (found[index].sonar, found[index].pose) if index < len(found) else None
+
+
+def _parameters(path: Path, error: BaseException) -> str:
+    """What parameters a scene has, where it was given others."""
+    wrong = re.search(r"unused parameters:\s*-?\s*\$(\w+)", str(error))
+    if wrong is None:
+        return ""
+    known = re.findall(r"<default\s+name=[\"'](\w+)[\"']", path.read_text(encoding="utf-8", errors="replace"))
+    return f"; {nearest_names(wrong[1], known)}" if known else "; the scene has no parameters"
 
 
 def _reason(error: BaseException) -> str:

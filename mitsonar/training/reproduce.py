@@ -20,7 +20,7 @@ from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe, training_recipe_from
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, argument, complaint
 from mitsonar.io.storage import Storage
 from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
@@ -77,7 +77,7 @@ class Effort:
         if not 0 < self.scale <= 1:
             raise MitsonarError(f"scale is a part of the thesis's data, above 0 and at most 1: got {self.scale:g}")
         if self.minutes is not None and not (self.minutes > 0 and math.isfinite(self.minutes)):
-            raise MitsonarError(f"minutes of training of a row must be above 0: got {self.minutes:g}")
+            raise MitsonarError(f"{argument('minutes')} of training of a row must be above 0: got {self.minutes:g}")
         if self.batch is not None and self.batch < 1:
             raise MitsonarError(f"a batch has 1 sample or more: got {self.batch}")
 

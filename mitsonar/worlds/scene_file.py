@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mitsonar.errors import MitsonarError
@@ -27,6 +29,18 @@ class SceneFile(Family):
     @property
     def seeded(self) -> bool:
         return False
+
+    def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Refuse a ``size_m`` whose square reaches beyond all that the file holds: frames there would be empty."""
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise MitsonarError(f"{self.file} holds nothing that a sonar could see: give a scene with shapes")
+        fits = 2 * max(0.0, float(min(-low[0], -low[1], high[0], high[1])))
+        if self.size_m > fits * (1 + 1e-3):
+            raise MitsonarError(
+                f"world.size_m, {self.size_m:g} m, is larger than what {self.file} holds, x {low[0]:.3g}..{high[0]:.3g} m "
+                f"and y {low[1]:.3g}..{high[1]:.3g} m: frames taken beyond it would be empty; give at most {fits:.3g} (a "
+                "square around the origin), or a larger ground"
+            )
 
     def build(self, seed: int) -> World:
         raise MitsonarError(f"{self.file} is a scene already: there is nothing to build")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument, meant
 from mitsonar.worlds.world import Floor, Mesh, Standpoint, World
 
 __all__ = ["FORMATS", "mesh_world"]
@@ -63,11 +64,11 @@ def mesh_world(
     path = Path(path)
     up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
     if up not in UP:
-        raise MitsonarError(f"up must be x, y or z: got {up!r}")
+        raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{meant(up, UP)}")
     if not (np.isfinite(scale) and scale > 0):
-        raise MitsonarError(f"scale must be a finite number above 0, metres a unit of the file: got {scale:g}")
+        raise MitsonarError(f"{argument('scale')} must be a finite number above 0, metres a unit of the file: got {scale:g}")
     if floor_m is not None and not 0 < floor_m <= 10_000:
-        raise MitsonarError(f"floor_m must lie in 0..10000 m: got {floor_m:g}")
+        raise MitsonarError(f"{argument('floor_m')} must lie in 0..10000 m: got {floor_m:g}")
     value = _value(reflectivity)
     pieces = [_piece(geometry, value) for geometry in _geometries(path)]
     turn = np.array(UP[up], dtype=float) * scale
@@ -107,7 +108,10 @@ def _value(reflectivity: str | float) -> str | float:
     except ValueError:
         number = np.nan
     if not 0 <= number <= 1:
-        raise MitsonarError(f"reflectivity must be red, luminance or a number 0..1: got {reflectivity!r}")
+        raise MitsonarError(
+            f"{argument('reflectivity')} must be red, luminance or a number 0..1: got {reflectivity!r}"
+            f"{meant(reflectivity, ('red', 'luminance'))}"
+        )
     return number
 
 
@@ -118,6 +122,11 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
     if path.suffix.lower() not in FORMATS:
         raise MitsonarError(
             f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}"
+        )
+    if path.suffix.lower() == ".dae" and find_spec("collada") is None:
+        raise MitsonarError(
+            f"cannot read {path}: COLLADA needs the package pycollada, which is not installed; pip install "
+            "'mitsonar[meshes]', or export the model as glb, obj, stl or ply"
         )
     try:
         scene = trimesh.load_scene(path, process=False)

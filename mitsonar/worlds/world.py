@@ -57,6 +57,17 @@ class Family(BaseModel):
         """The world of a seed; the same bytes for the same seed."""
         raise NotImplementedError
 
+    def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Refuse a scene that is smaller than what its frames are taken from; a world that is built is as large as it says.
+
+        Args:
+            low: least x, y, z of all that the scene holds ``(3,)`` [m].
+            high: largest ``(3,)`` [m].
+
+        Raises:
+            MitsonarError: it is smaller.
+        """
+
     def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
         """Write the world of a seed into a new folder; the XML file, and the parameters to load it with."""
         return self.build(seed).write(folder), {}

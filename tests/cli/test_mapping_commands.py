@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping.odometry_run import OdometryFolder
 from mitsonar.mapping.trajectory_smoothing import path_of
 from mitsonar.motion.pose import Pose, Trajectory, motions
 from mitsonar.records.sonar_frames import SonarFrames
@@ -274,3 +275,30 @@ def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path
     frames.save(tmp_path / "bare.npz")
     refused(mitsonar("mosaic", tmp_path / "bare.npz", "true", "-o", out), "where the sonar was")
     assert not list(tmp_path.glob("*.png"))
+
+
+def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
+    """Paths are the same ones, the mosaic too; a folder remembers its own convention."""
+    for frame in ("mitsonar", "ros-enu", "ned"):
+        out = tmp_path / frame
+        done = mitsonar("odometry", drawn, "-o", out, "--estimator", "zero", "--frame", frame)
+        assert done.returncode == 0, done.stderr
+        path = OdometryFolder.open(out).true
+        assert path is not None
+        np.testing.assert_allclose(path.poses, SonarFrames.load(drawn).poses, atol=1e-7)
+        options = ["--frame", "mitsonar" if frame == "ned" else frame]  # which is for files, not for a folder
+        done = mitsonar("mosaic", drawn, out, "-o", tmp_path / f"{frame}.tif", "--cell-mm", 20, *options)
+        assert done.returncode == 0, done.stderr
+        done = mitsonar(
+            *("mosaic", drawn, out / "true.tum", "-o", tmp_path / f"{frame}-true.tif", "--cell-mm", 20, "--frame", frame)
+        )
+        assert done.returncode == 0, done.stderr
+    for ending in (".tif", "-true.tif"):
+        wanted, _ = bands(tmp_path / f"mitsonar{ending}")
+        for frame in ("ros-enu", "ned"):
+            np.testing.assert_allclose(bands(tmp_path / f"{frame}{ending}")[0], wanted, atol=1e-3)
+    refused(
+        mitsonar("mosaic", drawn, tmp_path / "ned" / "true.tum", "-o", tmp_path / "x.tif"),
+        "says that it is ned, and --frame mitsonar is asked",
+    )
+    refused(mitsonar("odometry", drawn, "-o", tmp_path / "y", "--frame", "nde"), "unknown frame 'nde'", "did you mean ned?")

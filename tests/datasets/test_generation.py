@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from pathlib import Path
@@ -388,8 +389,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
     )
     workers: list[subprocess.Popen[bytes]] = []
     try:
-        _wait(place.exists, 30)
-        address = json.loads(place.read_text())["address"]
+        address = _written(place, 30)["address"]
         worker = [
             sys.executable,
             "-m",
@@ -413,6 +413,33 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
             process.kill()
             process.wait()
     assert files_of(tmp_path / "tiny.zarr") == files_of(made)
+
+
+def _written(path: Path, seconds: float) -> dict[str, Any]:
+    """What another process writes as JSON, once it has written all of it: the file is there before its content."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return dict(json.loads(path.read_text()))
+        except (FileNotFoundError, json.JSONDecodeError):
+            assert time.monotonic() < deadline, f"{path.name} was not written in time"
+            time.sleep(0.05)
+
+
+def test_a_file_that_is_still_being_written_is_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "scheduler.json"
+
+    def write_slowly() -> None:
+        for text in ("", '{"address": "tcp', '{"address": "tcp://here"}'):
+            time.sleep(0.15)
+            path.write_text(text)
+
+    writer = threading.Thread(target=write_slowly)
+    writer.start()
+    assert _written(path, 30) == {"address": "tcp://here"}
+    writer.join()
+    with pytest.raises(AssertionError, match="not written in time"):
+        _written(tmp_path / "never.json", 0.1)
 
 
 def _wait(until: Any, seconds: float) -> None:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn_frames import over_ground, sway
 from helpers import Command, refused, run_python, tiny_recipe
-from test_odometry import over_ground, sway
 
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["Pings", "assumed_height", "pings_of", "reach_of"]
@@ -78,9 +78,10 @@ def assumed_height(responses: ImpulseResponses, name: str, height_m: float | Non
     elif responses.height_m is not None:
         height = float(np.mean(responses.height_m))
     else:
-        raise MitsonarError(f"{name} needs the height over the ground: the responses hold none; give height_m")
+        raise MitsonarError(f"{name} needs the height over the ground: the responses hold none; give {argument('height_m')}")
     if not 0 < height < responses.sonar.range_max:
         raise MitsonarError(
-            f"{name}: height_m must be above 0 and below range_max {responses.sonar.range_max:g} m: got {height:g} m"
+            f"{name}: {argument('height_m')} must be above 0 and below range_max {responses.sonar.range_max:g} m: got "
+            f"{height:g} m"
         )
     return height

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.height.floor_profile import FloorProfile
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import SEGMENTS, Segment, Whole
@@ -145,7 +145,7 @@ class DirectHeight:
         pose = None if frame.poses is None else frame.poses[0]
         pitch = self.pitch_rad if self.pitch_rad is not None else (None if pose is None else float(pose[3]))
         if pitch is None or not np.isfinite(pitch):
-            raise MitsonarError("the height needs the pitch: the frames lack poses; give pitch_deg")
+            raise MitsonarError(f"the height needs the pitch: the frames lack poses; give {argument('pitch_deg')}")
         roll = 0.0 if pose is None or not np.isfinite(pose[4]) else float(pose[4])
         views = tuple(frame.values) if isinstance(frame, ViewFrames) else ()
         pitch, roll = round(pitch, 3), round(roll, 3)

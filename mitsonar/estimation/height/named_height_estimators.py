@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, meant
 from mitsonar.estimation.height.direct_height import DirectHeight, HeightEstimator
 from mitsonar.estimation.named_estimators import load_checkpoint, names_checkpoint, options_from
 
@@ -21,7 +21,10 @@ def height_estimator_from(text: str) -> HeightEstimator:
     if name == "direct":
         return DirectHeight(**options_from(name, words, DirectHeight))
     if not names_checkpoint(name):
-        raise MitsonarError(f"heights are told by direct, or by the checkpoint or folder of a training: got {name!r}")
+        raise MitsonarError(
+            "heights are told by direct, or by the checkpoint or folder of a training: got "
+            f"{name!r}{meant(name, ['direct'])}"
+        )
     checkpoint = load_checkpoint(name)
     from mitsonar.estimation.height.height_network import HeightNetwork
 

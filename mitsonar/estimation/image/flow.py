@@ -149,7 +149,7 @@ class Flow:
         if self.match not in ("map", "vector"):
             raise MitsonarError(f"match must be map or vector: got {self.match!r}")
         if self.height_m is not None and not self.height_m > 0:
-            raise MitsonarError(f"the height must be above 0: got {self.height_m:g} m; give height_m over the ground")
+            raise MitsonarError(f"the height must be above 0: got {self.height_m:g} m; give that over the ground")
         if self.height_std is not None and not self.height_std >= 0:
             raise MitsonarError(f"height_std must be 0 or more, a part of the height: got {self.height_std:g}")
 

@@ -1,0 +1,82 @@
+"""What to say of frames without echoes: where the sonar is, where it looks, what its rays met, what may be wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.motion.pose import vehicle_rotation
+
+__all__ = ["NEARLY_EMPTY", "angle_hint", "empty_frames", "view_of"]
+
+NEARLY_EMPTY = 1e-4
+"""A frame with a smaller part of its pixels filled is said to be empty: 5 pixels of 512 x 96."""
+
+
+def empty_frames(
+    empty: int,
+    frames: int,
+    first: tuple[int, NDArray[np.float64]],
+    rays: Sequence[int],
+    window: tuple[float, float],
+    found: tuple[float, float] | None,
+) -> str:
+    """One sentence on empty frames.
+
+    Args:
+        empty: how many frames hold no echo, or hardly one (:data:`NEARLY_EMPTY`).
+        frames: how many there are.
+        first: number of the first of the empty ones and its pose ``(6,)`` [m, rad].
+        rays: of that frame, how many met something inside the window, nearer, farther, and nothing.
+        window: nearest and farthest range that is shown [m].
+        found: nearest and farthest return outside the window in that frame [m]; None where there is none.
+    """
+    number, pose = first
+    hint = angle_hint(pose)
+    if not any(rays[:3]):
+        check = "check the pose (x, y, z in m; pitch > 0 looks down) and the scene's units"
+        said = f"no ray hit anything in {empty} frames: {check}; in frame {number} {view_of(pose)}"
+        return f"{said}; {hint}" if hint else said
+    inside, nearer, farther, missed = (100 * count / sum(rays) for count in rays)
+    beside = f" (returns at {found[0]:.3g}..{found[1]:.3g} m)" if found else ""
+    check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
+    return (
+        f"{empty} of {frames} frames are empty, frame {number} first: {inside:.2g} % of its rays meet something within the "
+        f"window {window[0]:g}..{window[1]:g} m, {nearer:.2g} % nearer, {farther:.2g} % farther{beside}, {missed:.2g} % "
+        f"nothing; {view_of(pose)}; {hint or check}"
+    )
+
+
+def view_of(pose: NDArray[np.float64]) -> str:
+    """Where a sonar is and where it looks, in words."""
+    forward = vehicle_rotation(pose).apply([0.0, 1.0, 0.0])[0]
+    below = math.degrees(math.asin(float(np.clip(-forward[2], -1, 1))))
+    level = (
+        "along the horizon" if abs(below) < 0.05 else f"{abs(below):.3g} deg {'below' if below > 0 else 'above'} the horizon"
+    )
+    axis = ", ".join(f"{value:.2f}" for value in forward + 0.0)
+    return f"the sonar is at ({', '.join(f'{value:g}' for value in pose[:3])}) m and looks {level}, along ({axis})"
+
+
+def angle_hint(pose: NDArray[np.float64]) -> str:
+    """What may be wrong with the angles of an empty frame: the other unit, or a view upwards; nothing where neither shows.
+
+    Args:
+        pose: x, y, z [m], pitch, roll, heading [rad].
+    """
+    angles = np.asarray(pose, dtype=float)[3:]
+    largest = float(np.abs(angles).max())
+    degrees = ", ".join(f"{value:.3g}" for value in np.degrees(angles))
+    if largest > 2 * math.pi:
+        given = ", ".join(f"{value:.3g}" for value in angles)
+        return (
+            f"its pitch, roll, heading are {given} rad, more than a full turn: were degrees given where radians are meant?"
+        )
+    if 0 < math.degrees(largest) <= 2 * math.pi:
+        return f"its pitch, roll, heading are only {degrees} deg: were radians given where degrees are meant?"
+    if angles[0] < -math.radians(1):
+        return f"its pitch is {math.degrees(angles[0]):.3g} deg, and pitch > 0 looks down: check its sign"
+    return ""

@@ -1,0 +1,186 @@
+"""What the command line answers to slips: the nearest name, the option that was typed, commands that can be pasted."""
+
+from __future__ import annotations
+
+import pickle
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+from drawn_frames import over_ground, sway
+from helpers import Command, refused
+
+from mitsonar.cli.console import OPTIONS, command_line
+from mitsonar.errors import MitsonarError, argument, meant
+from mitsonar.geometry.attitude import attitude_of
+
+AMPHORA = Path(__file__).parents[1] / "scenes" / "meshes" / "amphora.ply"
+
+SLIPS = [
+    ("render flat_floor --noise hgih", "got 'hgih'; did you mean high?"),
+    ("render flat_flor", "did you mean flat_floor?"),
+    ("render flat_floor --model physicl", "--model: input should be 'physical' or 'thesis'", "did you mean physical?"),
+    ("render flat_floor --sonar didson30", "did you mean didson300?"),
+    ("render flat_floor --trajectory shiped", "did you mean shipped?"),
+    ("render flat_floor --frame end", "unknown frame 'end' of poses: did you mean ned?"),
+    ("render pattern -D textur=rings", "did you mean texture?"),
+    ("render flat_floor -D cells=3", "unused parameters: - $cells=3"),
+    ("impulse hydrophones --trajectory squar", "did you mean square?"),
+    ("impulse hydrophones --model scaterers", "--model: input should be", "did you mean scatterers?"),
+    ("impulse hydrophones --set receivers=forwrd", "chooses of the receivers"),
+    ("limit flat_floor --segments stabord", "did you mean starboard?"),
+    ("limit flat_floor --vary hight_m=2", "did you mean height_m?"),
+    ("dataset recipes rocky-feild", "did you mean rocky-field"),
+    ("dataset make rocky-field --set flight.kind=runz", "recipe flight.kind: input", "did you mean runs?"),
+    ("dataset make rocky-field --set store=image", "recipe store: input should be", "did you mean images?"),
+    ("dataset make rocky-field --set labels=[shadwo]", "did you mean shadow?"),
+    ("dataset make rocky-field --set world.family=pattrn", "did you mean pattern?"),
+    ("dataset make rocky-field --set split.by=scenes", "did you mean scene?"),
+    ("height none.npz --by drect", "got 'drect'; did you mean direct?"),
+    ("mosaic none.npz treu", "or `true`; did you mean true?"),
+    (f"world mesh {AMPHORA} --reflectivity luminence", "--reflectivity must be", "did you mean luminance?"),
+]
+
+
+@pytest.mark.parametrize(("typed", "words"), [(slip[0], slip[1:]) for slip in SLIPS], ids=[slip[0] for slip in SLIPS])
+def test_the_nearest_name_is_asked_for(mitsonar: Command, tmp_path: Path, typed: str, words: tuple[str, ...]) -> None:
+    out = ["-o", tmp_path / "out.png"] if typed.startswith("mosaic") else ["-o", tmp_path / "out"]
+    out = [] if typed.split()[0] in ("limit", "height") or "recipes" in typed else out
+    refused(mitsonar(*shlex.split(typed), *out), *words)
+
+
+@pytest.mark.learn
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        ("evaluate corrent none.zarr", "or corrnet; did you mean corrnet?"),
+        ("train posenet-hul -o x", "did you mean posenet-hull"),
+        ("reproduce 3.22 -o x", "did you mean 3.2"),
+    ],
+)
+def test_the_nearest_name_of_trained_things(mitsonar: Command, tmp_path: Path, typed: str, words: str) -> None:
+    refused(mitsonar(*typed.split(), cwd=tmp_path), words)
+
+
+@pytest.mark.parametrize(
+    "typed", ["rendr flat_floor", "dataset mak x", "world rocky-feild -o x", "render flat_floor --sonra x"]
+)
+def test_commands_and_options_have_neighbours_too(mitsonar: Command, typed: str) -> None:
+    done = mitsonar(*typed.split())
+    assert done.returncode == 2
+    said = " ".join(done.stderr.replace("│", " ").split())
+    assert any(
+        words in said
+        for words in ("Did you mean 'render'?", "Did you mean 'make'?", "Did you mean 'rocky-field'", "--sonar")
+    )
+
+
+# ---------------------------------------------------------------- options by the names that were typed
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        ("render flat_floor --seed -1", "error: --seed: input should be greater than or equal to 0"),
+        ("impulse hydrophones --velocity 400,0", "error: --velocity is in m/s and must stay below"),
+        ("limit flat_floor --height -1", "error: --height must be above 0"),
+        ("image nothing --range 5,4", "error: --range takes from,to in m, the near end first: got 5,4"),
+        ("mosaic none.npz true -o x.png --cell-mm -10", "error: --cell-mm must be above 0: got -0.01 m"),
+        ("mosaic none.npz true -o x.png --centre-beams 1", "error: --centre-beams must be at least 2"),
+        ("world rocky-field --size-m -1 -o x", "error: --size-m: input should be greater than 0"),
+        (f"world mesh {AMPHORA} -o x --up w", "error: --up must be x, y or z"),
+        (f"world mesh {AMPHORA} -o x --scale -1", "error: --scale must be a finite number"),
+        (f"world mesh {AMPHORA} -o x --floor-m -1", "error: --floor-m must lie in"),
+    ],
+)
+def test_options_are_named_as_they_were_typed(mitsonar: Command, tmp_path: Path, typed: str, words: str) -> None:
+    done = mitsonar(*shlex.split(typed), cwd=tmp_path)
+    refused(done)
+    assert words in done.stderr
+    assert "\x1f" not in done.stderr
+
+
+def test_what_frames_lack_is_asked_for_by_its_option(mitsonar: Command, tmp_path: Path) -> None:
+    frames = over_ground(sway(3))
+    frames.height_m, frames.poses = None, None
+    frames.save(tmp_path / "bare.npz")
+    refused(
+        mitsonar("odometry", tmp_path / "bare.npz", "-o", tmp_path / "o", "--estimator", "ecc"), "--height", "--pitch-deg"
+    )
+    refused(mitsonar("height", tmp_path / "bare.npz"), "give --pitch-deg")
+    refused(mitsonar("odometry", tmp_path / "bare.npz", "-o", tmp_path / "o", "--every", 0), "--every must be at least 1")
+    with pytest.raises(MitsonarError, match="give height_m and pitch_rad") as caught:
+        attitude_of(frames, "ecc", None, None)
+    assert "\x1f" not in str(caught.value)
+
+
+def test_arguments_have_their_python_names_but_for_who_typed_options() -> None:
+    error = MitsonarError(f"give {argument('height_m')} or {argument('sonar pitch_rad')}, not height_m")
+    for one in (error, pickle.loads(pickle.dumps(error))):
+        assert str(one) == "give height_m or sonar pitch_rad, not height_m"
+        assert one.said({"height_m": "--height"}) == "give --height or sonar pitch_rad, not height_m"
+        assert one.said({"pitch_rad": "--pitch-deg"}) == "give height_m or --pitch-deg, not height_m"
+
+
+def test_the_table_names_options_that_there_are() -> None:
+    """Every option of the table is one of its command."""
+    import typer
+
+    from mitsonar.cli import application
+
+    tree = typer.main.get_command(application())
+    for name, options in OPTIONS.items():
+        command = tree.commands["world"].get_command(None, "mesh") if name == "mesh" else tree.commands[name]
+        there = {option for parameter in command.params for option in parameter.opts}
+        assert {option for option in options.values() if option.startswith("--")} <= there, name
+
+
+def test_a_name_that_is_near_none_is_not_guessed() -> None:
+    assert meant("quartz", ["none", "low", "high"]) == ""
+    assert meant("", ["none"]) == ""
+    assert meant("NONE", ["none"]) == "; did you mean none?"
+
+
+# ---------------------------------------------------------------- commands that can be pasted
+
+
+def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> None:
+    """A folder with a space, a quote and a dollar sign."""
+    folder = tmp_path / "my world's $5"
+    done = mitsonar("world", "flat-objects", "--size-m", 4, "-o", folder)
+    assert done.returncode == 0, done.stderr
+    printed = done.stdout.partition("see it with: ")[2].strip()
+    words = subprocess.run(
+        ["sh", "-c", f'for word in {printed}; do echo "$word"; done'], capture_output=True, text=True, check=True
+    )
+    assert words.stdout.splitlines() == ["mitsonar", "render", str(folder / "scene.xml"), "--cartesian"]
+    assert command_line("dataset", "show", Path("a b.zarr")) == "mitsonar dataset show 'a b.zarr'"
+
+
+def test_a_data_sets_command_is_quoted(mitsonar: Command, tmp_path: Path) -> None:
+    told = ["--sequences", 1, "--workers", 1, "--set", "sonar.beams=4", "--set", "sonar.range_bins=16"]
+    told += ["--set", "world={family: flat-objects, size_m: 20}", "--set", "flight.jump_m=null"]
+    done = mitsonar("dataset", "make", "rocky-field", "-o", tmp_path / "a b.zarr", *told)
+    assert done.returncode == 0, done.stderr
+    assert shlex.split(done.stdout.partition("look at it: ")[2]) == [
+        "mitsonar",
+        "dataset",
+        "show",
+        str(tmp_path / "a b.zarr"),
+    ]
+
+
+# ---------------------------------------------------------------- COLLADA
+
+
+def test_a_collada_file_without_its_package_names_the_extra(
+    mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from mitsonar.worlds import user_mesh
+
+    monkeypatch.setattr(user_mesh, "find_spec", lambda name: None)
+    (tmp_path / "wreck.dae").write_text("<COLLADA/>")
+    done = mitsonar("world", "mesh", tmp_path / "wreck.dae", "-o", tmp_path / "w")
+    refused(done, "COLLADA needs the package pycollada", "pip install 'mitsonar[meshes]'", "glb, obj, stl or ply")
+    assert not (tmp_path / "w").exists()

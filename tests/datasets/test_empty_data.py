@@ -1,0 +1,93 @@
+"""Data sets whose sonar looks past the scene: refused where that can be known, else warned of and found by the check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from helpers import HEARD, TINY, Command, refused, tiny_recipe
+
+from mitsonar.config.data_recipe import load_recipe, recipe_from
+from mitsonar.datasets.data_check import check
+from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.plan import Scene
+from mitsonar.datasets.scene_rendering import loaded_world
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+GROUND = """<shape type="rectangle" id="ground"><transform name="to_world"><scale x="{half}" y="{half}"/></transform>
+  <bsdf type="diffuse"/></shape>"""
+BALL = """<shape type="sphere" id="{name}"><point name="center" x="{x}" y="{x}" z="0.1"/>
+  <float name="radius" value="0.1"/></shape>"""
+
+
+def scene_file(folder: Path, half: float, *far: float) -> Path:
+    """A ground of that half edge, and balls at these places, which make the scene larger than its ground."""
+    balls = "".join(BALL.format(name=f"ball{number}", x=x) for number, x in enumerate(far))
+    path = folder / "scene.xml"
+    path.write_text(f'<scene version="3.0.0">{GROUND.format(half=half)}{balls}</scene>')
+    return path
+
+
+def own_scene(path: Path, size_m: float, **changes: Any) -> Any:
+    """The tiny recipe in a scene of one's own, twelve frames in two sequences."""
+    world = {"family": "scene", "file": str(path), "size_m": size_m}
+    flight = {**TINY.get("flight", {}), "pings": 6, "jump_m": None}
+    return tiny_recipe(world=world, scenes=[{"count": 1, "sequences": 4}], flight=flight, **changes)
+
+
+@pytest.mark.parametrize("gain", [None, 3.0])
+def test_a_scene_smaller_than_its_recipe_says_is_refused_before_rendering(tmp_path: Path, gain: float | None) -> None:
+    path = scene_file(tmp_path, 4.0)
+    out = tmp_path / "x.zarr"
+    with pytest.raises(
+        MitsonarError, match=r"world.size_m, 30 m, is larger than what .*scene.xml holds, x -4..4 m and y"
+    ) as caught:
+        make_dataset(own_scene(path, 30.0, gain=gain), str(out))
+    assert "give at most 8 (a square around the origin)" in str(caught.value)
+    assert not (out / "zarr.json").exists()
+    loaded_world(own_scene(path, 8.0), Scene(0, 0, 0, 1))
+
+
+def test_impulse_responses_are_refused_likewise(tmp_path: Path) -> None:
+    world = {"family": "scene", "file": str(scene_file(tmp_path, 4.0)), "size_m": 30.0}
+    with pytest.raises(MitsonarError, match="is larger than what"):
+        make_dataset(recipe_from({**HEARD, "world": world}), str(tmp_path / "x.zarr"))
+
+
+@pytest.mark.parametrize("kind", ["images", "vectors", "both"])
+def test_empty_frames_are_warned_of_and_are_faults(tmp_path: Path, kind: str) -> None:
+    """Two balls far away: that the ground between them is small is not known before it is rendered."""
+    recipe = own_scene(scene_file(tmp_path, 3.0, -20.0, 20.0), 40.0, gain=1.0, store=kind)
+    made = make_dataset(recipe, str(tmp_path / "x.zarr"))
+    store = DataStore.open(tmp_path / "x.zarr")
+    names = {"images": ["image"], "vectors": ["vector"], "both": ["image", "vector"]}[kind]
+    empty = np.all([~store.read(name).reshape(24, -1).any(axis=1) for name in names], axis=0)
+    assert 0 < empty.sum() <= 24
+    wanted = f"{empty.sum()} of 24 frames are empty, without a single echo ({np.flatnonzero(empty)[0]}"
+    assert sum(sentence.startswith(wanted) for sentence in made.warnings) == 1
+    assert "check world.size_m" in next(sentence for sentence in made.warnings if sentence.startswith(wanted))
+    assert [fault.startswith(wanted) for fault in check(store)] == [True]
+
+
+def test_the_command_line_says_so(mitsonar: Command, tmp_path: Path) -> None:
+    recipe = own_scene(scene_file(tmp_path, 3.0, -20.0, 20.0), 40.0, gain=1.0)
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(recipe.model_dump(mode="json", exclude_defaults=True)))
+    load_recipe(tmp_path / "mine.yaml")
+    done = mitsonar("dataset", "make", tmp_path / "mine.yaml", "-o", tmp_path / "x.zarr", "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    assert "frames are empty" in done.stderr
+    checked = mitsonar("dataset", "check", tmp_path / "x.zarr")
+    refused(checked, "1 faults", "empty frames stay until the recipe is another")
+    assert "frames are empty, without a single echo" in checked.stdout
+    small = {**yaml.safe_load((tmp_path / "mine.yaml").read_text())}
+    small["world"]["size_m"] = 60.0
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(small))
+    refused(
+        mitsonar("dataset", "make", tmp_path / "small.yaml", "-o", tmp_path / "y.zarr"), "world.size_m", "is larger than"
+    )

@@ -1,0 +1,77 @@
+"""Black frames are not given in silence: what was met, where the sonar looks, what may be wrong."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import Command, diffuse, floor, scene, sphere
+
+from mitsonar.errors import MitsonarWarning
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose
+from mitsonar.simulation.empty_frames import angle_hint, view_of
+from mitsonar.simulation.imaging import Simulator
+
+SONAR = Sonar(beams=8, range_bins=64, rays_per_beam=100, rays_across=1, range_min=1.0, range_max=5.0)
+GOOD = Pose(0, 0, 2.5, np.radians(35))
+
+
+def warned(loaded: Any, poses: Any, sonar: Sonar = SONAR) -> list[str]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Simulator(loaded, sonar).render(poses)
+    return [str(one.message) for one in caught if issubclass(one.category, MitsonarWarning)]
+
+
+@pytest.mark.usefixtures("variant")
+def test_frames_that_look_over_the_ground_say_so() -> None:
+    """Radians given where degrees are meant: pitch 0.61 deg; the floor is met beyond the window."""
+    ground = scene(floor=floor(diffuse(0.5), 50))
+    (said,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "frames are empty" in text]
+    assert said.startswith("1 of 2 frames are empty, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
+    assert "farther (returns at" in said
+    assert "the sonar is at (0, 0, 2.5) m and looks 0.61 deg below the horizon, along (0.00, 1.00, -0.01)" in said
+    assert said.endswith("its pitch, roll, heading are only 0.61, 0, 0 deg: were radians given where degrees are meant?")
+
+
+@pytest.mark.usefixtures("variant")
+def test_frames_of_degrees_given_as_radians_say_so() -> None:
+    """35 rad is 205 deg, into the sky."""
+    ground = scene(floor=floor(diffuse(0.5), 50))
+    (said,) = warned(ground, [Pose(0, 0, 2.5, 35.0)])
+    assert said.startswith("no ray hit anything in 1 frames: check the pose (x, y, z in m; pitch > 0 looks down)")
+    assert "35, 0, 0 rad, more than a full turn: were degrees given where radians are meant?" in said
+
+
+@pytest.mark.usefixtures("variant")
+def test_frames_with_hardly_an_echo_count_and_frames_with_a_small_target_do_not() -> None:
+    sonar = SONAR.replace(range_bins=2048, beams=64)
+    tiny = scene(ball=sphere((0, 3, 2.5), 0.003, diffuse(0.9)))
+    hardly = warned(tiny, [Pose(0, 0, 2.5)], sonar.replace(rays_per_beam=400, rays_across=4))
+    assert any(text.startswith("1 of 1 frames are empty") for text in hardly)
+    assert not warned(scene(ball=sphere((0, 3, 2.5), 0.3, diffuse(0.9))), [Pose(0, 0, 2.5)], sonar)
+
+
+def test_hints_name_what_is_likely() -> None:
+    assert "check its sign" in angle_hint(np.array([0, 0, 0, -0.5, 0, 0]))
+    assert angle_hint(np.array([0, 0, 0, 0.6, 0, 0])) == ""
+    assert angle_hint(np.zeros(6)) == ""
+    assert "radians given" in angle_hint(np.array([0, 0, 0, *np.radians([0.6, 0, -1.57])]))
+    assert "degrees given" in angle_hint(np.array([0, 0, 0, 18.0, 0, -4.0]))
+
+
+def test_where_a_sonar_looks() -> None:
+    assert view_of(np.array([1, 2, 3.5, 0, 0, np.pi / 2])) == (
+        "the sonar is at (1, 2, 3.5) m and looks along the horizon, along (1.00, 0.00, 0.00)"
+    )
+    assert "looks 30 deg above the horizon, along (0.00, 0.87, 0.50)" in view_of(np.array([0, 0, 0, -np.pi / 6, 0, 0]))
+
+
+def test_the_command_line_warns_of_a_black_picture(mitsonar: Command, tmp_path: Path) -> None:
+    done = mitsonar("render", "flat_floor", "-o", tmp_path / "out", "--from", "0,0,2.5,0.61,0,0.07")
+    assert done.returncode == 0, done.stderr
+    assert "were radians given where degrees are meant?" in done.stderr
