@@ -22,6 +22,16 @@ pytestmark = [
 
 from mitsonar.datasets.re_render import re_rendered  # noqa: E402
 from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
+from mitsonar.estimation.benchmark import (  # noqa: E402
+    VARIATIONS,
+    Answers,
+    _heaved,
+    answers_of,
+    bounds_of_pairs,
+    frames_of,
+    rows_of,
+    with_prior,
+)
 from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
 from mitsonar.estimation.zero import Zero  # noqa: E402

@@ -29,6 +29,13 @@ torch = pytest.importorskip("torch", reason="torch is not installed: install mit
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
 
 from mitsonar.cli.train_command import train as command  # noqa: E402
+from mitsonar.config.training_recipe import (  # noqa: E402
+    Loss,
+    Optimiser,
+    TrainingRecipe,
+    load_training_recipe,
+    training_recipe_from,
+)
 from mitsonar.datasets.arrangement import Labels  # noqa: E402
 from mitsonar.datasets.rendered_pairs import RawStream, RenderedPairs  # noqa: E402
 from mitsonar.datasets.scene_rendering import SceneRenderer  # noqa: E402
