@@ -57,10 +57,11 @@ class ImagingSonar(mi.Sensor):
 
     Properties: those of :class:`mitsonar.instruments.imaging_sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
     ``elevation_fov_deg`` [deg, 14],
-    ``beams`` [96], ``rays_per_beam`` [700], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512],
-    ``sound_speed`` [m/s, 1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing],
-    ``rays_across`` [4], ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0],
-    ``frame_rate_hz`` [Hz, 10]); ``preset``, a name that the others change; ``ping`` [0], which draw of the jitter;
+    ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512], ``sound_speed`` [m/s, 1500],
+    ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing], ``jitter`` [physical: true],
+    ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``frame_rate_hz`` [Hz, 10], ``quality`` [standard]: draft,
+    standard or fine, ``thesis_rays`` [700], ``rays_per_beam`` and ``rays_across`` [from quality; of the model thesis
+    ``thesis_rays`` and one]); ``preset``, a name that the others change; ``ping`` [0], which draw of the jitter;
     ``to_world``. A film may be given if it says the same as beams and rays do.
 
     It does not model side lobes, beam patterns within the width, or a sonar that moves during a ping.

@@ -16,6 +16,7 @@ def presets(
     name: Annotated[str | None, typer.Argument(help="One preset: every number with its source.")] = None,
 ) -> None:
     """Print the sonars that can be named, or one of them with the document behind each number."""
+    from mitsonar.instruments.imaging_sonar import RAYS
     from mitsonar.instruments.named_sonars import PRESETS, preset, preset_sources
 
     if name is not None:
@@ -23,7 +24,10 @@ def presets(
         say(f"{name}: {PRESETS[name][0]}")
         for key, value in sonar.model_dump(exclude={"name"}).items():
             shown = f"{value:g}" if isinstance(value, float) else str(value)
-            say(f"  {key:18} {shown:10} {sources.get(key, 'default')}")
+            source = sources.get(key, "from quality" if key in RAYS else "default")
+            say(f"  {key:18} {shown:10} {source}")
+        for line in _accuracy([name]):
+            say(line)
         return
     say(f"{'preset':22} {'az x el (deg)':14} {'beams':>5} {'width':>6}  {'window (m)':12} {'bins':>5}  instrument")
     for key, (title, _) in PRESETS.items():
@@ -32,7 +36,31 @@ def presets(
         field = f"{sonar.azimuth_fov_deg:g} x {sonar.elevation_fov_deg:g}"
         window = f"{sonar.range_min:g}..{sonar.range_max:g}"
         say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
+    for line in _accuracy(list(PRESETS)):
+        say(line)
     say("`mitsonar presets NAME` prints where each number comes from; docs/sonar.md tells how to write your own.")
+
+
+def _accuracy(names: list[str]) -> list[str]:
+    """The measured errors of each quality, preset by preset."""
+    from mitsonar.instruments.quality import measured_errors
+
+    about, measured = measured_errors()
+    lines = [
+        "",
+        "quality: rays a beam (over elevation x across), and rms error of one ping in % on plain ground / on 15 mm cells",
+        f"{'preset':22}" + "".join(f" {quality:26}" for quality in measured[names[0]]).rstrip(),
+    ]
+    for name in names:
+        cells = [
+            f"{f'{row.rays_per_beam} x {row.rays_across}':8} {row.plain_percent:6g} % / {row.textured_percent:g} %"
+            for row in measured[name].values()
+        ]
+        lines.append(f"{name:22}" + "".join(f" {cell:26}" for cell in cells).rstrip())
+    return [
+        *lines,
+        f"Physical model; the thesis model keeps its own rays. Ground a fifth of the far range below the sonar. {about}.",
+    ]
 
 
 @answered

@@ -35,6 +35,10 @@ def render(
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
+    quality: Annotated[
+        str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
+    ] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")] = None,
     noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
     labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
@@ -57,7 +61,7 @@ def render(
     outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=convention_named(frame).name)
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
-    instrument, attitude = _instrument(loaded, sonar, model, seed)
+    instrument, attitude = _instrument(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))
     path = _path(instrument, attitude, scene, frames, start, end, trajectory, frame)
     folder = out or Path("out") / find_scene(scene).stem
     simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
@@ -80,7 +84,22 @@ def scene_parameters(pairs: list[str]) -> dict[str, str]:
     return dict(pair.split("=", 1) for pair in pairs)
 
 
-def _instrument(scene: Any, name: str | None, model: str | None, seed: int | None) -> tuple[Sonar, Pose | None]:
+def sonar_changes(pairs: list[str], quality: str | None) -> dict[str, Any]:
+    """What --set and --quality change of a sonar."""
+    wrong = [pair for pair in pairs if "=" not in pair]
+    if wrong:
+        raise MitsonarError(f"--set takes KEY=VALUE: got {wrong[0]!r}")
+    changes = dict(pair.split("=", 1) for pair in pairs)
+    if "preset" in changes:
+        raise MitsonarError(f"--set changes keys of the sonar: got preset={changes['preset']}; name it by --sonar")
+    if quality is not None and changes.get("quality", quality) != quality:
+        raise MitsonarError(f"--quality {quality} and --set quality={changes['quality']} contradict each other: give one")
+    return changes if quality is None else {**changes, "quality": quality}
+
+
+def _instrument(
+    scene: Any, name: str | None, model: str | None, seed: int | None, changes: dict[str, Any] | None = None
+) -> tuple[Sonar, Pose | None]:
     """The sonar to use and the pose that the scene gives it."""
     from mitsonar.instruments.named_sonars import load_sonar
     from mitsonar.simulation.scene import sonar_in
@@ -91,9 +110,16 @@ def _instrument(scene: Any, name: str | None, model: str | None, seed: int | Non
             "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300) and a pose (--from)"
         )
     sonar = load_sonar(name) if name is not None else found[0]  # type: ignore[index]
-    change: dict[str, Any] = {} if model is None else {"model": model}
+    change: dict[str, Any] = dict(changes or {})
+    change |= {} if model is None else {"model": model}
     change |= {} if seed is None else {"seed": seed}
-    return sonar.replace(**change), found[1] if found else None
+    sonar = sonar.replace(**change)
+    if "quality" in change and sonar.model == "thesis":
+        raise MitsonarError(
+            "quality is of the model physical, the thesis model has its own number of rays: got quality "
+            f"{change['quality']}; leave it out, or give --set rays_per_beam=N"
+        )
+    return sonar, found[1] if found else None
 
 
 def _path(

@@ -10,12 +10,34 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.errors import MitsonarError, complaint
+from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
 
-__all__ = ["Bearing", "Instrument", "Model", "Sonar"]
+__all__ = ["RAYS", "Bearing", "Instrument", "Model", "Sonar"]
 
 Model = Literal["physical", "thesis"]
 Bearing = Literal["azimuth", "cone"]
 SEE = " (see `mitsonar presets --help` and docs/sonar.md)"
+RAYS = ("rays_per_beam", "rays_across")
+"""Fields that follow from ``quality`` where they are not given."""
+
+THESIS_ACROSS = 4
+"""What ``rays_across`` says in the thesis model, which traces one."""
+
+
+def _rays_over_elevation(given: dict[str, Any]) -> int:
+    """Rays over elevation that follow from the other fields."""
+    if given["model"] == "thesis":
+        return int(given["thesis_rays"])
+    return rays_over_elevation(given["quality"], math.radians(given["elevation_fov_deg"]))
+
+
+def _rays_across(given: dict[str, Any]) -> int:
+    """Rays across a beam that follow from the other fields."""
+    if given["model"] == "thesis":
+        return THESIS_ACROSS
+    fov = math.radians(given["azimuth_fov_deg"])
+    width = fov / given["beams"] if given["beam_width_deg"] is None else math.radians(given["beam_width_deg"])
+    return rays_across(given["quality"], width, fov, given["range_max"])
 
 
 class Instrument(BaseModel):
@@ -55,6 +77,9 @@ class Sonar(Instrument):
     The same names are the XML properties of the sensor ``imaging_sonar`` and the keys of a sonar's YAML file
     (``docs/sonar.md``).
 
+    ``rays_per_beam`` and ``rays_across`` follow from ``quality`` in the physical model, and are ``thesis_rays`` and one in
+    the thesis model; numbers that are given win.
+
     Raises:
         MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
     """
@@ -65,7 +90,6 @@ class Sonar(Instrument):
     azimuth_fov_deg: float = Field(29.0, gt=0, le=360, description="field of view across the beams [deg]")
     elevation_fov_deg: float = Field(14.0, gt=0, le=180, description="field of view within a beam [deg]")
     beams: int = Field(96, ge=1, le=65_536, description="number of beams")
-    rays_per_beam: int = Field(700, ge=1, le=1_000_000, description="rays over a beam's elevation")
     range_min: float = Field(3.2, ge=0, le=1e5, description="start of the window [m]")
     range_max: float = Field(5.6, gt=0, le=1e5, description="end of the window [m], beyond range_min")
     range_bins: int = Field(512, ge=1, le=1_000_000, description="range bins of the window")
@@ -77,7 +101,6 @@ class Sonar(Instrument):
     beam_width_deg: float | None = Field(
         None, gt=0, le=360, description="width of one beam [deg]; default: the spacing of the beams"
     )
-    rays_across: int = Field(4, ge=1, le=4096, description="rays across a beam's width (thesis: one, on the axis)")
     jitter: bool | None = Field(
         None, description="rays move at random within their cells, anew each ping; default: physical yes, thesis no"
     )
@@ -87,6 +110,22 @@ class Sonar(Instrument):
         0, ge=0, le=4, description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading"
     )
     frame_rate_hz: float = Field(10.0, gt=0, le=1e6, description="pings a second [Hz]")
+    quality: Quality = Field(
+        "standard", description="rays of `physical`: draft, standard or fine; `mitsonar presets` prints what each errs by"
+    )
+    thesis_rays: int = Field(700, ge=1, le=1_000_000, description="rays over a beam's elevation of the model thesis")
+    rays_per_beam: int = Field(
+        default_factory=_rays_over_elevation,
+        ge=1,
+        le=1_000_000,
+        description="rays over a beam's elevation; default: from quality",
+    )
+    rays_across: int = Field(
+        default_factory=_rays_across,
+        ge=1,
+        le=4096,
+        description="rays across a beam's width (thesis: one, on the axis); default: from quality",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -113,8 +152,21 @@ class Sonar(Instrument):
             )
         rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
         if rays > 2**28:
-            raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower beams, rays_across or rays_per_beam")
+            raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower quality, beams or numbers of rays")
         return self
+
+    def replace(self, **fields: Any) -> Self:
+        """This sonar with some fields changed, checked again.
+
+        Numbers of rays that follow from other fields follow again. A ``quality`` takes the place of numbers of rays that
+        were given before, in the physical model; numbers given beside it win.
+        """
+        kept = self.model_dump()
+        renewed = "quality" in fields and fields.get("model", self.model) != "thesis"
+        for name in RAYS:
+            if renewed or name not in self.model_fields_set:
+                del kept[name]
+        return self.create(**{**kept, **fields})
 
     def _outermost_deg(self) -> float:
         return math.degrees(self.bearing_rad[-1] + self.beam_width_rad / 2)

@@ -35,7 +35,6 @@ THESIS = "Almanza-Medina, section 2.3"
 THESIS4 = "Almanza-Medina, chapter 4"
 LINE_ARRAY = "a line array or acoustic lens measures the angle to its own axis"
 WINDOW = "ours, inside the instrument's limits"
-RAYS = "ours"
 TVG = "ours: spreading is compensated, as instruments show it"
 
 PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
@@ -51,8 +50,7 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (512, DIDSON),
             "frame_rate_hz": (21.0, DIDSON_SHEET),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, THESIS),
-            "rays_across": (4, RAYS),
+            "thesis_rays": (700, THESIS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -68,8 +66,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1344, "bins of a recorded ARIS 3000 window (0.003 m steps, the SDK's finest)"),
             "frame_rate_hz": (15.0, ARIS),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -83,8 +79,7 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_max": (6.1, THESIS4),
             "range_bins": (512, THESIS4),
             "bearing": ("azimuth", "gives the thesis's windows of 6.1 and 24.5 m"),
-            "rays_per_beam": (1000, THESIS4),
-            "rays_across": (1, RAYS),
+            "thesis_rays": (1000, THESIS4),
             "gain_exponent": (2, "ours: the thesis has an implicit R^2 gain"),
         },
     ),
@@ -100,8 +95,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1496, "0.0254 m bins, as published P900 simulations take from the data sheet"),
             "frame_rate_hz": (15.0, P900),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -117,8 +110,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1496, "0.0254 m bins, as published P900 simulations take from the data sheet"),
             "frame_rate_hz": (15.0, P900),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -135,8 +126,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1024, "ours; the data sheet's range resolution is finer"),
             "frame_rate_hz": (40.0, OCULUS_RATE),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -153,8 +142,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1024, "ours; the data sheet's range resolution is finer"),
             "frame_rate_hz": (40.0, OCULUS_RATE),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -171,8 +158,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1024, "ours; the data sheet's range resolution is finer"),
             "frame_rate_hz": (40.0, OCULUS_RATE),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -189,8 +174,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1024, "ours; the data sheet's range resolution is finer"),
             "frame_rate_hz": (40.0, OCULUS_RATE),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -207,8 +190,6 @@ PRESETS: dict[str, tuple[str, dict[str, tuple[Any, str]]]] = {
             "range_bins": (1024, "ours; the data sheet's range resolution is 4 mm (CHIRP), second hand"),
             "frame_rate_hz": (30.0, GEMINI),
             "bearing": ("cone", LINE_ARRAY),
-            "rays_per_beam": (700, RAYS),
-            "rays_across": (4, RAYS),
             "gain_exponent": (2, TVG),
         },
     ),
@@ -229,7 +210,7 @@ def preset(name: str) -> Sonar:
 
 
 def preset_sources(name: str) -> dict[str, str]:
-    """Where each number of a preset comes from."""
+    """Where each number of a preset comes from; numbers of rays follow from ``quality`` and have no source."""
     preset(name)
     return {key: source for key, (_, source) in PRESETS[name][1].items()}
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.imaging_sonar import RAYS, Sonar
 from mitsonar.instruments.views import Receiver
 from mitsonar.motion.pose import mounted, to_world_matrices
 from mitsonar.records.echoes import Echoes
@@ -33,7 +33,8 @@ class ReceiverTracer:
         # r = (R_A + R_B) / 2 <= R_B + apart / 2, and r is at least the window's begin where it counts
         nearest = max(sonar.range_min, sonar.bin_m)
         gain = (nearest / (nearest - apart / 2)) ** 2 if sonar.model == "physical" else 1.0
-        self.bits = fraction_bits(view.transmitter.replace(**_window(sonar)), view.transmitter.rays, gain)
+        traced = {name: getattr(view.transmitter, name) for name in RAYS}  # another window would want others
+        self.bits = fraction_bits(view.transmitter.replace(**_window(sonar), **traced), view.transmitter.rays, gain)
 
     def tables(self, poses: ArrayLike) -> dict[str, Any]:
         """Where the receiver is: three rows of ``to_world`` a ping."""

@@ -35,7 +35,8 @@ def rendered(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
 
     texture = {"type": "cell_noise", "cells": 1000, "seed": 3}
     path = path_of(DRIVEN, Pose.from_degrees([0.3, -1.0, 2.5, 35, 0, 20]), np.arange(12) / 10)
-    frames = Simulator(scene(floor=floor(diffuse(texture), 15.0)), Sonar()).render(path.poses)
+    sonar = Sonar(rays_per_beam=700, rays_across=4)
+    frames = Simulator(scene(floor=floor(diffuse(texture), 15.0)), sonar).render(path.poses)
     folder = tmp_path_factory.mktemp("rendered")
     frames.save(folder / "frames.npz")
     return folder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from PIL import Image
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.imaging import Simulator
@@ -110,6 +112,29 @@ def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(
     again = Simulator(load_scene(scene), fewer.sonar)
     levels = np.concatenate([pings.levels for pings in again.pings(fewer.poses)])
     np.testing.assert_allclose(np.minimum(levels, fewer.level_scale), fewer.image * fewer.level_scale, rtol=1e-6)
+
+
+def test_quality_and_numbers_of_rays_are_chosen_on_the_command_line(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    def rays(*options: object) -> tuple[str, int, int]:
+        done = mitsonar("render", scene, "-o", tmp_path / "out", "--overwrite", *options)
+        assert done.returncode == 0, done.stderr
+        sonar = SonarFrames.load(tmp_path / "out").sonar
+        assert sonar is not None
+        return sonar.quality, sonar.rays_per_beam, sonar.rays_across
+
+    told = rays()  # the scene's own numbers
+    draft = Sonar(beams=16, quality="draft")
+    assert rays("--quality", "draft") == ("draft", draft.rays_per_beam, draft.rays_across) != told
+    assert rays("--set", "quality=draft") == rays("--quality", "draft")
+    assert rays("--quality", "draft", "--set", "rays_per_beam=20") == ("draft", 20, draft.rays_across)
+    assert rays("--set", "rays_per_beam=20", "--set", "rays_across=3")[1:] == (20, 3)
+    assert rays("--model", "thesis")[1:] == told[1:]
+    refused(mitsonar("render", scene, "--quality", "fien"), "unknown quality 'fien': did you mean fine?")
+    refused(mitsonar("render", scene, "--quality", "fine", "--model", "thesis"), "quality is of the model physical")
+    refused(mitsonar("render", scene, "--set", "rays_per_bem=20"), "did you mean rays_per_beam")
+    refused(mitsonar("render", scene, "--set", "rays_per_beam"), "--set takes KEY=VALUE: got 'rays_per_beam'")
+    refused(mitsonar("render", scene, "--set", "preset=aris3000"), "name it by --sonar")
+    refused(mitsonar("render", scene, "--quality", "fine", "--set", "quality=draft"), "contradict each other")
 
 
 def test_bad_input_is_answered_by_one_sentence(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
@@ -247,6 +272,9 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     assert "oculus-m1200d-2100khz" in listed.stdout
     one = mitsonar("presets", "gemini-720is")
     assert "0703-SOM-00002" in one.stdout
+    assert re.search(r"rays_across +4 +from quality", one.stdout)
+    for printed in (listed.stdout, one.stdout):  # rays and errors of each quality
+        assert re.search(r"^gemini-720is +58 x 1 .*% / .*172 x 4 .*% / .*686 x 8 .*% / ", printed, re.MULTILINE)
     refused(mitsonar("presets", "gemini"), "gemini-720is")
     assert "sunken_ship" in mitsonar("scenes").stdout
     doctor = mitsonar("doctor")

@@ -16,7 +16,6 @@ DEFAULTS = {
     "azimuth_fov_deg": 29.0,
     "elevation_fov_deg": 14.0,
     "beams": 96,
-    "rays_per_beam": 700,
     "range_min": 3.2,
     "range_max": 5.6,
     "range_bins": 512,
@@ -24,12 +23,15 @@ DEFAULTS = {
     "bearing": "azimuth",
     "beam_layout": "even",
     "beam_width_deg": None,
-    "rays_across": 4,
     "jitter": None,
     "seed": 0,
     "model": "physical",
     "gain_exponent": 0,
     "frame_rate_hz": 10.0,
+    "quality": "standard",
+    "thesis_rays": 700,
+    "rays_per_beam": 120,  # 14 deg / (tan(asin 0.2) 0.01), the next even number
+    "rays_across": 4,
 }
 
 
@@ -61,7 +63,7 @@ def test_sine_layout_steps_evenly_in_the_sine() -> None:
 
 
 def test_physical_and_thesis_differ_in_rays_jitter_and_width() -> None:
-    physical = Sonar(beams=10, rays_per_beam=20, beam_width_deg=0.3)
+    physical = Sonar(beams=10, rays_per_beam=20, rays_across=4, beam_width_deg=0.3)
     thesis = physical.replace(model="thesis")
     assert (physical.across, physical.columns, physical.rays, physical.jittered) == (4, 40, 800, True)
     assert (thesis.across, thesis.columns, thesis.rays, thesis.jittered) == (1, 10, 200, False)
@@ -95,7 +97,7 @@ def test_jitter_can_be_forced(model: str, jitter: bool) -> None:
         ({"seed": -1}, r"seed: .*got -1"),
         ({"bearing": "cone", "azimuth_fov_deg": 200}, r"cone bearing covers at most 180 deg: got azimuth_fov_deg 200"),
         ({"beam_layout": "sine", "azimuth_fov_deg": 200}, r"beam_layout sine covers at most 180 deg"),
-        ({"beams": 60_000, "rays_per_beam": 900_000}, r"at most 268,435,456 rays: got 216,000,000,000"),
+        ({"beams": 60_000, "rays_per_beam": 900_000, "rays_across": 4}, r"at most 268,435,456 rays: got 216,000,000,000"),
     ],
 )
 def test_errors_say_what_and_got(fields: dict[str, Any], message: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.imaging_sonar import RAYS, Sonar
 from mitsonar.instruments.named_sonars import PRESETS, load_sonar, preset, preset_sources, sonar_from
 
 
@@ -17,7 +17,8 @@ def test_preset_is_valid_and_every_number_has_a_source(name: str) -> None:
     assert sonar.name == name
     assert PRESETS[name][0].strip()
     assert all(isinstance(source, str) and len(source.strip()) >= 4 for source in sources.values())
-    given = {key for key, value in sonar.model_dump().items() if value != getattr(Sonar(), key)} - {"name"}
+    given = {key for key, value in sonar.model_dump().items() if value != getattr(Sonar(), key)} - {"name", *RAYS}
+    assert not set(RAYS) & sonar.model_fields_set  # they follow from quality
     assert given <= set(sources)  # nothing differs from the defaults without a source
     assert {"azimuth_fov_deg", "elevation_fov_deg", "beams", "range_min", "range_max", "range_bins"} <= set(sources)
     assert {key: getattr(sonar, key) for key in sources} == {key: value for key, (value, _) in PRESETS[name][1].items()}

@@ -31,7 +31,8 @@ KINDS = {
 
 def sensor(pose: Pose = POSE, **fields: Any) -> mi.Sensor:
     """A sensor of 8 beams, 100 x 60 deg, at a pose."""
-    given = {"azimuth_fov_deg": 100.0, "elevation_fov_deg": 60.0, "beams": 8, "rays_per_beam": 12, **fields}
+    given = {"azimuth_fov_deg": 100.0, "elevation_fov_deg": 60.0, "beams": 8, "rays_per_beam": 12}
+    given |= {"rays_across": 4, **fields}
     return mi.load_dict({"type": "imaging_sonar", "to_world": mi.ScalarTransform4f(to_world_matrices(pose)[0]), **given})
 
 
@@ -65,7 +66,7 @@ def test_properties_are_those_of_a_sonar() -> None:
         **{"azimuth_fov_deg": 33.0, "elevation_fov_deg": 9.0, "beams": 5, "rays_per_beam": 7, "range_min": 1.5},
         **{"range_max": 2.5, "range_bins": 11, "sound_speed": 1480.0, "bearing": "cone", "beam_layout": "sine"},
         **{"beam_width_deg": 0.7, "rays_across": 3, "jitter": False, "seed": 4, "model": "thesis"},
-        **{"gain_exponent": 2, "frame_rate_hz": 15.0},
+        **{"gain_exponent": 2, "frame_rate_hz": 15.0, "quality": "fine", "thesis_rays": 6},
     }
     assert set(fields) == set(Sonar.model_fields) - {"name"}
     loaded = mi.load_dict({"type": "imaging_sonar", **fields})

@@ -47,7 +47,7 @@ def whole_bins(truth: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 def test_energy_of_a_flat_floor(flat: Any, tmp_path: Path, bearing: str, jitter: bool) -> None:
     """SPEC.md, section 2: with footprints 1 % a bin at 700 rays a beam; four rays across measure 0.03 %."""
-    sonar = Sonar(bearing=bearing, jitter=jitter)
+    sonar = Sonar(bearing=bearing, jitter=jitter, rays_per_beam=700, rays_across=4)
     truth = floor_levels(sonar, HEIGHT, PITCH, 0.5)
     got = levels(flat, sonar)[0]
     assert_image_close(got, np.where(whole_bins(truth), truth, 0), 1e-3, tmp_path / "floor.png")
@@ -59,7 +59,7 @@ def test_energy_of_a_flat_floor(flat: Any, tmp_path: Path, bearing: str, jitter:
 
 @pytest.mark.parametrize("exponent", [2, 4])
 def test_gain_laws_of_a_flat_floor(flat: Any, tmp_path: Path, exponent: int) -> None:
-    sonar = Sonar(gain_exponent=exponent, beams=16, beam_width_deg=0.3)
+    sonar = Sonar(gain_exponent=exponent, beams=16, beam_width_deg=0.3, rays_per_beam=700, rays_across=4)
     truth = floor_levels(sonar, HEIGHT, PITCH, 0.5)
     got = levels(flat, sonar)[0]
     assert_image_close(got, np.where(whole_bins(truth), truth, 0), 2e-3, tmp_path / "floor.png")

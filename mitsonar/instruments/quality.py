@@ -1,0 +1,115 @@
+"""How many rays an accuracy needs, and what each quality was measured to err by.
+
+The law of the physical model, from ``benchmarks/bench_quality.py``:
+
+Plain ground: a ray spreads its level evenly over the ranges that its cell of elevation covers, and cells join without gap,
+so only the slope of the level within a cell is lost. The error grows with the cell's length along range as a part of the
+range, ``dR / R = de / tan(grazing angle)``, whatever the range bins are. It falls faster than 1 / rays, and more rays
+across lower the part that is jitter.
+
+Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random, so the error is
+the texture's contrast over the root of the rays that meet in one bin, which is ``rays_across`` until an elevation cell is
+shorter than a bin. It falls as 1 / sqrt(rays), and faster once rays are denser than the texture.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from importlib.resources import files
+from typing import Annotated, Literal, NamedTuple
+
+import yaml
+from pydantic import BeforeValidator
+
+from mitsonar.errors import nearest_names
+
+__all__ = ["FAR_GRAZING_RAD", "QUALITIES", "Measured", "Quality", "measured_errors", "rays_across", "rays_over_elevation"]
+
+FAR_GRAZING_RAD = math.asin(0.2)
+"""Angle at which the reference ground is met at the window's far end [rad]: the sonar is a fifth of that range above it."""
+
+STEEPEST_RAD = math.radians(75)
+"""Bearing beyond which a beam's width counts no more [rad]: the ground leaves the window there."""
+
+MOST_ACROSS = 4096
+
+
+class Rays(NamedTuple):
+    """What a quality asks of the rays.
+
+    Attributes:
+        reach: longest range interval of one ray's cell on the reference ground, as a part of the range.
+        apart_m: distance of rays across a beam at the far end of the window [m].
+        across: rays across a beam at most, unless ``reach`` needs more.
+    """
+
+    reach: float
+    apart_m: float
+    across: int
+
+
+QUALITIES: dict[str, Rays] = {
+    "draft": Rays(0.03, math.inf, 1),
+    "standard": Rays(0.01, 0.0075, 4),
+    "fine": Rays(0.0025, 0.00375, 8),
+}
+"""What each quality asks, coarsest first."""
+
+
+def _known(name: object) -> object:
+    if name not in QUALITIES:
+        raise ValueError(f"unknown quality {name!r}: {nearest_names(str(name), QUALITIES)}")
+    return name
+
+
+Quality = Annotated[Literal["draft", "standard", "fine"], BeforeValidator(_known)]
+
+
+def rays_over_elevation(quality: str, elevation_fov_rad: float) -> int:
+    """Rays over a beam's elevation, an even number: segments halve the field of view.
+
+    A cell of height ``de`` covers ``de / tan(grazing)`` of the range; at the far end of the window it may cover ``reach``.
+    """
+    needed = elevation_fov_rad / (math.tan(FAR_GRAZING_RAD) * QUALITIES[quality].reach)
+    return 2 * math.ceil(needed / 2)
+
+
+def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, range_max: float) -> int:
+    """Rays across a beam's width.
+
+    Texture wants rays ``apart_m`` apart at the far end. At the edge of a wide fan the ground's range changes across a beam,
+    by ``tan(bearing)`` times the beam's width of the range, of which each ray may stand for twice ``reach``.
+    """
+    wanted = QUALITIES[quality]
+    texture = min(wanted.across, math.ceil(beam_width_rad * range_max / wanted.apart_m))
+    oblique = math.ceil(beam_width_rad * math.tan(min(azimuth_fov_rad / 2, STEEPEST_RAD)) / (2 * wanted.reach))
+    return min(MOST_ACROSS, max(1, texture, oblique))
+
+
+class Measured(NamedTuple):
+    """What a quality of a preset was measured to err by.
+
+    Attributes:
+        rays_per_beam: over elevation.
+        rays_across: across a beam.
+        plain_percent: rms error of a ping's bins on plain ground, in % of their level.
+        textured_percent: on ground of 15 mm cells with reflectivities spread evenly over 0..1, in % of the level of plain
+            ground of the same mean.
+    """
+
+    rays_per_beam: int
+    rays_across: int
+    plain_percent: float
+    textured_percent: float
+
+
+@cache
+def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
+    """The machine and date of the measurement, and what was measured by preset and quality."""
+    table = yaml.safe_load(files("mitsonar.instruments").joinpath("quality.yaml").read_text(encoding="utf-8"))
+    found = {
+        preset: {quality: Measured(**numbers) for quality, numbers in rows.items()}
+        for preset, rows in table["presets"].items()
+    }
+    return f"{table['machine']}, {table['date']}", found
