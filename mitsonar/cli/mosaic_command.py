@@ -122,7 +122,7 @@ def _paths(trajectory: str, true: Path | None) -> tuple[dict[str, Trajectory], f
     paths: dict[str, Trajectory] = {}
     if Path(trajectory).is_dir():
         folder = OdometryFolder.open(trajectory)
-        height = folder.state["recipe"]["height_m"]
+        height = folder.height_m
         paths["estimated"] = folder.estimated
         if folder.true is not None:
             paths["true"] = folder.true

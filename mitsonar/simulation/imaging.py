@@ -286,6 +286,10 @@ def shadow(pings: Pings) -> NDArray[np.uint8]:
     return np.where(nearer & ~echo, np.where(still, 1, 2), 0).astype(np.uint8)
 
 
+NESTED = ("rays", "worst")
+"""What a tally counts more than one of."""
+
+
 @dataclass
 class Tally:
     """What a run adds up to warn of."""
@@ -347,6 +351,19 @@ class Tally:
         return {name: getattr(self, name) for name in names}
 
     @classmethod
-    def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
-        """The tally of a run that was broken off."""
-        return cls(sonar, **{**state, "worst": tuple(state["worst"])})
+    def restore(cls, sonar: Sonar, state: Any) -> Tally:
+        """The tally of a run that was broken off.
+
+        Raises:
+            MitsonarError: the state is damaged.
+        """
+        kept = cls(sonar)
+        try:
+            counts = [*state["worst"], *state["rays"].values(), *(state[name] for name in kept.state() if name not in NESTED)]
+            if len(state["worst"]) != 2 or set(state["rays"]) != set(kept.rays) or set(state) != set(kept.state()):
+                raise ValueError("other counts")
+            if not all(type(count) is int and 0 <= count < 2**63 for count in counts):
+                raise ValueError("counts are whole and not negative")
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise MitsonarError(f"the tally of the run is damaged ({error}): begin anew with --overwrite") from None
+        return cls(sonar, **{**state, "rays": dict(state["rays"]), "worst": tuple(state["worst"])})
