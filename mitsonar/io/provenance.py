@@ -26,8 +26,14 @@ LONGEST_SHOWN = 60
 # ---------------------------------------------------------------- had and asked
 
 
-def refuse_other(where: str | Path, had: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+def refuse_other(where: str | Path, had: Mapping[str, Any], asked: Mapping[str, Any], hint: str = "") -> None:
     """Go on only with what a run was begun with.
+
+    Args:
+        where: it lies.
+        had: what it was begun with.
+        asked: what is asked for now.
+        hint: how to ask for the same.
 
     Raises:
         MitsonarError: something else was asked for; what differs is named, with both values.
@@ -36,7 +42,7 @@ def refuse_other(where: str | Path, had: Mapping[str, Any], asked: Mapping[str, 
     if other:
         more = f"; and {len(other) - MOST_SHOWN} more" if len(other) > MOST_SHOWN else ""
         raise MitsonarError(
-            f"{where} was begun with {'; '.join(other[:MOST_SHOWN])}{more}: ask for the same, or choose another -o"
+            f"{where} was begun with {'; '.join(other[:MOST_SHOWN])}{more}: ask for the same{hint}, or choose another -o"
         )
 
 

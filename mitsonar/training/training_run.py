@@ -34,8 +34,8 @@ __all__ = ["Report", "leads", "train"]
 STATE_MINUTES = 5.0
 """Between two states on disk: what a kill may cost."""
 
-MOST_WORKERS = 1024
-"""Processes that a run may have had."""
+MOST_AT_ONCE = 1024
+"""Threads, and processes, that a run may have had."""
 
 SMOOTH = 0.98
 """Weight of the past in the running numbers of a report."""
@@ -128,11 +128,11 @@ def train(
         raise MitsonarError(f"--threads must be at least 1: got {threads}")
     folder = RunFolder(Path(out), writes=leads())
     known = folder.known() if resume else None
-    notes = known.notes if known is not None else {}
-    gain = notes.get("gain")
+    gain = None if known is None else known.notes.get("gain")
+    threads = threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
     material = material_of(recipe, data, render=render, gain=gain)
     network = network_for(recipe, material)
-    with _quiet(), _settings(threads or notes.get("threads")), torch.random.fork_rng(devices=[]):
+    with _quiet(), _settings(threads), torch.random.fork_rng(devices=[]):
         module = NetworkTraining(network, recipe, material)
         journal = Journal(folder, module, material, minutes, state_minutes, progress, stop)
         trainer = _trainer(module, folder, journal, accelerator, devices, strategy)
@@ -418,7 +418,8 @@ def _workers(workers: int | None, known: RunDirectory | None, render: bool, trai
     on_cpu = trainer.strategy.root_device.type == "cpu"
     if render:
         had = None if known is None else known.asked.get("workers")
-        return had if isinstance(had, int) and 0 <= had <= MOST_WORKERS else max(1, cores // 2 if on_cpu else cores - 1)
+        usual = max(1, cores // 2 if on_cpu else cores - 1)
+        return had if isinstance(had, int) and 0 <= had <= MOST_AT_ONCE else usual
     return (1 if cores > 2 else 0) if on_cpu else max(1, min(8, cores - 1))
 
 
