@@ -126,6 +126,7 @@ def show(
     import io
 
     from mitsonar.datasets.store import DataStore
+    from mitsonar.io.run_directory import refuse_to_replace
     from mitsonar.io.whole_files import write_whole
     from mitsonar.plotting.data_sheet import sheet_figure
 
@@ -133,8 +134,7 @@ def show(
     path = out or Path(Path(store.place.url).stem + ".png")
     if path.suffix.lower() != ".png" or not path.parent.is_dir():
         raise MitsonarError(f"-o must name a .png file in a folder that is there: got {path}")
-    if path.exists() and not overwrite:
-        raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
+    refuse_to_replace(path, overwrite=overwrite)
     buffer = io.BytesIO()
     sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
     write_whole(path, buffer.getvalue())

@@ -13,6 +13,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames, frames_from, views_from
 from mitsonar.errors import MitsonarError
+from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ def height(
     from mitsonar.estimation.height.named_height_estimators import height_estimator_from
     from mitsonar.mapping.measured_heights import measured
 
-    if out is not None and out.exists() and not overwrite:
-        raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or --overwrite")
+    if out is not None:
+        refuse_to_replace(out, overwrite=overwrite)
     estimator = height_estimator_from(by)
     source: FrameSource | ViewSource
     portions = _portions(frames, view) if estimator.views is None else (estimator.views, estimator.kind)

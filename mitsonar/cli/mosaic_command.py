@@ -12,6 +12,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames, frames_from
 from mitsonar.errors import MitsonarError
+from mitsonar.io.run_directory import refuse_to_replace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -107,9 +108,7 @@ def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
     if kind != ".png" and true is not None:
         raise MitsonarError("--true is drawn into a figure: give a .png as -o, or leave it out")
     quality = out.with_suffix(".quality.png") if kind == ".png" else None
-    for path in (out, quality):
-        if path is not None and path.exists() and not (overwrite and path.is_file()):
-            raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
+    refuse_to_replace(out, *([] if quality is None else [quality]), overwrite=overwrite)
     return quality
 
 

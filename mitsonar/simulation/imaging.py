@@ -286,10 +286,6 @@ def shadow(pings: Pings) -> NDArray[np.uint8]:
     return np.where(nearer & ~echo, np.where(still, 1, 2), 0).astype(np.uint8)
 
 
-NESTED = ("rays", "worst")
-"""What a tally counts more than one of."""
-
-
 @dataclass
 class Tally:
     """What a run adds up to warn of."""
@@ -359,7 +355,8 @@ class Tally:
         """
         kept = cls(sonar)
         try:
-            counts = [*state["worst"], *state["rays"].values(), *(state[name] for name in kept.state() if name not in NESTED)]
+            single = (state[name] for name in kept.state() if name not in ("rays", "worst"))
+            counts = [*state["worst"], *state["rays"].values(), *single]
             if len(state["worst"]) != 2 or set(state["rays"]) != set(kept.rays) or set(state) != set(kept.state()):
                 raise ValueError("other counts")
             if not all(type(count) is int and 0 <= count < 2**63 for count in counts):
