@@ -75,8 +75,8 @@ def test_render_writes_all_that_it_promises(mitsonar: Command, scene: Path, tmp_
     np.testing.assert_allclose(path.poses[-1], [0.2, 0.1, 2.5, np.radians(35), 0, np.radians(5)], atol=1e-7)
     about = json.loads((out / "run.json").read_text())
     assert about["finished"]
-    assert about["recipe"]["sonar"]["seed"] == 4
-    assert about["recipe"]["noise"] == NOISE_MODELS["low"].model_dump()
+    assert about["asked"]["sonar"]["seed"] == 4
+    assert about["asked"]["noise"] == NOISE_MODELS["low"].model_dump()
     assert about["gain"] == pytest.approx(1 / frames.level_scale)
     assert {"mitsuba", "drjit", "numpy"} <= set(about["versions"])
 
@@ -154,14 +154,14 @@ def test_an_out_that_exists_is_kept(mitsonar: Command, scene: Path, tmp_path: Pa
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
-    refused(mitsonar("render", scene, "-o", mine), "exists", "kept", "-o")
-    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "not a run of mitsonar")
+    refused(mitsonar("render", scene, "-o", mine), "holds other things (thesis.tex)", "kept", "-o")
+    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "holds other things")
     assert (mine / "thesis.tex").read_text() == "years of work"
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out).returncode == 0
     before = (out / "frames.npz").read_bytes()
     refused(mitsonar("render", scene, "-o", out, "--seed", 5), "exists")
-    refused(mitsonar("render", scene, "-o", out, "--seed", 5, "--resume"), "another run", "sonar")
+    refused(mitsonar("render", scene, "-o", out, "--seed", 5, "--resume"), "was begun with sonar.seed 0, not 5")
     assert (out / "frames.npz").read_bytes() == before
     assert mitsonar("render", scene, "-o", out, "--seed", 5, "--overwrite").returncode == 0
     assert (out / "frames.npz").read_bytes() != before
