@@ -13,9 +13,6 @@ from mitsonar.errors import MitsonarError
 
 __all__ = ["compare"]
 
-METHODS = "zero,ecc,flow,phase,direct"
-IMPULSE_METHODS = "zero,correlation,likelihood"
-
 
 @answered
 def compare(
@@ -24,7 +21,7 @@ def compare(
         str | None,
         typer.Option(
             help="Names, or checkpoints of networks, with commas between them, each NAME or NAME:key=value:key=value "
-            f"(default: {METHODS}; of impulse responses: {IMPULSE_METHODS})."
+            "(default: all that need no training)."
         ),
     ] = None,
     noise: Annotated[

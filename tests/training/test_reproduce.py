@@ -368,7 +368,7 @@ def kill(event, args, left=[{times}]):
         if left[0] == 0:
             os.kill(os.getpid(), signal.SIGKILL)
 sys.addaudithook(kill)
-sys.path.insert(0, {tests!r})
+sys.path[:0] = [{tests!r}, {tests!r} + "/training"]
 from pathlib import Path
 from test_reproduce import tiny
 tiny(Path({out!r}))
@@ -457,7 +457,11 @@ def test_a_folder_keeps_to_what_it_was_begun_with(whole: Path, tmp_path: Path) -
     about.write_text(kept.replace('"penalty": 100.0', '"penalty": 50.0'))  # as if the recipe's file had changed
     with pytest.raises(MitsonarError, match=r"was begun with row\.posenet-penalty\.loss\.penalty 50\.0, not 100\.0"):
         tiny(whole)
-    for damaged, said in ((kept[:-40], "cannot read"), ("{}", "no tables of mitsonar"), (kept.replace('"scale"', '"scala"'), "scala")):
+    for damaged, said in (
+        (kept[:-40], "cannot read"),
+        ("{}", "no tables of mitsonar"),
+        (kept.replace('"scale"', '"scala"'), "scala"),
+    ):
         about.write_text(damaged)
         with pytest.raises(MitsonarError, match=said):
             tiny(whole)
