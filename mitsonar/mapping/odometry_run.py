@@ -71,7 +71,7 @@ class OdometryFolder:
             MitsonarError: ``run.json`` is damaged.
         """
         height = self.run.asked.get("height_m")
-        if height is None or (isinstance(height, float | int) and 0 < height < np.inf):
+        if height is None or (type(height) in (int, float) and 0 < height < 1e6):
             return height
         raise MitsonarError(f"{self.path / RUN_FILE} is damaged (height_m is {height!r}): make the odometry again")
 

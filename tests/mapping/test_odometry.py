@@ -628,3 +628,16 @@ def test_nothing_is_left_where_nothing_was_estimated(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="needs height and pitch"):
         run_odometry(FrameSource.of(frames), "direct", Direct(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_height_that_a_stranger_wrote_is_refused(tmp_path: Path) -> None:
+    run(tmp_path / "out", sway(5))
+    file = tmp_path / "out" / "run.json"
+    state = json.loads(file.read_text())
+    for height in ("2", -1.0, True, 1e400):
+        file.write_text(json.dumps({**state, "asked": {**state["asked"], "height_m": height}}))
+        with pytest.raises(MitsonarError, match=r"run\.json is damaged \(height_m is "):
+            _ = OdometryFolder.open(tmp_path / "out").height_m
+    file.write_text(json.dumps({**state, "asked": {**state["asked"], "height_m": 2.5}}))
+    assert OdometryFolder.open(tmp_path / "out").height_m == 2.5
