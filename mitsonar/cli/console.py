@@ -16,7 +16,7 @@ import typer
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, explain_missing
 
-__all__ = ["answered", "command_line", "numbers", "progress_bar", "say", "say_stopped", "warn"]
+__all__ = ["LaterBar", "answered", "changes_of", "command_line", "numbers", "progress_bar", "say", "say_stopped", "warn"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -125,6 +125,22 @@ def numbers(text: str | None, count: int, what: str) -> list[float] | None:
     return values
 
 
+def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
+    """KEY=VALUE pairs, values as YAML."""
+    import yaml
+
+    changes: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        if not (key and equals):
+            raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
+        try:
+            changes[key] = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise MitsonarError(f"--set {key}: {text!r} is not a YAML value") from None
+    return changes if seed is None else {**changes, "seed": seed}
+
+
 @contextmanager
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
     """A bar with rate and time left on standard error, or in a log a line every ten seconds; yields what to call."""
@@ -165,3 +181,30 @@ class _Log:
             line = f"{self.what} {self.done}/{self.total}, {rate:.1f} {self.unit}/s, {left:.0f} s left"
             typer.echo(line, err=True)
             self.said = now
+
+
+class LaterBar:
+    """A progress bar that begins when the length is known."""
+
+    def __init__(self, what: str, unit: str) -> None:
+        self.what, self.unit = what, unit
+        self.inner: Any = None
+        self.call: Callable[[int], object] = lambda done: None
+
+    def begin(self, total: int, done: int) -> None:
+        """Show the bar, with what is done already."""
+        self.inner = progress_bar(self.what, total, self.unit)
+        self.call = self.inner.__enter__()
+        if done:
+            self.call(done)
+
+    def advance(self, more: int) -> None:
+        """Show that more is done."""
+        self.call(more)
+
+    def __enter__(self) -> LaterBar:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if self.inner is not None:
+            self.inner.__exit__(*error)

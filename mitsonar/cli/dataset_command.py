@@ -6,14 +6,14 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, command_line, progress_bar, say, say_stopped, warn
+from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
 from mitsonar.errors import MitsonarError
 
-__all__ = ["changes_of", "datasets"]
+__all__ = ["datasets"]
 
 Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s3://...) of a data set.")]
 
@@ -56,7 +56,7 @@ def make(
     if workers is not None and scheduler is not None:
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
     crew = len(os.sched_getaffinity(0)) if workers is None else workers
-    bar = _Bar()
+    bar = LaterBar("rendering", "frames")
     words = {"sequences": sequences, "workers": crew, "scheduler": scheduler, "verify": verify}
     try:
         with bar:
@@ -126,6 +126,7 @@ def show(
     import io
 
     from mitsonar.datasets.store import DataStore
+    from mitsonar.io.run_directory import refuse_to_replace
     from mitsonar.io.whole_files import write_whole
     from mitsonar.plotting.data_sheet import sheet_figure
 
@@ -133,8 +134,7 @@ def show(
     path = out or Path(Path(store.place.url).stem + ".png")
     if path.suffix.lower() != ".png" or not path.parent.is_dir():
         raise MitsonarError(f"-o must name a .png file in a folder that is there: got {path}")
-    if path.exists() and not overwrite:
-        raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
+    refuse_to_replace(path, overwrite=overwrite)
     buffer = io.BytesIO()
     sheet_figure(store, samples=samples, view=view, seed=seed).savefig(buffer, format="png", dpi=90)
     write_whole(path, buffer.getvalue())
@@ -175,43 +175,3 @@ def recipes(
 
     for key, path in shipped_recipes().items():
         say(f"{key:24} {yaml.safe_load(path.read_text(encoding='utf-8'))['about']}")
-
-
-class _Bar:
-    """A progress bar that begins when the length is known."""
-
-    def __init__(self) -> None:
-        self.inner: Any = None
-        self.call: Any = lambda frames: None
-
-    def begin(self, frames: int, done: int) -> None:
-        self.inner = progress_bar("rendering", frames, "frames")
-        self.call = self.inner.__enter__()
-        if done:
-            self.call(done)
-
-    def advance(self, frames: int) -> None:
-        self.call(frames)
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        if self.inner is not None:
-            self.inner.__exit__(*error)
-
-
-def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
-    """KEY=VALUE pairs, values as YAML."""
-    import yaml
-
-    changes: dict[str, Any] = {}
-    for pair in pairs:
-        key, equals, text = pair.partition("=")
-        if not (key and equals):
-            raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
-        try:
-            changes[key] = yaml.safe_load(text)
-        except yaml.YAMLError:
-            raise MitsonarError(f"--set {key}: {text!r} is not a YAML value") from None
-    return changes if seed is None else {**changes, "seed": seed}

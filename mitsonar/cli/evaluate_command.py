@@ -9,22 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsonar.cli.compare_command import FEWEST_SCENES, markdown
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
     from mitsonar.networks.checkpoint import Checkpoint
 
-__all__ = ["Run", "checkpoint_from", "evaluate", "report_lines"]
+__all__ = ["Run", "checkpoint_from", "evaluate"]
 
 Run = Annotated[str, typer.Argument(metavar="RUN", help="Folder of a training, a checkpoint, or corrnet.")]
-
-COLUMNS = (
-    *("method", "RMSE", "as in the thesis", "95 % interval", "median", "95 %", "slope", "bias", "large", "skill", "nees"),
-    *("ms", "inputs"),
-)
-RESULTS = ("table.md", "table.json")
 
 
 @answered
@@ -54,10 +46,12 @@ def evaluate(
     `large` is the RMSE of motions beyond half the largest (10..20 mm of 20), `as in the thesis` has yaw in 1/100 deg.
     """
     checkpoint = checkpoint_from(run)
+    from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
     from mitsonar.training.evaluation import evaluate as evaluated
+    from mitsonar.training.evaluation_tables import refuse_tables, report_lines, save_tables
 
     if out is not None:
-        _check_folder(out, overwrite)
+        refuse_tables(out, overwrite=overwrite)
     levels = None if noise is None else list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
     words: dict[str, Any] = {"part": part, "pairs": pairs, "force": force, "seed": seed, "batch": batch}
     with ExitStack() as bar:
@@ -75,7 +69,7 @@ def evaluate(
         warn(f"{report['scenes']} scenes only: the 95 % intervals are too narrow; evaluate on {FEWEST_SCENES} or more")
     lines = report_lines(report)
     if out is not None:
-        _write(out, lines, report)
+        save_tables(out, report)
     if as_json:
         say(json.dumps(report, indent=1))
         return
@@ -85,7 +79,7 @@ def evaluate(
     for line in lines:
         say(line)
     if out is not None:
-        say(f"\ntables: {out / RESULTS[0]}, {out / RESULTS[1]}")
+        say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}")
 
 
 def checkpoint_from(run: str) -> Checkpoint:
@@ -97,37 +91,3 @@ def checkpoint_from(run: str) -> Checkpoint:
     from mitsonar.networks.checkpoint import Checkpoint
 
     return Checkpoint.load(run)
-
-
-def report_lines(report: dict[str, Any]) -> list[str]:
-    """The tables of :func:`mitsonar.training.evaluation.evaluate` as Markdown."""
-    units = "height mm" if len(report["names"]) == 1 else "sideways mm / forward mm / yaw deg"
-    units = units.removesuffix(" / yaw deg") if len(report["names"]) == 2 else units
-    lines = [
-        f"{report['data']} ({report['recipe']}), part {report['part']} by {report['split']}: {report['pairs']} samples of "
-        f"{report['scenes']} scenes, {report['model']} model; {units}"
-    ]
-    for table in report["tables"]:
-        beyond = table["beyond"]
-        lines += ["", f"noise {table['noise']}", "", *markdown(table["rows"], COLUMNS), ""]
-        lines.append(
-            f"beyond the targets of training: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the answers  "
-        )
-    return lines
-
-
-def _check_folder(out: Path, overwrite: bool) -> None:
-    """Refuse to write over what is there."""
-    if out.exists() and not out.is_dir():
-        raise MitsonarError(f"-o is a folder: got the file {out}")
-    there = [name for name in RESULTS if (out / name).exists()]
-    if there and not overwrite:
-        raise MitsonarError(f"{out / there[0]} exists and is kept: choose another -o, or give --overwrite")
-
-
-def _write(out: Path, lines: list[str], report: dict[str, Any]) -> None:
-    from mitsonar.io.whole_files import write_json, write_whole
-
-    out.mkdir(parents=True, exist_ok=True)
-    write_whole(out / RESULTS[0], ("\n".join(lines) + "\n").encode())
-    write_json(out / RESULTS[1], report)

@@ -22,14 +22,14 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write a network with its weights as ONNX; what its numbers mean stands in the file's metadata."""
+    from mitsonar.io.run_directory import refuse_to_replace
     from mitsonar.io.whole_files import write_whole
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
         raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}{meant(batch, ['dynamic'])}")
     if onnx.suffix.lower() != ".onnx" or not onnx.parent.is_dir():
         raise MitsonarError(f"--onnx must name an .onnx file in a folder that is there: got {onnx}")
-    if onnx.exists() and not overwrite:
-        raise MitsonarError(f"{onnx} exists and is kept: choose another --onnx, or give --overwrite")
+    refuse_to_replace(onnx, overwrite=overwrite, option="--onnx")
     checkpoint = checkpoint_from(run)
     from mitsonar.networks.onnx_export import onnx_of
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +12,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
 from mitsonar.errors import MitsonarError
+from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -44,11 +43,12 @@ def height(
     `mitsonar odometry --height-by` gives estimators the heights found like this.
     """
     from mitsonar.estimation.height.named_height_estimators import height_estimator_from
+    from mitsonar.mapping.height_tables import heights_csv, heights_lines
     from mitsonar.mapping.measured_heights import measured
     from mitsonar.mapping.open_source import Reading, frames_for, views_for
 
-    if out is not None and out.exists() and not overwrite:
-        raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or --overwrite")
+    if out is not None:
+        refuse_to_replace(out, overwrite=overwrite)
     estimator = height_estimator_from(by)
     source: FrameSource | ViewSource
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
@@ -72,8 +72,8 @@ def height(
             progress(len(here))
     true = None if source.sonar_poses is None else source.sonar_poses[:, 2]
     if out is not None:
-        write_whole(out, _csv(source.time_s, said, true).encode())
-    for line in _lines(said, true):
+        write_whole(out, heights_csv(source.time_s, said, true).encode())
+    for line in heights_lines(said, true):
         say(line)
     lost = sum(not one.valid for one in said)
     given = estimator.inputs if pitch_deg is None else f"pitch {pitch_deg:g} deg as told, which the frames cannot check"
@@ -96,31 +96,3 @@ def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | Non
         return None
     names = tuple(name for stored, name in array_names(recipe).values() if stored == kind)
     return (view,) if view is not None else ("whole",) if "whole" in names else names, kind
-
-
-def _csv(time_s: np.ndarray, said: list[HeightEstimate], true: np.ndarray | None) -> str:
-    """A line a frame; empty where nothing is known."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["frame", "time_s", "height_m", "std_m", "believed", "reason", "true_z_m"])
-    for k, one in enumerate(said):
-        numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (one.height_m, one.std_m)]
-        z = "" if true is None else f"{true[k]:.6g}"
-        table.writerow([k, f"{time_s[k]:.9g}", *numbers, int(one.valid), one.reason, z])
-    return text.getvalue()
-
-
-def _lines(said: list[HeightEstimate], true: np.ndarray | None) -> list[str]:
-    """What is told of all frames."""
-    believed = np.array([one.valid for one in said], dtype=bool)
-    heights = np.array([one.height_m for one in said])[believed]
-    lines = []
-    for reason in dict.fromkeys(one.reason for one in said if not one.valid):
-        lines.append(f"not believed, {sum(one.reason == reason for one in said):,} frames: {reason}")
-    if len(heights):
-        lines.append(f"height {heights.min():.3f} .. {heights.max():.3f} m, median {np.median(heights):.3f} m")
-    if true is not None and len(heights):
-        error = heights - true[believed]
-        rmse, middle = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
-        lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {middle:.2f} cm, bias {100 * error.mean():+.2f} cm")
-    return lines

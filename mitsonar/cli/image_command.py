@@ -39,7 +39,7 @@ def image(
     folder = out or run_folder / "rebinned"
     if run_folder.resolve().is_relative_to(folder.resolve()):
         raise MitsonarError(f"-o {folder} would replace the echoes that are read: choose another folder")
-    origin = {"echoes_of": str(run_folder), "echoes_recipe": source.about.get("recipe", {})}
+    origin = {"echoes_of": str(run_folder), "echoes_recipe": source.asked}
     with progress_bar("binning", len(source.trajectory), "pings") as progress:
         report = run(
             source, source.trajectory, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress

@@ -48,19 +48,17 @@ def impulse(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
     """Measure channels: responses.npz, responses.zarr, response.png and waterfall.png in the folder OUT."""
+    from mitsonar.io.provenance import file_digest
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.impulse_run import iteration_error, run_impulse
-    from mitsonar.simulation.render_run import scene_digest
     from mitsonar.simulation.scene import channel_sonar_in, find_scene, load_scene
 
-    if overwrite and resume:
-        raise MitsonarError("--overwrite and --resume contradict each other: give one")
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     sonar, attitude = _instrument(channel_sonar_in(loaded), model, seed, set_ or [])
     flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory, frame)
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
-    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     simulator = ChannelSimulator(loaded, sonar)
     with progress_bar("measuring", len(flown), "pings") as progress:
         report = run_impulse(

@@ -14,6 +14,7 @@ from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
 from mitsonar.cli.render_command import Frame
 from mitsonar.errors import MitsonarError, meant
+from mitsonar.io.run_directory import refuse_to_replace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -114,9 +115,7 @@ def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
     if kind != ".png" and true is not None:
         raise MitsonarError("--true is drawn into a figure: give a .png as -o, or leave it out")
     quality = out.with_suffix(".quality.png") if kind == ".png" else None
-    for path in (out, quality):
-        if path is not None and path.exists() and not (overwrite and path.is_file()):
-            raise MitsonarError(f"{path} exists and is kept: choose another -o, or give --overwrite")
+    refuse_to_replace(out, *([] if quality is None else [quality]), overwrite=overwrite)
     return quality
 
 
@@ -131,7 +130,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
     paths: dict[str, Trajectory] = {}
     if Path(trajectory).is_dir():
         folder = OdometryFolder.open(trajectory)
-        height = folder.state["recipe"]["height_m"]
+        height = folder.height_m
         paths["estimated"] = folder.estimated
         if folder.true is not None:
             paths["true"] = folder.true

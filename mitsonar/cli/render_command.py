@@ -51,13 +51,12 @@ def render(
 ) -> None:
     """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise
+    from mitsonar.io.provenance import file_digest
     from mitsonar.motion.conventions import convention_named
     from mitsonar.simulation.imaging import Simulator
-    from mitsonar.simulation.render_run import Outputs, run, scene_digest
+    from mitsonar.simulation.render_run import Outputs, run
     from mitsonar.simulation.scene import find_scene, load_scene
 
-    if overwrite and resume:
-        raise MitsonarError("--overwrite and --resume contradict each other: give one")
     outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=convention_named(frame).name)
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
@@ -65,7 +64,7 @@ def render(
     path = _path(instrument, attitude, scene, frames, start, end, trajectory, frame)
     folder = out or Path("out") / find_scene(scene).stem
     simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
-    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": scene_digest(find_scene(scene)), "parameters": parameters}
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)

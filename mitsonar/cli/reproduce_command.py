@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, say_stopped
-from mitsonar.cli.dataset_command import changes_of
+from mitsonar.cli.console import answered, changes_of, progress_bar, say, say_stopped
 from mitsonar.cli.train_command import TrainingBar, asked_to_stop
 from mitsonar.errors import MitsonarError
 

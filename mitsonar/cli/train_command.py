@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsonar.cli.console import answered, say
-from mitsonar.cli.dataset_command import changes_of
+from mitsonar.cli.console import answered, changes_of, say
 
 if TYPE_CHECKING:
     from mitsonar.training.training_run import Report

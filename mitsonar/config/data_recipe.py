@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from functools import cached_property
@@ -18,6 +17,7 @@ from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
+from mitsonar.io.provenance import digest
 from mitsonar.motion.pose import Pose
 from mitsonar.worlds.families import create_family
 from mitsonar.worlds.world import Family, Interval
@@ -291,7 +291,7 @@ class Recipe(_Part):
         """What the recipe says beside the defaults, and more, as 16 hexadecimal digits: a key that a later version adds
         changes nothing for who does not use it."""
         said = self.model_dump(mode="json", exclude_defaults=True)
-        return hashlib.sha256(json.dumps([said, *more]).encode()).hexdigest()[:16]
+        return digest(json.dumps([said, *more]))[:16]
 
     def suffix(self, view: str) -> str:
         """What the names of a view's arrays end with: nothing where there is only one."""

@@ -261,14 +261,6 @@ class TrainingRecipe(_Part):
         """This recipe with some keys changed, checked again."""
         return training_recipe_from({**self.plain(), **fields})
 
-    def differs(self, other: TrainingRecipe) -> str | None:
-        """The first key whose value differs, with both values in words; None where all are the same."""
-        mine, others = _flat(self.plain()), _flat(other.plain())
-        for key in mine | others:
-            if mine.get(key) != others.get(key):
-                return f"{key} {mine.get(key)!r}, not {others.get(key)!r}"
-        return None
-
 
 def shipped_training_recipes() -> dict[str, Path]:
     """The recipes of the package by name."""
@@ -310,11 +302,3 @@ def training_recipe_from(fields: dict[str, Any]) -> TrainingRecipe:
         raise MitsonarError(said.replace("validate_", "validate")) from None
     except TypeError as error:
         raise MitsonarError(f"training recipe keys must be words: {error}") from None
-
-
-def _flat(fields: dict[str, Any], before: str = "") -> dict[str, Any]:
-    """Keys with dots between the levels."""
-    table: dict[str, Any] = {}
-    for key, value in fields.items():
-        table |= _flat(value, f"{before}{key}.") if isinstance(value, dict) and value else {f"{before}{key}": value}
-    return table

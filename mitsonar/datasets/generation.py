@@ -13,9 +13,10 @@ from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import empty_sentence, renderer_of
 from mitsonar.datasets.plan import Plan, scenes_of
 from mitsonar.datasets.split import PARTS, deal, world_of
-from mitsonar.datasets.store import DataStore, versions
+from mitsonar.datasets.store import PACKAGES, DataStore
 from mitsonar.datasets.workers import made_by
 from mitsonar.errors import MitsonarError
+from mitsonar.io.provenance import refuse_other, versions
 from mitsonar.io.storage import Storage
 from mitsonar.simulation.variant import ensure_variant
 
@@ -102,7 +103,7 @@ def _refuse_what_is_not_ours(place: Storage) -> None:
     """Arrays are made by removing what has their names: there must be nothing else."""
     there = [name for name in place.sizes() if not HALF_A_GROUP.fullmatch(name)]
     if there and "zarr.json" not in there:
-        raise MitsonarError(f"{place.url} is there and is no Zarr store: it is kept as it is; choose another -o")
+        raise MitsonarError(f"{place.url} holds other things ({min(there)}) and is kept as it is: choose another -o")
 
 
 def _begun_or_new(place: Storage, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
@@ -116,7 +117,7 @@ def _begun_or_new(place: Storage, recipe: Recipe, sequences: int | None, variant
             if verify:
                 store.mend_known(Plan.of(recipe, count))
             return store
-    about = {**renderer_of(modality_of(recipe)).settled(recipe), "variant": variant, "versions": versions()}
+    about = {**renderer_of(modality_of(recipe)).settled(recipe), "variant": variant, "versions": versions(PACKAGES)}
     return DataStore.create(place, recipe, Plan.of(recipe, count), about)
 
 
@@ -127,15 +128,9 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
         MitsonarError: it was not; what differs is named.
     """
     about = store.about
-    wanted = recipe.model_dump(mode="json")
-    other = [name for name in wanted if wanted[name] != about["recipe"].get(name)]
-    if int(about["sequences"]) != sequences:
-        other.append(f"sequences ({about['sequences']} there, {sequences} asked)")
-    if other:
-        raise MitsonarError(
-            f"{store.place.url} holds another data set, it differs in {', '.join(other)}: make it with the recipe and "
-            "options that it was begun with (`mitsonar dataset info --recipe` prints the recipe), or choose another -o"
-        )
+    asked = {**recipe.model_dump(mode="json"), "sequences": sequences}
+    had = {**about["recipe"], "sequences": about["sequences"]}
+    refuse_other(store.place.url, had, asked, " (`mitsonar dataset info --recipe` prints the recipe)")
     if about["variant"] != variant:
         raise MitsonarError(
             f"{store.place.url} was begun with {about['variant']}, this is {variant}, which differs in the last bits: set "

@@ -6,7 +6,6 @@ import hashlib
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +19,10 @@ from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import Axis, Modality, Stored
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.errors import MitsonarError
+from mitsonar.io.provenance import other_versions
 from mitsonar.io.storage import Storage
 
-__all__ = ["DECIDING", "FORMAT", "DataStore", "versions"]
+__all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
 
 FORMAT = 1
 """Version of what docs/dataset.md describes."""
@@ -32,7 +32,10 @@ SHARD_BYTES = 32 * 2**20
 
 SEAL = "seal"
 
-DECIDING = ("mitsonar", "mitsuba", "drjit")
+PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr")
+"""Packages whose versions are kept."""
+
+DECIDING = PACKAGES[:3]
 """Packages whose versions decide what is recorded."""
 
 
@@ -350,9 +353,7 @@ class DataStore:
 
     def other_versions(self) -> list[str]:
         """Packages that decide what is recorded and are not here what the store was begun with."""
-        there, here = self.about["versions"], versions()
-        deciding = (*DECIDING, *self.modality.decided_by)
-        return [f"{name} {there.get(name)} (now {here[name]})" for name in deciding if there.get(name) != here[name]]
+        return other_versions(self.about["versions"], (*DECIDING, *self.modality.decided_by))
 
     def unplanned(self, plan: Plan) -> list[str]:
         """Arrays that the plan decides and that do not hold it (to 1e-9: processors differ in last bits)."""
@@ -405,17 +406,6 @@ def planned(plan: Plan, modality: Modality) -> dict[str, NDArray[Any]]:
 def digest(content: bytes) -> int:
     """64 bits of BLAKE2b."""
     return int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
-
-
-def versions() -> dict[str, str]:
-    """Versions of what decides the values."""
-    found = {}
-    for package in ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found
 
 
 TEXTS = {

@@ -43,7 +43,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise MitsonarError(f"no such file: {path}") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # the last where it is nested too deep
         raise MitsonarError(f"cannot read {path}: {error}") from None
     if not isinstance(value, dict):
         raise MitsonarError(f"{path} must hold a JSON object")

@@ -9,7 +9,6 @@ import json
 import time
 import warnings
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
-from mitsonar.io.whole_files import read_json, write_json, write_whole
+from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
+from mitsonar.io.whole_files import write_json, write_whole
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source
 from mitsonar.motion.conventions import convention_named
@@ -28,25 +28,31 @@ from mitsonar.plotting.map_figure import path_figure, save_figure
 
 __all__ = ["OdometryFolder", "run_odometry", "table_lines"]
 
-KIND = "mitsonar odometry"
-
-FILES = (
-    *("run.json", "estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
-    *("table.md", "table.json", "path.png"),
+ODOMETRY = RunKind(
+    "odometry",
+    outputs=(
+        *("estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
+        *("table.md", "table.json", "path.png"),
+    ),
+    notes={
+        **{"source": str, "inputs": str, "smooth": str, "scale": str, "frame": str, "factors": list, "from": list},
+        **{"not_believed": int, "warnings": list, "seconds": float, "pairs_in_these_seconds": int, "workers": int},
+    },
+    packages=("mitsonar", "numpy", "scipy", "opencv-python-headless"),
+    deciding=("mitsonar",),
 )
-"""All that a folder may hold; nothing else is ever removed."""
 
 
 class OdometryFolder:
     """A folder that an odometry is written to, or lies in.
 
     Attributes:
+        run: what was asked for, and how far it is.
         path: where.
-        state: what ``run.json`` holds.
     """
 
-    def __init__(self, path: str | Path, state: dict[str, Any]) -> None:
-        self.path, self.state = Path(path), state
+    def __init__(self, run: RunDirectory) -> None:
+        self.run, self.path = run, run.path
 
     @classmethod
     def open(cls, path: str | Path) -> OdometryFolder:
@@ -55,12 +61,22 @@ class OdometryFolder:
         Raises:
             MitsonarError: none, or not finished.
         """
-        folder = cls(path, read_json(Path(path) / "run.json"))
-        if folder.state.get("kind") != KIND:
-            raise MitsonarError(f"{path} is no odometry: give the folder that `mitsonar odometry` made")
-        if not folder.state.get("finished"):
+        folder = cls(RunDirectory.open(path, ODOMETRY))
+        if not folder.run.finished:
             raise MitsonarError(f"{path} is not finished: run the same `mitsonar odometry` with --resume")
         return folder
+
+    @property
+    def height_m(self) -> float | None:
+        """Height over the ground that the odometry was told [m].
+
+        Raises:
+            MitsonarError: ``run.json`` is damaged.
+        """
+        height = self.run.asked.get("height_m")
+        if height is None or (type(height) in (int, float) and 0 < height < 1e6):
+            return height
+        raise MitsonarError(f"{self.path / RUN_FILE} is damaged (height_m is {height!r}): make the odometry again")
 
     @property
     def estimated(self) -> Trajectory:
@@ -76,40 +92,9 @@ class OdometryFolder:
         """A path in the convention in which it was written; what it looks at was known then."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MitsonarWarning)
-            return Trajectory.load(self.path / name, str(self.state.get("frame", "mitsonar")))
+            return Trajectory.load(self.path / name, str(self.run.notes.get("frame", "mitsonar")))
 
-    # ---------------------------------------------------------------- beginning
-
-    @classmethod
-    def begin(cls, path: str | Path, state: dict[str, Any], *, overwrite: bool, resume: bool) -> OdometryFolder:
-        """A place for a new odometry, or the one that is there and goes on; nothing is written yet.
-
-        ``state["recipe"]`` decides the estimates: one that goes on must have the same.
-
-        Raises:
-            MitsonarError: something else is there; the one to resume was another one.
-        """
-        folder = cls(path, json.loads(json.dumps(state, default=_plain)))
-        there = folder.path
-        if not there.exists() or (there.is_dir() and not any(not one.name.endswith(".part") for one in there.iterdir())):
-            return folder
-        if not (overwrite or resume):
-            raise MitsonarError(f"{there} exists and is kept as it is: choose another -o, or --resume, or --overwrite")
-        had = read_json(there / "run.json") if (there / "run.json").is_file() else {}
-        if had.get("kind") != KIND:
-            raise MitsonarError(f"{there} is no odometry of mitsonar and is kept as it is: choose another -o")
-        if overwrite:
-            for name in FILES:
-                (there / name).unlink(missing_ok=True)
-            return folder
-        old, new = had.get("recipe", {}), folder.state["recipe"]
-        other = [key for key in new if new[key] != old.get(key)]
-        if other:
-            raise MitsonarError(
-                f"{there} holds another odometry, it differs in {', '.join(other)}: resume with the options it was begun "
-                "with (run.json has them), or choose another -o"
-            )
-        return folder
+    # ---------------------------------------------------------------- estimates
 
     def kept(self) -> dict[int, Estimate]:
         """Estimates of an earlier try, by the number of their pair; a line that a kill left half written is cut off.
@@ -140,22 +125,18 @@ class OdometryFolder:
         Raises:
             MitsonarError: it cannot be made.
         """
-        if not (self.path / "run.json").exists():
-            try:
-                self.path.mkdir(parents=True, exist_ok=True)
-                write_json(self.path / "run.json", self.state)
-            except OSError as error:
-                raise MitsonarError(f"cannot write {self.path}: {error.strerror}; choose another -o") from None
+        self.run.start()
         with (self.path / "estimates.jsonl").open("a", encoding="utf-8") as file:
             file.write(_line_of(pair, estimate))
 
     # ---------------------------------------------------------------- results
 
-    def write(self, found: Odometry, more: dict[str, Any]) -> None:
+    def write(self, found: Odometry, title: str, more: dict[str, Any]) -> None:
         """All results; the last one is run.json, which says that they are whole."""
-        self.state |= more | {"finished": False}
-        write_json(self.path / "run.json", self.state)
-        frame = str(self.state.get("frame", "mitsonar"))
+        self.run.start()
+        self.run.finished = False
+        self.run.note(**more)
+        frame = str(self.run.notes.get("frame", "mitsonar"))
         _save_tum(self.path / "estimated.tum", found.path, frame)
         if found.true is not None:
             _save_tum(self.path / "true.tum", found.true, frame)
@@ -165,9 +146,8 @@ class OdometryFolder:
         write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
         table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
         write_json(self.path / "table.json", {"rows": table})
-        save_figure(self.path / "path.png", _figure(found, str(self.state["title"])))
-        self.state["finished"] = True
-        write_json(self.path / "run.json", self.state)
+        save_figure(self.path / "path.png", _figure(found, title))
+        self.run.finish()
 
 
 def run_odometry(
@@ -211,10 +191,8 @@ def run_odometry(
     Raises:
         MitsonarError: as there; the folder holds something else, or cannot be written.
     """
-    if overwrite and resume:
-        raise MitsonarError("--overwrite and --resume contradict each other: give one")
     convention_named(frame)
-    recipe = {
+    asked = {
         "estimator": name,
         "options": dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {},  # type: ignore[arg-type]
         "frames": len(source),
@@ -223,19 +201,9 @@ def run_odometry(
         "height_m": source.told_height_m,
         "pitch_deg": None if source.pitch_rad is None else float(np.degrees(source.pitch_rad)),
         "noise": None if source.noise is None else {**source.noise.model_dump(), "seed": source.seed},
-        "mitsonar": _version("mitsonar"),
     }
-    state = {
-        "kind": KIND,
-        "finished": False,
-        "title": f"{Path(source.name).name}, {name}",
-        "source": source.name,
-        "inputs": estimator.inputs,
-        "recipe": recipe,
-        "versions": {package: _version(package) for package in ("numpy", "scipy", "opencv-python-headless")},
-    }
-    folder = OdometryFolder.begin(out, state, overwrite=overwrite, resume=resume)
-    kept = folder.kept() if resume else {}
+    folder = OdometryFolder(RunDirectory.begin(out, ODOMETRY, asked, resume=resume, overwrite=overwrite))
+    kept = folder.kept() if folder.run.resumed else {}
     begun = time.perf_counter()
     found = odometry(
         source,
@@ -250,18 +218,20 @@ def run_odometry(
         progress=progress,
     )
     settings = {
+        "source": source.name,
+        "inputs": estimator.inputs,
         "smooth": smooth,
-        "scale": scale if isinstance(scale, str) else None if scale is None else np.asarray(scale, dtype=float).tolist(),
+        "scale": scale if isinstance(scale, str) or scale is None else "given",
         "frame": frame,
-        "factors": found.factors.tolist(),
-        "from": list(found.path.poses[0]),
+        "factors": found.factors,
+        "from": found.path.poses[0],
         "not_believed": int((~found.believed).sum()),
         "warnings": found.warnings(),
         "seconds": time.perf_counter() - begun,
         "pairs_in_these_seconds": len(found.estimates) - len(kept),
         "workers": workers,
     }
-    folder.write(found, settings)
+    folder.write(found, f"{Path(source.name).name}, {name}", settings)
     return found
 
 
@@ -352,15 +322,3 @@ def _figure(found: Odometry, title: str) -> Any:
         pose_covariances=None if poses is None else {"estimated": poses},
         title=title,
     )
-
-
-def _plain(value: Any) -> Any:
-    """What JSON does not know."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed as a package"

@@ -449,6 +449,26 @@ class Tally:
         return {name: getattr(self, name) for name in names}
 
     @classmethod
-    def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
-        """The tally of a run that was broken off."""
-        return cls(sonar, **{**state, "worst": tuple(state["worst"]), "first_empty": tuple(state["first_empty"])})
+    def restore(cls, sonar: Sonar, state: Any) -> Tally:
+        """The tally of a run that was broken off.
+
+        Raises:
+            MitsonarError: the state is damaged.
+        """
+        kept = cls(sonar)
+        try:
+            single = (state[name] for name in kept.state() if name not in ("rays", "worst", "first_empty"))
+            counts = [*state["worst"], *state["first_empty"], *state["rays"].values(), *single]
+            if (
+                len(state["worst"]) != 2
+                or len(state["first_empty"]) not in (0, 5)
+                or set(state["rays"]) != set(kept.rays)
+                or set(state) != set(kept.state())
+            ):
+                raise ValueError("other counts")
+            if not all(type(count) is int and 0 <= count < 2**63 for count in counts):
+                raise ValueError("counts are whole and not negative")
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise MitsonarError(f"the tally of the run is damaged ({error}): begin anew with --overwrite") from None
+        tuples = {name: tuple(state[name]) for name in ("worst", "first_empty")}
+        return cls(sonar, **{**state, "rays": dict(state["rays"]), **tuples})

@@ -13,15 +13,25 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.io.provenance import digest
+from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.pose import Trajectory
 from mitsonar.plotting.response_figure import response_png, waterfall_png
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
-from mitsonar.simulation.render_run import begin, path_digest
+from mitsonar.simulation.render_run import SIMULATORS
 
-__all__ = ["Report", "Spread", "iteration_error", "run_impulse", "spread_of"]
+__all__ = ["SOUNDING", "Report", "Spread", "iteration_error", "run_impulse", "spread_of"]
+
+SOUNDING = RunKind(
+    "channel measurement",
+    outputs=("responses.npz", "responses.zarr", "response.png", "waterfall.png"),
+    notes={"frames_done": int, "warnings": list},
+    packages=(*SIMULATORS, "finufft"),
+    deciding=(*SIMULATORS[:3], "finufft"),
+)
 
 OVERSPREAD = 0.3
 """Delay spread times Doppler spread above which a channel can hardly be measured."""
@@ -79,41 +89,41 @@ def run_impulse(
     Raises:
         MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
     """
-    folder, sonar = Path(folder), simulator.sonar
-    recipe = {**origin, "sonar": sonar.model_dump(mode="json"), "pings": len(flown), "poses_sha256": path_digest(flown)}
-    recipe["velocity"] = velocity[0].tolist() if len(np.unique(velocity, axis=0)) == 1 else "of the path"
+    sonar = simulator.sonar
+    asked = {**origin, "sonar": sonar.model_dump(mode="json"), "pings": len(flown)}
+    asked["poses_sha256"] = digest(flown.poses.tobytes(), flown.time_s.tobytes())
+    asked["velocity"] = velocity[0].tolist() if len(np.unique(velocity, axis=0)) == 1 else "of the path"
     paths = [simulator.paths(flown.poses[0], velocity[:1], receiver) for receiver in range(len(sonar.receivers))]
     spread = spread_of(paths)
     if not any(path.amplitude.size for path in paths):
         _refuse_silence(simulator, flown, paths)
-    state = begin(folder, recipe, "responses", overwrite=overwrite, resume=resume)
-    if not state["finished"]:
-        progress(int(state["frames_done"]))
-        made = _make(simulator, flown, velocity, folder, state, progress)
-        state["warnings"] = [*simulator.notes, *warnings_of(made, spread)]
-        write_json(folder / "run.json", state)
+    run = RunDirectory.begin(folder, SOUNDING, asked, resume=resume, overwrite=overwrite)
+    run.start(frames_done=0)
+    if not (run.path / "responses.npz").exists():  # the last that is written
+        progress(run.count("frames_done", len(flown)))
+        made = _make(simulator, flown, velocity, run, progress)
+        run.note(warnings=[*simulator.notes, *warnings_of(made, spread)])
         made.about |= {"spread_factor": spread.factor}
-        write_whole(folder / "response.png", response_png(made))
-        write_whole(folder / "waterfall.png", waterfall_png(made))
-        made.save(folder / "responses.npz")
-        state["finished"] = True
-        write_json(folder / "run.json", state)
-    return Report(folder, len(flown), spread, state["warnings"])
+        write_whole(run.path / "response.png", response_png(made))
+        write_whole(run.path / "waterfall.png", waterfall_png(made))
+        made.save(run.path / "responses.npz")
+    if not run.finished:
+        run.finish()
+    return Report(run.path, len(flown), spread, run.notes.get("warnings") or [])
 
 
 def _make(
     simulator: ChannelSimulator,
     flown: Trajectory,
     velocity: NDArray[np.float64],
-    folder: Path,
-    state: dict[str, Any],
+    run: RunDirectory,
     progress: Callable[[int], None],
 ) -> ImpulseResponses:
-    """Make the pings that are missing; ``state`` and run.json follow each batch."""
+    """Make the pings that are missing; the run's notes follow each batch."""
     import zarr
 
-    done = int(state["frames_done"])
-    url = folder / "responses.zarr"
+    done = run.count("frames_done", len(flown))
+    url = run.path / "responses.zarr"
     if done == 0:
         shape = (len(flown), len(simulator.sonar.receivers))
         empty = ImpulseResponses(
@@ -133,8 +143,7 @@ def _make(
             here = slice(part.first, part.first + len(part))
             for name in ("response", "height_m", "echoes", "dropped"):
                 group[name][here] = getattr(part, name)  # type: ignore[index]
-            state["frames_done"] = here.stop
-            write_json(folder / "run.json", state)
+            run.note(frames_done=here.stop)
             progress(len(part))
     except (KeyError, ValueError) as error:
         raise MitsonarError(f"cannot go on with {url}: {error}; make it again with --overwrite") from None

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,7 +16,9 @@ from PIL import Image
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import read_json, write_json, write_whole
+from mitsonar.io.provenance import digest
+from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.pose import Trajectory
 from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
@@ -27,7 +27,18 @@ from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.imaging import Pings, Tally, constant_gain, to_image
 from mitsonar.simulation.variant import ensure_variant
 
-__all__ = ["Outputs", "Report", "Source", "StoredEchoes", "begin", "path_digest", "run", "scene_digest"]
+__all__ = ["RENDERING", "SIMULATORS", "Outputs", "Report", "Source", "StoredEchoes", "run"]
+
+SIMULATORS = ("mitsonar", "mitsuba", "drjit", "numpy")
+"""Packages that decide what is simulated, to the last bit."""
+
+RENDERING = RunKind(
+    "rendering",
+    outputs=("frames.npz", "frames.zarr", "images", "cartesian", "echoes", "poses.tum"),
+    notes={"frames_done": int, "gain": float, "tally": dict, "warnings": list},
+    packages=SIMULATORS,
+    deciding=SIMULATORS[:3],
+)
 
 
 class Source(Protocol):
@@ -88,7 +99,7 @@ def run(
         folder: is made; holds ``frames.npz`` (or ``frames.zarr``), ``images/``, ``poses.tum``, ``run.json`` and what
             ``outputs`` asks for.
         outputs: what is written.
-        origin: what repeats the run beside sonar, poses and outputs (scene, its digest, parameters); kept in run.json.
+        origin: what repeats the run beside sonar, poses and outputs: scene, its digest, parameters.
         overwrite: replace a run that is there.
         resume: go on with a run that was broken off.
         progress: called with the number of frames that were added.
@@ -96,54 +107,80 @@ def run(
     Raises:
         MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
     """
-    folder = Path(folder)
-    recipe = _recipe(source, trajectory, outputs, origin)
-    state = begin(folder, recipe, "frames", overwrite=overwrite, resume=resume)
-    trajectory.save(folder / "poses.tum", outputs.frame)
-    if not state["finished"]:
-        progress(int(state["frames_done"]))
-        store = _make_frames(source, trajectory, folder, outputs, state, progress)
-        tally = Tally.restore(source.sonar, state["tally"])
-        state["warnings"] = [*source.notes, *tally.warnings(source, trajectory.poses)]
-        write_json(folder / "run.json", state)
+    made = RunDirectory.begin(
+        folder, RENDERING, _asked(source, trajectory, outputs, origin), resume=resume, overwrite=overwrite
+    )
+    made.start(frames_done=0)
+    trajectory.save(made.path / "poses.tum", outputs.frame)
+    if (made.path / "frames.npz").exists():  # finished, or killed while the store was removed
+        shutil.rmtree(made.path / "frames.zarr", ignore_errors=True)
+    elif not made.finished:
+        progress(made.count("frames_done", len(trajectory)))
+        store = _make_frames(source, trajectory, made, outputs, progress)
+        tally = Tally.restore(source.sonar, made.notes["tally"])
+        made.note(warnings=[*source.notes, *tally.warnings(source, trajectory.poses)])
         if len(trajectory) <= LONGEST_NPZ:
-            store.pack(folder / "frames.npz")
-        state["finished"] = True
-        write_json(folder / "run.json", state)
+            store.pack(made.path / "frames.npz")
+    if not made.finished:
+        made.finish()
     pictures = "cartesian" if outputs.cartesian else "images"
-    return Report(folder, len(trajectory), sorted((folder / pictures).glob("*.png")), state["warnings"])
+    found = sorted((made.path / pictures).glob("*.png"))
+    return Report(made.path, len(trajectory), found, made.notes.get("warnings") or [])
+
+
+def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dict[str, Any]) -> dict[str, Any]:
+    """All that decides the bits of a run."""
+    return {
+        **origin,
+        "variant": source.variant,
+        "sonar": source.sonar.model_dump(),
+        "frames": len(trajectory),
+        "poses_sha256": digest(trajectory.poses.tobytes(), trajectory.time_s.tobytes()),
+        "noise": outputs.noise.model_dump(),
+        "labels": outputs.labels,
+        "cartesian": outputs.cartesian,
+        "exr": outputs.exr,
+        "frame": outputs.frame,
+    }
 
 
 def _make_frames(
-    source: Source,
-    trajectory: Trajectory,
-    folder: Path,
-    outputs: Outputs,
-    state: dict[str, Any],
-    progress: Callable[[int], None],
+    source: Source, trajectory: Trajectory, made: RunDirectory, outputs: Outputs, progress: Callable[[int], None]
 ) -> FrameStore:
-    """Write the frames that are missing; ``state`` and run.json follow each batch."""
-    done, tally, store = int(state["frames_done"]), Tally(source.sonar), None
+    """Write the frames that are missing; the run's notes follow each batch."""
+    folder, done, tally, store = made.path, made.count("frames_done", len(trajectory)), Tally(source.sonar), None
     if done > 0:
-        store, tally = FrameStore.open(folder / "frames.zarr"), Tally.restore(source.sonar, state["tally"])
+        store = FrameStore.open(folder / "frames.zarr")
+        tally = Tally.restore(source.sonar, made.notes.get("tally"))
     if store is not None and done == len(trajectory):
         return store
     batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
     if done == 0:
-        state["gain"], batches = constant_gain(batches)
+        made.notes["gain"], batches = constant_gain(batches)
     for pings in batches:
-        frames, image = _frames_of(pings, source.sonar, trajectory, outputs.noise, float(state["gain"]))
+        frames, image = _frames_of(pings, source.sonar, trajectory, outputs.noise, _gain(made))
         store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
         _write_pictures(folder, pings.first, frames, outputs)
         if outputs.exr:
             _write_echoes(folder, source, frames, pings.first)
         store.write(pings.first, frames)
         tally.add(pings, image)
-        state |= {"frames_done": pings.first + len(pings), "tally": tally.state()}
-        write_json(folder / "run.json", state)
+        made.note(frames_done=pings.first + len(pings), tally=tally.state())
         progress(len(pings))
     assert store is not None
     return store
+
+
+def _gain(made: RunDirectory) -> float:
+    """The gain of all frames of a run.
+
+    Raises:
+        MitsonarError: its file tells none.
+    """
+    gain = made.notes.get("gain")
+    if gain is None or not gain > 0:
+        raise MitsonarError(f"{made.path} does not tell its gain: begin anew with --overwrite")
+    return float(gain)
 
 
 class StoredEchoes:
@@ -160,7 +197,7 @@ class StoredEchoes:
     def __init__(self, folder: str | Path, *, bins: int | None = None, window: tuple[float, float] | None = None) -> None:
         self.variant = ensure_variant()
         self.folder = Path(folder)
-        self.about = read_json(self.folder / "run.json")
+        self.asked = RunDirectory.open(folder, RENDERING).asked
         if not (self.folder / "echoes").is_dir():
             raise MitsonarError(f"{folder} holds no echoes: render the run with --exr first")
         frames = SonarFrames.load(self.folder)
@@ -204,76 +241,6 @@ class StoredEchoes:
         return self.film_echoes(pose, ping).outside(self.sonar)
 
 
-def scene_digest(path: str | Path) -> str:
-    """SHA-256 of a scene's XML file; meshes and textures that it names are not read."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
-
-
-def path_digest(trajectory: Trajectory) -> str:
-    """SHA-256 of poses and times."""
-    return hashlib.sha256(np.column_stack([trajectory.poses, trajectory.time_s]).tobytes()).hexdigest()
-
-
-def _recipe(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dict[str, Any]) -> dict[str, Any]:
-    """All that decides the bits of a run."""
-    return {
-        **origin,
-        "variant": source.variant,
-        "sonar": source.sonar.model_dump(),
-        "frames": len(trajectory),
-        "poses_sha256": path_digest(trajectory),
-        "noise": outputs.noise.model_dump(),
-        "labels": outputs.labels,
-        "cartesian": outputs.cartesian,
-        "exr": outputs.exr,
-        "frame": outputs.frame,
-    }
-
-
-def begin(folder: Path, recipe: dict[str, Any], what: str, *, overwrite: bool, resume: bool) -> dict[str, Any]:
-    """The state of the run: a new one, in a new folder, or the one that is there and was broken off.
-
-    Args:
-        folder: of the run.
-        recipe: all that decides its bits.
-        what: it makes, ``frames`` or ``responses``: a Zarr group of that name while it goes on, packed as npz in the end.
-        overwrite: replace a run that is there.
-        resume: go on with a run that was broken off.
-
-    Raises:
-        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
-    """
-    exists = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    if exists and resume:
-        state = read_json(folder / "run.json")
-        old = state.get("recipe", {})
-        other = [key for key in recipe if recipe[key] != old.get(key)]
-        if other:
-            raise MitsonarError(
-                f"{folder} holds another run, it differs in {', '.join(other)}: resume with the options it was begun "
-                f"with (run.json has them), or choose another folder"
-            )
-        if (folder / f"{what}.npz").exists():  # killed while the store was packed, or finished
-            if what == "frames":
-                shutil.rmtree(folder / "frames.zarr", ignore_errors=True)
-            state["finished"] = True
-            write_json(folder / "run.json", state)
-        return {"finished": False, "frames_done": 0, "warnings": []} | state
-    if exists and not overwrite:
-        raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o, or --resume, or --overwrite")
-    if exists:
-        if not (folder / "run.json").is_file():
-            raise MitsonarError(f"{folder} is not a run of mitsonar and is not overwritten: choose another -o")
-        shutil.rmtree(folder)
-    state = {"finished": False, "frames_done": 0, "warnings": [], "recipe": recipe, "versions": _versions()}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "run.json", state)
-    except OSError as error:
-        raise MitsonarError(f"cannot write {folder}: {error.strerror}; choose another -o") from None
-    return state
-
-
 def _frames_of(
     pings: Pings, sonar: Sonar, trajectory: Trajectory, noise: NoiseModel, gain: float
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
@@ -315,13 +282,3 @@ def _write_echoes(folder: Path, source: Source, frames: SonarFrames, first: int)
         part = path.with_name(f".{path.stem}.part.exr")
         save_exr(part, source.film_echoes(pose, first + index), source.sonar)
         part.replace(path)
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in ("mitsonar", "mitsuba", "drjit", "numpy"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed as a package"
-    return found

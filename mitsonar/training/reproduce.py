@@ -10,17 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import date
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
-from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe, training_recipe_from
+from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, complaint
+from mitsonar.io.provenance import plain_json, refuse_other, versions
+from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.storage import Storage
 from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
@@ -37,15 +38,17 @@ from mitsonar.training.document_tables import (
     tables_with,
 )
 from mitsonar.training.evaluation import evaluate
+from mitsonar.training.training_folder import TRAINING
 from mitsonar.training.training_run import Report, train
 
 __all__ = ["Effort", "Watch", "reproduce", "unseen_recipe"]
 
-ABOUT = "reproduce.json"
-"""What the folder was begun with."""
-
-FORMAT = 1
-"""Version of a folder."""
+TABLES = RunKind(
+    "tables",
+    outputs=("table.md", "table.json", "table-*.png", "data", "runs", "rows"),
+    notes={"tables": list, "recipes": dict},
+    packages=("mitsonar", "mitsuba", "drjit", "torch", "lightning", "numpy"),
+)
 
 UNSEEN_SEED = 7919
 """Added to a data set's seed: worlds that training never saw."""
@@ -92,10 +95,6 @@ class Effort:
             return recipe
         rate = recipe.optimiser.rate * math.sqrt(self.batch / recipe.batch)
         return recipe.replace(batch=self.batch, optimiser=recipe.optimiser.model_dump() | {"rate": rate})
-
-    def plain(self) -> dict[str, Any]:
-        """As JSON gives it back."""
-        return dict(json.loads(json.dumps(asdict(self))))
 
     def sentence(self) -> str:
         """For people."""
@@ -174,7 +173,7 @@ def reproduce(
     data = {name: load_recipe(recipe.data, recipe.data_changes) for name, recipe in recipes.items()}
     crew = Crew(workers, accelerator, devices, watch or SilentWatch())
     with Storage(out).locked():
-        bench = TableBuilder.begun(Path(out), effort)
+        bench = TableBuilder(RunDirectory.begin(out, TABLES, asdict(effort), resume=True), effort)
         bench.ask(table, recipes)
         report = bench.report()
         for name, recipe in recipes.items():
@@ -182,21 +181,6 @@ def reproduce(
                 bench.work(name, recipe, data[name], crew)
                 report = bench.report()
     return report
-
-
-class About(BaseModel):
-    """What ``reproduce.json`` holds: the effort, the tables that are wanted, and the recipes of the rows that were begun."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    format: int
-    version: str
-    scale: float
-    minutes: float | None
-    batch: int | None
-    changes: dict[str, Any]
-    tables: list[str]
-    recipes: dict[str, dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -214,50 +198,27 @@ class TableBuilder:
     """The folder.
 
     Attributes:
-        folder: where it is.
+        run: which tables are wanted, and the recipes of their rows.
         effort: what it was begun with.
     """
 
-    folder: Path
+    run: RunDirectory
     effort: Effort
 
-    @classmethod
-    def begun(cls, folder: Path, effort: Effort) -> TableBuilder:
-        """A new folder, or the one that is there, if it was begun alike.
+    @property
+    def folder(self) -> Path:
+        """Where it is."""
+        return self.run.path
 
-        Raises:
-            MitsonarError: it was not, or holds other things.
-        """
-        path = folder / ABOUT
-        if not path.exists():
-            others = [name for name in Storage(folder).sizes() if name != f".{ABOUT}.part"]
-            if others:
-                raise MitsonarError(f"{folder} holds other things ({others[0]}) and is kept: choose another -o")
-            about = About(format=FORMAT, version=version("mitsonar"), **effort.plain(), tables=[], recipes={})
-            write_json(path, about.model_dump())
-            return cls(folder, effort)
-        if read_json(path).get("format") != FORMAT:
-            raise MitsonarError(f"{path} is not of format {FORMAT}, which this mitsonar reads: choose another -o")
-        bench = cls(folder, effort)
-        had = bench.about()
-        differ = [
-            f"{key} {getattr(had, key)}, not {value}" for key, value in effort.plain().items() if getattr(had, key) != value
-        ]
-        if differ:
-            raise MitsonarError(f"{folder} was begun with {'; '.join(differ)}: ask for the same, or choose another -o")
-        return bench
+    @property
+    def tables(self) -> list[str]:
+        """Names of the tables that are wanted."""
+        return self.run.notes.get("tables") or []
 
-    def about(self) -> About:
-        """What the folder was begun with.
-
-        Raises:
-            MitsonarError: the file is damaged.
-        """
-        path = self.folder / ABOUT
-        try:
-            return About(**read_json(path))
-        except ValidationError as error:
-            raise MitsonarError(f"{path} is damaged: {complaint(error, About, 'file')}") from None
+    @property
+    def recipes(self) -> dict[str, Any]:
+        """Recipes of the rows that were begun."""
+        return self.run.notes.get("recipes") or {}
 
     def ask(self, table: str, recipes: dict[str, TrainingRecipe]) -> None:
         """Keep which tables are wanted, and the recipes of their rows.
@@ -265,15 +226,12 @@ class TableBuilder:
         Raises:
             MitsonarError: a row was begun with another recipe.
         """
-        about = self.about()
-        for name, recipe in recipes.items():
-            had = about.recipes.get(name)
-            other = None if had is None else training_recipe_from(had).differs(recipe)
-            if other is not None:
-                raise MitsonarError(f"row {name} of {self.folder} was begun with {other}: choose another -o")
-        tables = [name for name in load_tables() if name == table or name in about.tables]
-        begun = about.recipes | {name: recipe.plain() for name, recipe in recipes.items()}
-        write_json(self.folder / ABOUT, about.model_copy(update={"tables": tables, "recipes": begun}).model_dump())
+        self.run.start(tables=[], recipes={})
+        had, asked = self.recipes, plain_json({name: recipe.plain() for name, recipe in recipes.items()})
+        begun = {name: recipe for name, recipe in asked.items() if name in had}
+        refuse_other(self.folder, {"row": {name: had[name] for name in begun}}, {"row": begun})
+        tables = [name for name in load_tables() if name == table or name in self.tables]
+        self.run.note(tables=tables, recipes=had | asked)
 
     def work(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
         """Data, training and evaluation of one row; each stays on disk when it is done, and is not done again."""
@@ -291,7 +249,7 @@ class TableBuilder:
             _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_teller(crew.watch, f"{name}, {said}")))
             for url, part, said in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
         ]
-        reached = _reached(checkpoint, recipe, self._run(name) / "run.json")
+        reached = _reached(checkpoint, recipe, self._run(name))
         found = Found(recipe=name, validation=scores[0], unseen=scores[1], reached=reached)
         (self.folder / "rows").mkdir(exist_ok=True)
         write_json(self.folder / "rows" / f"{name}.json", found.model_dump(mode="json"))
@@ -337,16 +295,17 @@ class TableBuilder:
 
     def report(self) -> dict[str, Any]:
         """Write the tables and figures of what there is."""
-        about, found = self.about(), self.found()
-        tables = [table_named(name) for name in about.tables]
-        lines = [f"`mitsonar reproduce`, mitsonar {version('mitsonar')}: {self.effort.sentence()}."]
+        found, version = self.found(), versions(("mitsonar",))["mitsonar"]
+        tables = [table_named(name) for name in self.tables]
+        lines = [f"`mitsonar reproduce`, mitsonar {version}: {self.effort.sentence()}."]
         for table in tables:
             lines += ["", *table_lines(table, found)]
             figure = table_figure(table, found, title=f"{table.kind} {table.name}, {table.title}; {self.effort.sentence()}")
             buffer = io.BytesIO()
             figure.savefig(buffer, format="png", dpi=80)
             write_whole(self.folder / f"table-{table.name}.png", buffer.getvalue())
-        report = {**about.model_dump(), "tables": {table.name: plain_table(table, found) for table in tables}}
+        report = {"version": version, **self.run.asked, "recipes": self.recipes}
+        report["tables"] = {table.name: plain_table(table, found) for table in tables}
         write_whole(self.folder / "table.md", ("\n".join(lines) + "\n").encode())
         write_json(self.folder / "table.json", report)
         return report
@@ -391,16 +350,16 @@ def _scores(report: dict[str, Any]) -> dict[str, Score]:
     return scores
 
 
-def _reached(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Reached:
+def _reached(checkpoint: Checkpoint, recipe: TrainingRecipe, folder: Path) -> Reached:
     """The scale of a training that has ended, from what it wrote.
 
     Raises:
         MitsonarError: that file is damaged.
     """
     try:
-        return _as_told(checkpoint, recipe, read_json(path))
+        return _as_told(checkpoint, recipe, RunDirectory.open(folder, TRAINING).notes)
     except (KeyError, TypeError, ZeroDivisionError, ValidationError) as error:
-        raise MitsonarError(f"{path} is damaged ({error}): remove its folder, and the row is trained again") from None
+        raise MitsonarError(f"{folder} is damaged ({error}): remove it, and the row is trained again") from None
 
 
 def _as_told(checkpoint: Checkpoint, recipe: TrainingRecipe, run: dict[str, Any]) -> Reached:

@@ -7,7 +7,6 @@ import io
 import os
 import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,19 +15,26 @@ import torch
 import yaml
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
+from mitsonar.config.training_recipe import TrainingRecipe
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import read_json, write_json, write_whole
+from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
+from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.motion_errors import Axis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["RunFolder", "StateFile", "column", "curve_figure"]
+__all__ = ["TRAINING", "RunFolder", "StateFile", "column", "curve_figure"]
 
-NAMES = ("run.json", "recipe.yaml", "last.ckpt", "network.ckpt", "log.csv", "curve.png")
-MUST_AGREE = ("data", "digest", "render", "workers", "world_size")
-"""What a resumed run must have as before, beside the recipe, to reach the same weights."""
+TRAINING = RunKind(
+    "training",
+    outputs=("recipe.yaml", "last.ckpt", "network.ckpt", "log.csv", "curve.png"),
+    notes={
+        **{"gain": float, "threads": int, "accelerator": str, "epoch_samples": int, "steps": int, "machine": dict},
+        **{"steps_done": int, "minutes": float},
+    },
+    packages=("mitsonar", "torch", "lightning", "numpy"),
+)
 
 WIDE = 30
 """Ratio of samples seen from which they are drawn on a log axis."""
@@ -61,17 +67,19 @@ class StateFile(TorchCheckpointIO):
         return dict(state)
 
 
-@dataclass(frozen=True)
+@dataclass
 class RunFolder:
     """Where a training lies.
 
     Attributes:
         path: of the folder.
         writes: whether this process is the one that writes.
+        run: what was asked for, and how far it is; None before :meth:`begin`, and where another process writes.
     """
 
     path: Path
     writes: bool = True
+    run: RunDirectory | None = None
 
     @property
     def state(self) -> Path:
@@ -83,67 +91,44 @@ class RunFolder:
         """The best network."""
         return self.path / "network.ckpt"
 
+    def known(self) -> RunDirectory | None:
+        """An earlier run, which may be another one.
+
+        Raises:
+            MitsonarError: its file is damaged.
+        """
+        return RunDirectory.open(self.path, TRAINING) if (self.path / RUN_FILE).is_file() else None
+
     def begin(
-        self, recipe: TrainingRecipe, about: dict[str, Any], *, resume: bool, overwrite: bool
-    ) -> dict[str, Any] | None:
-        """Make the folder, or find an earlier run in it; what its run.json holds.
+        self, recipe: TrainingRecipe, asked: dict[str, Any], notes: dict[str, Any], *, resume: bool, overwrite: bool
+    ) -> RunDirectory | None:
+        """Make the folder, or find an earlier run in it; that run.
+
+        Args:
+            recipe: of the training.
+            asked: what a resumed run must have as before, beside the recipe, to reach the same weights.
+            notes: what else is worth knowing of the run.
+            resume: go on with a run that is there.
+            overwrite: begin anew where a run is.
 
         Raises:
             MitsonarError: it exists and neither is allowed, holds other things, or an earlier run differs.
         """
         if not self.writes:
             return None
-        if resume and overwrite:
-            raise MitsonarError("--resume and --overwrite contradict each other: give one")
-        there = self.path.exists() and (not self.path.is_dir() or any(self._apart_from_beginnings()))
-        ours = (self.path / NAMES[0]).is_file()
-        if there and not ours:
-            raise MitsonarError(f"{self.path} holds other things and is kept: choose another -o")
-        if there and not resume and not overwrite:
-            raise MitsonarError(
-                f"{self.path} holds a training and is kept: --resume goes on with it, --overwrite begins anew, or choose "
-                "another -o"
-            )
-        if there and resume:
-            return self._agreed(recipe, about)
-        for name in NAMES if there else ():
-            (self.path / name).unlink(missing_ok=True)
-        self.path.mkdir(parents=True, exist_ok=True)
-        text = yaml.safe_dump(recipe.plain(), sort_keys=False, allow_unicode=True)
-        write_whole(self.path / "recipe.yaml", text.encode())
-        write_json(self.path / "run.json", {**about, **machine(), "finished": False})
-        return None
+        asked = {**asked, "recipe": recipe.plain()}
+        self.run = RunDirectory.begin(self.path, TRAINING, asked, resume=resume, overwrite=overwrite)
+        self.run.start(**notes, machine=machine())
+        if not (self.path / "recipe.yaml").is_file():
+            text = yaml.safe_dump(recipe.plain(), sort_keys=False, allow_unicode=True)
+            write_whole(self.path / "recipe.yaml", text.encode())
+        return self.run if self.run.resumed else None
 
-    def _apart_from_beginnings(self) -> list[Path]:
-        """What lies there, but for what a run leaves that was killed before it had begun."""
-        if (self.path / NAMES[0]).is_file():
-            return list(self.path.iterdir())
-        return [
-            path for path in self.path.iterdir() if path.name not in ("recipe.yaml", ".recipe.yaml.part", ".run.json.part")
-        ]
-
-    def _agreed(self, recipe: TrainingRecipe, about: dict[str, Any]) -> dict[str, Any]:
-        other = load_training_recipe(self.path / "recipe.yaml").differs(recipe)
-        if other is not None:
-            raise MitsonarError(
-                f"{self.path} was begun with {other}: resume with {self.path / 'recipe.yaml'}, or choose another -o"
-            )
-        had = read_json(self.path / "run.json")
-        for key in MUST_AGREE:
-            if had.get(key) != about.get(key):
-                raise MitsonarError(
-                    f"{self.path} was begun with {key} {had.get(key)}, not {about.get(key)}: resume with what it was begun "
-                    "with, or choose another -o"
-                )
-        return had
-
-    def known(self) -> dict[str, Any]:
-        """What an earlier run has written into run.json; empty where there is none."""
-        return read_json(self.path / "run.json") if (self.path / "run.json").is_file() else {}
-
-    def note(self, **fields: Any) -> None:
-        """Add to run.json."""
-        write_json(self.path / "run.json", {**self.known(), **fields})
+    def end(self, *, finished: bool, **notes: Any) -> None:
+        """Keep how far the training is."""
+        if self.run is not None:
+            self.run.finished = finished
+            self.run.note(**notes)
 
     def log(self, rows: list[dict[str, Any]], zero: list[float], axes: tuple[Axis, ...]) -> None:
         """Write log.csv and curve.png anew."""
@@ -162,13 +147,9 @@ class RunFolder:
 
 
 def machine() -> dict[str, Any]:
-    """Where and with what a run is made."""
+    """Where a run is made."""
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    versions = {name: version(name) for name in ("mitsonar", "torch", "lightning", "numpy")}
-    return {
-        "versions": versions,
-        "machine": {"system": platform.platform(), "cores": len(os.sched_getaffinity(0)), "gpu": device},
-    }
+    return {"system": platform.platform(), "cores": len(os.sched_getaffinity(0)), "gpu": device}
 
 
 def column(level: str, axis: Axis) -> str:

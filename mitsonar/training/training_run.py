@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.io.provenance import other_versions
+from mitsonar.io.run_directory import RunDirectory
 from mitsonar.motion.motion_errors import Axis
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_data import Material, material_of
@@ -31,6 +33,9 @@ __all__ = ["Report", "leads", "train"]
 
 STATE_MINUTES = 5.0
 """Between two states on disk: what a kill may cost."""
+
+MOST_AT_ONCE = 1024
+"""Threads, and processes, that a run may have had."""
 
 SMOOTH = 0.98
 """Weight of the past in the running numbers of a report."""
@@ -122,29 +127,31 @@ def train(
     if threads is not None and threads < 1:
         raise MitsonarError(f"--threads must be at least 1: got {threads}")
     folder = RunFolder(Path(out), writes=leads())
-    known = folder.known() if resume else {}
-    gain = known.get("gain") if isinstance(known.get("gain"), float) else None
+    known = folder.known() if resume else None
+    gain = None if known is None else known.notes.get("gain")
+    threads = threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
     material = material_of(recipe, data, render=render, gain=gain)
     network = network_for(recipe, material)
-    with _quiet(), _settings(threads or known.get("threads")), torch.random.fork_rng(devices=[]):
+    with _quiet(), _settings(threads), torch.random.fork_rng(devices=[]):
         module = NetworkTraining(network, recipe, material)
         journal = Journal(folder, module, material, minutes, state_minutes, progress, stop)
         trainer = _trainer(module, folder, journal, accelerator, devices, strategy)
         workers = _workers(workers, known, render, trainer)
-        about = {
+        asked = {
             "data": material.about["name"],
             "digest": material.about["digest"],
-            "gain": material.about["gain"],
             "render": render,
             "workers": workers if render else None,
             "world_size": trainer.world_size,
+        }
+        notes = {
+            "gain": material.about["gain"],
             "threads": torch.get_num_threads(),
             "accelerator": type(trainer.accelerator).__name__,
             "epoch_samples": material.epoch,
             "steps": module.steps,
         }
-        had = folder.begin(recipe, about, resume=resume, overwrite=overwrite)
-        _warn_of_other_bits(had, about)
+        _warn_of_other_bits(folder.begin(recipe, asked, notes, resume=resume, overwrite=overwrite), notes)
         state = folder.state if resume and folder.state.is_file() else None
         begun = StateFile().load_checkpoint(state) if state else None
         done = begun["global_step"] if begun else 0
@@ -232,7 +239,7 @@ class Journal(Callback):
         if end:
             if trainer.is_global_zero:
                 finished = step >= self.module.steps
-                self.folder.note(finished=finished, steps_done=step, minutes=round(self.spent, 3))
+                self.folder.end(finished=finished, steps_done=step, minutes=round(self.spent, 3))
             trainer.strategy.barrier()
             trainer.should_stop = True
 
@@ -401,7 +408,7 @@ def _trainer(
     return trainer
 
 
-def _workers(workers: int | None, known: dict[str, Any], render: bool, trainer: lightning.Trainer) -> int:
+def _workers(workers: int | None, known: RunDirectory | None, render: bool, trainer: lightning.Trainer) -> int:
     """Processes that read or render: those of an earlier run, or by the machine."""
     if workers is not None:
         if workers < 0:
@@ -410,20 +417,25 @@ def _workers(workers: int | None, known: dict[str, Any], render: bool, trainer: 
     cores = len(os.sched_getaffinity(0)) // max(1, trainer.world_size)
     on_cpu = trainer.strategy.root_device.type == "cpu"
     if render:
-        had = known.get("workers")
-        return had if isinstance(had, int) else max(1, cores // 2 if on_cpu else cores - 1)
+        had = None if known is None else known.asked.get("workers")
+        usual = max(1, cores // 2 if on_cpu else cores - 1)
+        return had if isinstance(had, int) and 0 <= had <= MOST_AT_ONCE else usual
     return (1 if cores > 2 else 0) if on_cpu else max(1, min(8, cores - 1))
 
 
-def _warn_of_other_bits(had: dict[str, Any] | None, about: dict[str, Any]) -> None:
+def _warn_of_other_bits(had: RunDirectory | None, notes: dict[str, Any]) -> None:
     """What makes a resumed run end with other last bits than an unbroken one."""
-    for key in ("threads", "accelerator"):
-        if had is not None and had.get(key) != about[key]:
-            warnings.warn(
-                f"the run was begun with {key} {had.get(key)}, now {about[key]}: it goes on, but not to the same bits",
-                MitsonarWarning,
-                stacklevel=3,
-            )
+    if had is None:
+        return
+    other = [
+        f"{key} {had.notes.get(key)} (now {notes[key]})"
+        for key in ("threads", "accelerator")
+        if had.notes.get(key) != notes[key]
+    ]
+    for change in other + other_versions(had.versions, ("mitsonar", "torch")):
+        warnings.warn(
+            f"the run was begun with {change}: it goes on, but not to the same bits", MitsonarWarning, stacklevel=3
+        )
 
 
 @contextmanager

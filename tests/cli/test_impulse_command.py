@@ -56,7 +56,7 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
     again = mitsonar("impulse", scene, "--velocity", "1,-0.5", "--frames", 20, "-o", out)
     refused(again, "kept as it is", "--resume")
     assert mitsonar("impulse", scene, "--velocity", "1,-0.5", "--frames", 20, "-o", out, "--resume").returncode == 0
-    refused(mitsonar("impulse", scene, "--frames", 20, "-o", out, "--resume"), "another run", "poses")
+    refused(mitsonar("impulse", scene, "--frames", 20, "-o", out, "--resume"), "was begun with", "poses_sha256", "velocity")
 
 
 def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Path, tmp_path: Path) -> None:

@@ -242,8 +242,8 @@ def test_bad_options_are_answered_by_one_sentence(mitsonar: Command, drawn: Path
     refused(mitsonar("odometry", drawn, "-o", out, "--height", 2), "tell their heights")
     refused(mitsonar("odometry", drawn, "-o", out, "--sequence", 1), "no data set")
     refused(mitsonar("odometry", drawn, "-o", out, "--overwrite", "--resume"), "contradict")
-    refused(mitsonar("odometry", drawn, "-o", drawn), "exists and is kept")
-    refused(mitsonar("odometry", drawn, "-o", drawn, "--overwrite"), "no odometry", "kept")
+    refused(mitsonar("odometry", drawn, "-o", drawn), "is a file and is kept")
+    refused(mitsonar("odometry", drawn, "-o", drawn, "--overwrite"), "is a file and is kept")
     assert not out.exists()
 
 

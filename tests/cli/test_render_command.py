@@ -77,8 +77,8 @@ def test_render_writes_all_that_it_promises(mitsonar: Command, scene: Path, tmp_
     np.testing.assert_allclose(path.poses[-1], [0.2, 0.1, 2.5, np.radians(35), 0, np.radians(5)], atol=1e-7)
     about = json.loads((out / "run.json").read_text())
     assert about["finished"]
-    assert about["recipe"]["sonar"]["seed"] == 4
-    assert about["recipe"]["noise"] == NOISE_MODELS["low"].model_dump()
+    assert about["asked"]["sonar"]["seed"] == 4
+    assert about["asked"]["noise"] == NOISE_MODELS["low"].model_dump()
     assert about["gain"] == pytest.approx(1 / frames.level_scale)
     assert {"mitsuba", "drjit", "numpy"} <= set(about["versions"])
 
@@ -179,14 +179,14 @@ def test_an_out_that_exists_is_kept(mitsonar: Command, scene: Path, tmp_path: Pa
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
-    refused(mitsonar("render", scene, "-o", mine), "exists", "kept", "-o")
-    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "not a run of mitsonar")
+    refused(mitsonar("render", scene, "-o", mine), "holds other things (thesis.tex)", "kept", "-o")
+    refused(mitsonar("render", scene, "-o", mine, "--overwrite"), "holds other things")
     assert (mine / "thesis.tex").read_text() == "years of work"
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out).returncode == 0
     before = (out / "frames.npz").read_bytes()
     refused(mitsonar("render", scene, "-o", out, "--seed", 5), "exists")
-    refused(mitsonar("render", scene, "-o", out, "--seed", 5, "--resume"), "another run", "sonar")
+    refused(mitsonar("render", scene, "-o", out, "--seed", 5, "--resume"), "was begun with sonar.seed 0, not 5")
     assert (out / "frames.npz").read_bytes() == before
     assert mitsonar("render", scene, "-o", out, "--seed", 5, "--overwrite").returncode == 0
     assert (out / "frames.npz").read_bytes() != before
@@ -334,3 +334,37 @@ def test_echoes_are_not_replaced_by_what_is_made_of_them(mitsonar: Command, scen
     refused(mitsonar("image", out, "-o", out, "--overwrite"), "echoes", "another folder")
     refused(mitsonar("image", out, "-o", tmp_path, "--overwrite"), "another folder")
     assert (out / "echoes" / "000000.exr").is_file()
+
+
+def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> None:
+    """Killed in the middle, then written by a stranger: one sentence each, and the true state still goes on."""
+    path = Trajectory(np.tile([0, 0, 2.5, np.radians(35), 0, 0], (3, 1)), np.arange(3.0))
+    simulator, outputs = Simulator(load_scene(scene), rays_per_launch=4_000), Outputs(NOISE_MODELS["none"])
+    calls: list[int] = []
+
+    def killed(frames: int) -> None:
+        calls.append(frames)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(simulator, path, tmp_path / "run", outputs, origin={}, progress=killed)
+    file = tmp_path / "run" / "run.json"
+    kept = file.read_text()
+    state = json.loads(kept)
+    assert 0 < state["frames_done"] < 3
+    for damage, said in (
+        ({"frames_done": 4}, "frames_done is at most 3, got 4"),
+        ({"frames_done": "1"}, "frames_done is a count"),
+        ({"gain": 0.0}, "does not tell its gain"),
+        ({"tally": {**state["tally"], "frames": "1"}}, "the tally of the run is damaged"),
+        ({"tally": {**state["tally"], "worst": 3}}, "the tally of the run is damaged"),
+        ({"tally": None}, "the tally of the run is damaged"),
+    ):
+        file.write_text(json.dumps(state | damage))
+        with pytest.raises(MitsonarError, match=said):
+            run(simulator, path, tmp_path / "run", outputs, origin={}, resume=True)
+    file.write_text(kept)
+    run(simulator, path, tmp_path / "run", outputs, origin={}, resume=True)
+    run(simulator, path, tmp_path / "whole", outputs, origin={})
+    np.testing.assert_array_equal(SonarFrames.load(tmp_path / "run").image, SonarFrames.load(tmp_path / "whole").image)

@@ -170,7 +170,7 @@ def test_command_prints_a_table_and_goes_on(mitsonar: Command, made: Path, tmp_p
     report = json.loads(again.stdout)
     for before, after in zip(table["tables"], report["tables"], strict=True):
         assert [row["rmse"] for row in before["rows"]] == [row["rmse"] for row in after["rows"]]
-    refused(mitsonar(*words, "--pairs", 5, "-o", tmp_path / "out"), "other pairs", "choose another -o")
+    refused(mitsonar(*words, "--pairs", 5, "-o", tmp_path / "out"), "was begun with pairs", "not 5", "choose another -o")
 
 
 def test_mistakes_are_said(mitsonar: Command, made: Path, tmp_path: Path) -> None:

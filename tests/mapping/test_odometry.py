@@ -493,8 +493,8 @@ def test_a_folder_holds_the_path_and_all_about_it(tmp_path: Path) -> None:
         np.testing.assert_allclose(table["motion_covariances"][0], np.diag(STD**2))
     state = json.loads((out / "run.json").read_text())
     assert state["finished"]
-    assert state["recipe"]["estimator"] == "told"
-    assert state["recipe"]["options"]["lost"] == [4]
+    assert state["asked"]["estimator"] == "told"
+    assert state["asked"]["options"]["lost"] == [4]
     assert (state["smooth"], state["not_believed"]) == ("none", 1)
     table = json.loads((out / "table.json").read_text())["rows"]
     assert {"name": "motions not believed, bridged", "value": 1.0, "unit": ""} in table
@@ -554,11 +554,11 @@ def test_another_odometry_is_not_gone_on_with(tmp_path: Path) -> None:
     before = files_of(out)
     with pytest.raises(MitsonarError, match="exists and is kept"):
         run(out, path)
-    with pytest.raises(MitsonarError, match="differs in options"):
+    with pytest.raises(MitsonarError, match=r"was begun with options\.covariance .*, not None"):
         run(out, path, Told(path.poses), resume=True)
-    with pytest.raises(MitsonarError, match="differs in every"):
+    with pytest.raises(MitsonarError, match="was begun with every 1, not 2"):
         run(out, path, every=2, resume=True)
-    with pytest.raises(MitsonarError, match="differs in frames_sha256"):
+    with pytest.raises(MitsonarError, match="was begun with frames_sha256"):
         run(out, replace(path, poses=path.poses + 1), Told(path.poses, covariance=np.diag(STD**2)), resume=True)
     with pytest.raises(MitsonarError, match="contradict"):
         run(out, path, overwrite=True, resume=True)
@@ -594,3 +594,16 @@ def test_nothing_is_left_where_nothing_was_estimated(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="needs height and pitch"):
         run_odometry(FrameSource.of(frames), "direct", Direct(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_height_that_a_stranger_wrote_is_refused(tmp_path: Path) -> None:
+    run(tmp_path / "out", sway(5))
+    file = tmp_path / "out" / "run.json"
+    state = json.loads(file.read_text())
+    for height in ("2", -1.0, True, 1e400):
+        file.write_text(json.dumps({**state, "asked": {**state["asked"], "height_m": height}}))
+        with pytest.raises(MitsonarError, match=r"run\.json is damaged \(height_m is "):
+            _ = OdometryFolder.open(tmp_path / "out").height_m
+    file.write_text(json.dumps({**state, "asked": {**state["asked"], "height_m": 2.5}}))
+    assert OdometryFolder.open(tmp_path / "out").height_m == 2.5

@@ -337,7 +337,7 @@ def test_odometry_and_compare_take_checkpoints(
     assert len(told) == 11
     assert all(np.allclose(one["motion"], SAYS, atol=1e-7) and one["valid"] for one in told)
     stated = json.loads((tmp_path / "out1" / "run.json").read_text())
-    assert stated["recipe"]["options"]["digest"] == checkpoint.digest
+    assert stated["asked"]["options"]["digest"] == checkpoint.digest
     table = ("compare", made, "--part", "all", "--limit", 0, "--estimators", f"zero,{run}")
     done = mitsonar(*table, "-o", tmp_path / "table", "--json")
     assert done.returncode == 0, done.stderr

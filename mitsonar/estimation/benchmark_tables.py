@@ -1,0 +1,79 @@
+"""Tables of a comparison or an evaluation as Markdown: what a column says of a row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+__all__ = ["FEWEST_SCENES", "markdown", "table_lines"]
+
+FEWEST_SCENES = 10
+"""With fewer, clustered intervals hold much less than they say."""
+
+
+def table_lines(table: dict[str, Any]) -> list[str]:
+    """A table of the report as Markdown."""
+    lines = ["", f"noise {table['noise']}, {table['variation']}", "", *markdown(table["rows"], COLUMNS)]
+    if table["limits"]:
+        known = {law: std for law, std in table["limits"].items() if any(value != 0 for value in std)}
+        lines += ["", "limit of two frames: " + "; ".join(f"{law} {_three(std)}" for law, std in known.items())]
+    others = [row for row in table["rows"] if row["method"] != table["reference"] and row["method"] != "zero"]
+    for row in others:
+        numbers = zip(row["over_reference"], row["over_reference_low"], row["over_reference_high"], DIGITS, strict=True)
+        spans = (f"{value:+.{d}f} ({low:+.{d}f}..{high:+.{d}f})" for value, low, high, d in numbers)
+        lines.append(
+            f"{'' if row is not others[0] else chr(10)}{row['method']} less {table['reference']}: {' / '.join(spans)}  "
+        )
+    return lines
+
+
+def markdown(rows: list[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+    """Methods as lines of a Markdown table with these columns of :data:`CELLS`."""
+    cells = [list(columns), ["---"] * len(columns), *([CELLS[column](row) for column in columns] for row in rows)]
+    width = [max(len(row[k]) for row in cells) for k in range(len(columns))]
+    return ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in cells]
+
+
+DIGITS = (2, 2, 4)
+
+
+def _number(value: float | None, axis: int) -> str:
+    return "-" if value is None else f"{value:.{DIGITS[axis]}f}"
+
+
+def _three(values: list[float | None]) -> str:
+    return " / ".join(_number(value, k) for k, value in enumerate(values))
+
+
+def _joined(values: list[float | None], digits: int) -> str:
+    return " / ".join("-" if value is None else f"{value:.{digits}f}" for value in values)
+
+
+def _interval(row: dict[str, Any]) -> str:
+    ends = zip(row["rmse_low"], row["rmse_high"], strict=True)
+    return " ".join(f"{_number(low, k)}..{_number(high, k)}" for k, (low, high) in enumerate(ends))
+
+
+CELLS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "method": lambda row: str(row["method"]),
+    "RMSE": lambda row: _three(row["rmse"]),
+    "as in the thesis": lambda row: _joined(row["thesis"], 2),
+    "95 % interval": _interval,
+    "median": lambda row: _three(row["median"]),
+    "95 %": lambda row: _three(row["p95"]),
+    "slope": lambda row: _joined(row["slope"], 3),
+    "bias": lambda row: _three(row["bias"]),
+    "large": lambda row: _three(row["large"]),
+    "fail": lambda row: str(row["failures"]),
+    "skill": lambda row: _joined(row["skill"], 2),
+    "/ limit (rays)": lambda row: _joined(row["over_limit"], 1),
+    "nees": lambda row: "-" if row["nees"] is None else f"{row['nees']:.1f}",
+    "ms": lambda row: f"{row['ms']:.1f}",
+    "inputs": lambda row: str(row["inputs"]),
+}
+"""What a column says of a row."""
+
+COLUMNS = (
+    *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),
+    *("ms", "inputs"),
+)

@@ -1,0 +1,246 @@
+"""A comparison: many estimators on the same pairs of a data set, with their errors side by side."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.datasets.modalities import modality_of
+from mitsonar.datasets.modality import samples_of
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError, meant
+from mitsonar.estimation.benchmark import VARIATIONS, Answers, answers_of, bounds_of_pairs, chosen, rows_of, with_prior
+from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
+from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
+from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.io.provenance import digest, versions
+from mitsonar.motion.motion_errors import cluster_resamples, in_units
+from mitsonar.motion.pose import motions
+
+__all__ = ["Asked", "compare"]
+
+Array = NDArray[np.float64]
+Begin = Callable[[str, int], AbstractContextManager[Callable[[int], object]]]
+"""Called with what begins and how many pairs it has; while it is open, its value is called with how many more are done."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is compared; see ``mitsonar compare --help``.
+
+    Attributes:
+        estimators: their names, commas between them; None: all that need no training.
+        noise: levels, commas between them, or ``;``.
+        part: of the data set; None: that which training does not see.
+        pairs: at most so many; None: all.
+        perturb: rows with something wrong in what estimators are told.
+        jitter: a row with rays that move.
+        prior: rows that know how large motions are.
+        limit: pairs over which the physical limit is computed; 0: none.
+        reference: the method that others are compared with; None: the last.
+        seed: of noise, choice of pairs and bootstrap.
+    """
+
+    estimators: str | None = None
+    noise: str = "none"
+    part: str | None = None
+    pairs: int | None = None
+    perturb: bool = False
+    jitter: bool = False
+    prior: bool = False
+    limit: int = 10
+    reference: str | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Estimators, and the pairs that all of them are asked of.
+
+    Attributes:
+        methods: by name.
+        levels: noise models by name; None where a ratio says all.
+        samples: by level of noise, the same pairs in each.
+        numbers: of the samples that are asked.
+        truth: motions of the sonar ``(n, 3)`` [m, m, rad].
+        scenes: number of each pair's scene ``(n,)``.
+    """
+
+    methods: dict[str, Any]
+    levels: dict[str, NoiseModel | None]
+    samples: dict[str, Any]
+    numbers: list[int]
+    truth: Array
+    scenes: NDArray[np.int64]
+
+    @property
+    def first(self) -> Any:
+        """The samples at the first level of noise."""
+        return next(iter(self.samples.values()))
+
+
+def compare(
+    data: str, asked: Asked, out: str | Path | None = None, begin: Begin = lambda what, pairs: nullcontext(lambda done: None)
+) -> dict[str, Any]:
+    """Ask all estimators of the same pairs, and tell their errors; failures count as zero motion.
+
+    Args:
+        data: path or URL of a data set.
+        asked: what is compared.
+        out: folder for answers, ``table.md`` and ``table.json``; a comparison that was broken off there goes on.
+        begin: told how far things are.
+
+    Returns:
+        What ``table.json`` holds: what was asked; ``notes``, sentences that the reader needs; ``tables``, one a level of
+        noise and variation, with ``rows``: what :class:`~mitsonar.estimation.benchmark.Row` holds.
+
+    Raises:
+        MitsonarError: unknown names, too few pairs, or another comparison in the folder.
+    """
+    bench = _bench(data, asked)
+    settings = _settings(bench, asked)
+    kept = kept_answers(out, settings)
+    variations = _variations(asked)
+    with begin("comparing", len(bench.levels) * len(variations) * len(bench.numbers)) as progress:
+        answers = {
+            (level, variation): answers_of(
+                bench.methods,
+                bench.samples[level],
+                bench.numbers,
+                variation,
+                known=kept.load(_key(level, model), variation, bench.methods, len(bench.numbers)),
+                keep=partial(kept.keep, _key(level, model), variation),
+                progress=progress,
+            )
+            for level, model in bench.levels.items()
+            for variation in variations
+        }
+    tables = []
+    for level in bench.levels:
+        bounds = _bounds(bench, level, asked.limit, kept, begin)
+        tables += [_table(bench, asked, level, variation, answers[level, variation], bounds) for variation in variations]
+    scenes = len(np.unique(bench.scenes))
+    notes = [f"{scenes} scenes only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
+    report = {"data": data, "model": modality_of(bench.first.recipe).sonar.model, **settings, "scenes": scenes}
+    report |= {"notes": notes if scenes < FEWEST_SCENES else [], "tables": tables, **versions(("mitsonar",))}
+    kept.finish(report)
+    return report
+
+
+# ---------------------------------------------------------------- what is asked
+
+
+def _bench(data: str, asked: Asked) -> Bench:
+    """Estimators and pairs.
+
+    Raises:
+        MitsonarError: unknown names, options that are not for these data, too few pairs.
+    """
+    recipe = DataStore.open(data).recipe
+    modality = modality_of(recipe)
+    names = (asked.estimators or modality.estimators).split(",")
+    methods = {text: estimator_from(text) for text in dict.fromkeys(names) if text}
+    if not methods or (asked.reference is not None and asked.reference not in methods):
+        raise MitsonarError(
+            f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {asked.reference!r}"
+            f"{meant(asked.reference, methods)}"
+        )
+    if not modality.variations and (asked.perturb or asked.jitter or asked.prior):
+        raise MitsonarError("--perturb, --jitter and --prior are for data sets of images: leave them out")
+    words = list(dict.fromkeys(asked.noise.split(";" if ";" in asked.noise else ",")))
+    levels = {word: modality.noise_model(word) for word in words}
+    options = {"part": asked.part or recipe.split.unseen, "one_a_sequence": True, "seed": asked.seed}
+    samples = {level: samples_of(modality, data, noise=level, **options) for level in levels}
+    first = next(iter(samples.values()))
+    if len(first) < 2:
+        raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
+    if asked.jitter and first.recipe.instrument.jittered:
+        raise MitsonarError("the rays of this data set move already: --jitter is for the thesis's model")
+    numbers = chosen(len(first), asked.pairs, asked.seed)
+    # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
+    pose = first.chosen.pose
+    truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
+    return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]])
+
+
+def _settings(bench: Bench, asked: Asked) -> dict[str, Any]:
+    """What decides the answers; levels of noise may be added later."""
+    chosen_of, recipe = bench.first.chosen, bench.first.recipe
+    said = json.dumps(recipe.model_dump(), default=str)
+    networks = {name: method.digest for name, method in bench.methods.items() if method.digest}
+    return {
+        "digest": digest(chosen_of.motion.tobytes(), chosen_of.pose.tobytes(), said),
+        "methods": list(bench.methods),
+        "part": asked.part,
+        "pairs": len(bench.numbers),
+        "seed": asked.seed,
+        **({"networks": networks} if networks else {}),
+    }
+
+
+def _variations(asked: Asked) -> list[str]:
+    changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if asked.perturb else []
+    return ["as told", *changed, *(["jitter"] if asked.jitter else [])]
+
+
+def _key(level: str, model: NoiseModel | None) -> str:
+    """Names a noise level by what it is: a file of the same name may change; a ratio says all."""
+    return level if model is None else f"{level} {digest(model.model_dump_json())[:8]}"
+
+
+# ---------------------------------------------------------------- what is found
+
+
+def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
+    """The physical limit by law, over some of the pairs; empty where it is not asked for, and of impulse responses."""
+    model = bench.levels[level]
+    if not limit or model is None:
+        return {}
+    found = kept.load_bounds(_key(level, model), limit)
+    if found is None:
+        places = np.linspace(0, len(bench.numbers) - 1, min(limit, len(bench.numbers))).astype(int)
+        with begin("limit", len(places)) as progress:
+            found = bounds_of_pairs(bench.samples[level], [bench.numbers[k] for k in places], model, progress)
+        kept.keep_bounds(_key(level, model), limit, found)
+    return found
+
+
+def _table(
+    bench: Bench, asked: Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
+) -> dict[str, Any]:
+    """Errors of all methods, as JSON can hold them."""
+    said = dict(answers)
+    if asked.prior:
+        flight = bench.first.recipe.flight
+        largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
+        known = {name: one for name, one in said.items() if np.isfinite(one.covariance).any()}
+        said |= {f"{name}{PRIOR}": with_prior(one, largest) for name, one in known.items()}
+    inputs = {name: bench.methods[name.removesuffix(PRIOR)].inputs for name in said}
+    inputs = {name: f"{text}, prior" if name.endswith(PRIOR) else text for name, text in inputs.items()}
+    reference = asked.reference or list(bench.methods)[-1]
+    resamples = cluster_resamples(bench.scenes, seed=asked.seed)
+    rows = rows_of(said, inputs, bench.truth, resamples, limit=bounds.get("rays"), reference=reference)
+    return {
+        "noise": level,
+        "variation": variation,
+        "limits": {law: _finite(in_units(std)) for law, std in bounds.items()},
+        "reference": reference,
+        "rows": [row.plain() for row in rows],
+    }
+
+
+PRIOR = " with prior"
+
+
+def _finite(values: Array) -> list[float | None]:
+    """For JSON: what is not finite is None."""
+    return [float(value) if np.isfinite(value) else None for value in values]

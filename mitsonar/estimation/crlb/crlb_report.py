@@ -1,0 +1,124 @@
+"""Bounds of a subject as a report: JSON for programs, a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.crlb.crlb_subject import Subject
+from mitsonar.estimation.crlb.image_crlb import LAWS, Bound, bounds_at, overall, varied
+from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, constant_gain
+
+__all__ = ["Table", "Value", "bounds_of_subject", "report_lines", "report_of"]
+
+Value = float | tuple[float, float]
+"""Of a variable: a number, or both ends of a window."""
+
+Table = dict[tuple[str, str, str], list[Bound | None]]
+"""(portion, kind, law) -> a bound for each pose."""
+
+UNITS = np.array([1e3, 1e3, np.degrees(1)])
+
+
+def bounds_of_subject(
+    subject: Subject,
+    noise: NoiseModel,
+    changes: list[tuple[str, Value]],
+    pings: int | None,
+    progress: Callable[[int], None],
+) -> Table:
+    """Bounds at all poses, with sonar and poses changed.
+
+    Args:
+        subject: what they are asked for.
+        noise: of the image.
+        changes: names of :data:`~mitsonar.estimation.crlb.image_crlb.VARIABLES` with values, one after another.
+        pings: of each half of the derivatives; None: as needed.
+        progress: called with how many poses are done.
+
+    Raises:
+        MitsonarError: values that do not fit, or no echo at all.
+    """
+    table: Table = {}
+    gain = subject.gain
+    for place in subject.places():
+        sonar, poses, heights = subject.sonar, place.poses, place.heights
+        for name, value in changes:
+            sonar, poses = varied(sonar, poses, heights, name, value)
+            heights = np.full_like(heights, value) if name == "height_m" else heights
+        simulator = Simulator(place.scene, sonar, views=subject.views(sonar))
+        gain = gain if gain is not None else _gain(simulator, poses)
+        for bounds in bounds_at(simulator, poses, noise, gain, pings=pings):
+            for key, found in bounds.items():
+                table.setdefault(key, []).append(found)
+            progress(1)
+    return table
+
+
+def _gain(simulator: Any, poses: NDArray[np.float64]) -> float:
+    """The constant gain of all views of the first frames, as that of a run."""
+    batches = []
+    for looks in simulator.render_views(poses[:CALIBRATION_FRAMES]):
+        flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in looks], axis=1)
+        batches.append(Pings(looks[0].first, flat[:, :, None], looks[0].counts, looks[0].height_m))
+    if not any(pings.levels.any() for pings in batches):
+        raise MitsonarError("no ray met anything within the window: check the pose (pitch > 0 looks down) and the window")
+    return constant_gain(batches)[0]
+
+
+def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> dict[str, Any]:
+    """As JSON can hold it: numbers in mm and deg, null where there is no bound or the motion is not observable."""
+    found = []
+    for value, table in rows:
+        for (portion, kind, law), bounds in table.items():
+            row: dict[str, Any] = {} if name is None else {name: value}
+            row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
+            known = [one for one in bounds if one is not None]
+            for frames, words in ((1, "one_frame"), (2, "two_frames")):
+                each = np.array([one.std(frames) * UNITS for one in known])
+                row[words] = _numbers(overall(each)) if len(known) == len(bounds) else None
+                row[f"{words}_each"] = [_numbers(std) for std in each]
+            row["not_observable"] = sum(not np.isfinite(one.std()).all() for one in known)
+            row["relative_error"] = _numbers(np.mean([one.relative_error for one in known], axis=0)) if known else None
+            found.append(row)
+    return {
+        "source": source,
+        "noise": noise,
+        "vary": name,
+        "units": ["sideways mm", "forward mm", "yaw deg"],
+        "laws": LAWS,
+        "rows": found,
+    }
+
+
+def _numbers(values: NDArray[np.float64]) -> list[float | None]:
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
+
+
+def report_lines(report: dict[str, Any]) -> list[str]:
+    """The table: least standard deviations."""
+    name = report["vary"]
+    titles = [name] if name else []
+    titles += ["portion", "data", "law", "one frame: mm / mm / deg", "two frames: mm / mm / deg", "poses"]
+    cells = [titles]
+    for row in report["rows"]:
+        value = row.get(name)
+        text = "..".join(f"{v:g}" for v in value) if isinstance(value, tuple) else f"{value:g}" if name else ""
+        two = [_text(row[words]) for words in ("one_frame", "two_frames")]
+        lost = f", {row['not_observable']} not observable" if row["not_observable"] else ""
+        cells.append([*([text] if name else []), row["portion"], row["data"], row["law"], *two, f"{row['poses']}{lost}"])
+    widths = [max(len(line[k]) for line in cells) for k in range(len(titles))]
+    lines = ["  ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)).rstrip() for line in cells]
+    head = f"noise {report['noise']}: least standard deviation, sideways / forward / yaw (root of the mean variance)"
+    return [head, *lines]
+
+
+def _text(std: list[float | None] | None) -> str:
+    if std is None:
+        return "-"
+    return " / ".join("inf" if v is None else f"{v:.{d}f}" for v, d in zip(std, (3, 3, 4), strict=True))

@@ -1,0 +1,140 @@
+"""Answers of estimators on disk, kept as they come, so that a comparison that was broken off goes on."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.benchmark import Answers
+from mitsonar.estimation.benchmark_tables import table_lines
+from mitsonar.estimation.crlb.image_crlb import LAWS
+from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.whole_files import read_json, write_json, write_whole
+
+__all__ = ["COMPARISON", "AnswerFolder", "kept_answers"]
+
+Array = NDArray[np.float64]
+
+COMPARISON = RunKind(
+    "comparison",
+    outputs=("answers-*.npz", "limit-*.json", "table.md", "table.json"),
+    notes={},
+    packages=("mitsonar", "numpy", "opencv-python-headless", "torch"),
+    deciding=("mitsonar",),
+)
+
+
+class AnswerFolder:
+    """Answers that nobody keeps: of a comparison without a folder."""
+
+    def load(
+        self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int
+    ) -> dict[str, Answers] | None:
+        """What an earlier run has found of ``count`` pairs; None where it has not."""
+        return None
+
+    def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
+        """Keep answers as they come."""
+
+    def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
+        """Bounds of an earlier run."""
+        return None
+
+    def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:
+        """Keep bounds."""
+
+    def finish(self, report: dict[str, Any]) -> None:
+        """Write the tables."""
+
+
+class AnswersOnDisk(AnswerFolder):
+    """A folder of answers.
+
+    Args:
+        run: the folder.
+    """
+
+    def __init__(self, run: RunDirectory) -> None:
+        self.run = run
+
+    def _path(self, name: str, ending: str) -> Path:
+        return self.run.path / (re.sub(r"[^\w.-]+", "-", name.replace("%", "percent")) + ending)
+
+    def load(
+        self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int
+    ) -> dict[str, Answers] | None:
+        """What an earlier run has found of ``count`` pairs; None where it has not.
+
+        Raises:
+            MitsonarError: the file is damaged.
+        """
+        path = self._path(f"answers {level} {variation}", ".npz")
+        if not path.exists():
+            return None
+        try:
+            with np.load(path) as table:
+                found = {name: Answers.from_arrays(table, name) for name in methods}
+            if any(len(values) != count for one in found.values() for values in vars(one).values()):
+                raise ValueError("it holds other numbers of pairs")
+            return found
+        except Exception as error:  # a damaged zip raises whatever its bytes lead to
+            raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
+
+    def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
+        """Keep answers as they come."""
+        buffer = io.BytesIO()
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, one in answers.items():
+            arrays |= one.arrays(name)
+        np.savez(buffer, **arrays)  # type: ignore[arg-type]
+        write_whole(self._path(f"answers {level} {variation}", ".npz"), buffer.getvalue())
+
+    def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
+        """Bounds of an earlier run.
+
+        Raises:
+            MitsonarError: the file is damaged.
+        """
+        path = self._path(f"limit {level} {count}", ".json")
+        if not path.exists():
+            return None
+        found = read_json(path)
+        try:
+            bounds = {law: np.array(found[law], dtype=float) for law in LAWS}
+            if any(std.shape != (3,) for std in bounds.values()):
+                raise ValueError("a bound is three numbers")
+        except (KeyError, ValueError, TypeError) as error:
+            raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
+        return bounds
+
+    def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:
+        """Keep bounds."""
+        write_json(self._path(f"limit {level} {count}", ".json"), {law: std.tolist() for law, std in bounds.items()})
+
+    def finish(self, report: dict[str, Any]) -> None:
+        """Write the tables."""
+        lines = [line for table in report["tables"] for line in table_lines(table)]
+        write_whole(self.run.path / "table.md", ("\n".join(lines) + "\n").encode())
+        write_json(self.run.path / "table.json", report)
+        self.run.finish()
+
+
+def kept_answers(out: str | Path | None, settings: dict[str, Any]) -> AnswerFolder:
+    """Where a comparison keeps its answers: in a folder, gone on with, or nowhere.
+
+    Raises:
+        MitsonarError: the folder holds other things, or another comparison.
+    """
+    if out is None:
+        return AnswerFolder()
+    run = RunDirectory.begin(out, COMPARISON, settings, resume=True)
+    run.start()
+    return AnswersOnDisk(run)

@@ -1,0 +1,53 @@
+"""The tables of an evaluation: as Markdown, and in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.benchmark_tables import markdown
+from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.io.whole_files import write_json, write_whole
+
+__all__ = ["refuse_tables", "report_lines", "save_tables"]
+
+COLUMNS = (
+    *("method", "RMSE", "as in the thesis", "95 % interval", "median", "95 %", "slope", "bias", "large", "skill", "nees"),
+    *("ms", "inputs"),
+)
+
+
+def report_lines(report: dict[str, Any]) -> list[str]:
+    """The tables of :func:`mitsonar.training.evaluation.evaluate` as Markdown."""
+    units = "height mm" if len(report["names"]) == 1 else "sideways mm / forward mm / yaw deg"
+    units = units.removesuffix(" / yaw deg") if len(report["names"]) == 2 else units
+    lines = [
+        f"{report['data']} ({report['recipe']}), part {report['part']} by {report['split']}: {report['pairs']} samples of "
+        f"{report['scenes']} scenes, {report['model']} model; {units}"
+    ]
+    for table in report["tables"]:
+        beyond = table["beyond"]
+        lines += ["", f"noise {table['noise']}", "", *markdown(table["rows"], COLUMNS), ""]
+        lines.append(
+            f"beyond the targets of training: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the answers  "
+        )
+    return lines
+
+
+def refuse_tables(out: Path, *, overwrite: bool) -> None:
+    """Keep tables that are in a folder, unless they may be replaced.
+
+    Raises:
+        MitsonarError: some are, or it is no folder.
+    """
+    if out.exists() and not out.is_dir():
+        raise MitsonarError(f"-o is a folder: got the file {out}")
+    refuse_to_replace(out / "table.md", out / "table.json", overwrite=overwrite)
+
+
+def save_tables(out: Path, report: dict[str, Any]) -> None:
+    """Write ``table.md`` and ``table.json``; the folder is made."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_whole(out / "table.md", ("\n".join(report_lines(report)) + "\n").encode())
+    write_json(out / "table.json", report)
