@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import reprlib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ __all__ = [
     "explain_missing",
     "meant",
     "nearest_names",
+    "shortened",
 ]
 
 EXTRAS = {
@@ -125,7 +127,7 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
         said = str(first["ctx"]["error"])
         return f"{argument(f'{what} {key}')}: {said}" if where else said
     message = first["msg"][0].lower() + first["msg"][1:]
-    return f"{argument(f'{what} {key}')}: {message}, got {first['input']!r}{_meant(first)}{see}"
+    return f"{argument(f'{what} {key}')}: {message}, got {shortened(first['input'])}{_meant(first)}{see}"
 
 
 def _meant(error: Mapping[str, Any]) -> str:
@@ -133,6 +135,15 @@ def _meant(error: Mapping[str, Any]) -> str:
     if error["type"] != "literal_error":
         return ""
     return meant(error["input"], re.findall(r"'([^']*)'", str(error["ctx"]["expected"])))
+
+
+def shortened(value: object) -> str:
+    """A value as Python writes it, cut where it is long: it may be huge, or refer to itself."""
+    if isinstance(value, int) and abs(value) > 10**40:
+        return f"an integer of {value.bit_length():,} bits"
+    brief = reprlib.Repr()
+    brief.maxstring = brief.maxother = brief.maxlong = 80
+    return brief.repr(value)
 
 
 def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:

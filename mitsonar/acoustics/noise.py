@@ -6,17 +6,16 @@ Echo is clipped to [0, 1]; pixels without echo become Gaussian, others get an ad
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.special import ndtr
 
-from mitsonar.errors import MitsonarError, meant, nearest_names
+from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
+from mitsonar.io.whole_files import read_yaml
 
 __all__ = ["NOISE_MODELS", "Information", "NoiseModel", "information", "information_of_sums", "load_noise", "uniform"]
 
@@ -298,22 +297,18 @@ def load_noise(text: str) -> NoiseModel:
         return NOISE_MODELS[text]
     try:
         if text.lower().endswith((".yaml", ".yml")):
-            fields = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
-            if not isinstance(fields, dict):
+            fields = read_yaml(text, "noise file")
+            if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
                 raise MitsonarError(f"{text} must hold the keys mean, std, scale, each 0..1")
             return NoiseModel(**fields)
         mean, std, scale = (float(word) for word in text.split(","))
         return NoiseModel(mean=mean, std=std, scale=scale)
-    except OSError as error:
-        raise MitsonarError(f"cannot read noise file {text}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MitsonarError(f"{text} is not YAML: {' '.join(str(error).split())}") from None
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise MitsonarError(f"unknown noise key {key}: {nearest_names(key, NoiseModel.model_fields)}") from None
-        raise MitsonarError(f"noise {key} must be a fraction 0..1 of the maximum: got {first['input']!r}") from None
+        raise MitsonarError(f"noise {key} must be a fraction 0..1 of the maximum: got {shortened(first['input'])}") from None
     except (ValueError, TypeError) as error:
         if isinstance(error, MitsonarError):
             raise

@@ -127,7 +127,7 @@ def numbers(text: str | None, count: int, what: str) -> list[float] | None:
 
 def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
     """KEY=VALUE pairs, values as YAML."""
-    import yaml
+    from mitsonar.io.plain_data import parse_yaml
 
     changes: dict[str, Any] = {}
     for pair in pairs:
@@ -135,8 +135,8 @@ def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
         if not (key and equals):
             raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
         try:
-            changes[key] = yaml.safe_load(text)
-        except yaml.YAMLError:
+            changes[key] = parse_yaml(text, text)
+        except MitsonarError:
             raise MitsonarError(f"--set {key}: {text!r} is not a YAML value") from None
     return changes if seed is None else {**changes, "seed": seed}
 

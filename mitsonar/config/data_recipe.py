@@ -9,7 +9,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.errors import MitsonarError, complaint, nearest_names
@@ -18,6 +17,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
 from mitsonar.io.provenance import digest
+from mitsonar.io.whole_files import read_yaml
 from mitsonar.motion.pose import Pose
 from mitsonar.worlds.families import create_family
 from mitsonar.worlds.world import Family, Interval
@@ -373,13 +373,8 @@ def recipe_fields(
                 f"no {what} {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
             )
         path = shipped[str(name_or_file)]
-    try:
-        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MitsonarError(f"cannot read {what} {path}: {error.strerror}; give a YAML file{else_}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise MitsonarError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(fields, dict):
+    fields = read_yaml(path, what, else_)
+    if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
         keys = ", ".join(field.alias or name for name, field in model.model_fields.items())
         raise MitsonarError(f"{path} must hold the keys of a {what}: {keys}")
     return fields, path

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,8 +21,10 @@ from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import Axis, Modality, Stored
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.errors import MitsonarError
+from mitsonar.io.plain_data import check_plain, whole_number
 from mitsonar.io.provenance import other_versions
 from mitsonar.io.storage import Storage
+from mitsonar.records.columns import FEW_ROWS, rows_that_fit
 
 __all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
 
@@ -29,6 +33,9 @@ FORMAT = 1
 
 SHARD_BYTES = 32 * 2**20
 """Of what is recorded in a shard, about: what a worker holds, and what a kill may cost."""
+
+MOST_FRAMES = 10**9
+"""Of a data set."""
 
 SEAL = "seal"
 
@@ -130,6 +137,7 @@ class DataStore:
             attributes: dict[str, Any] = dict(group.attrs)
             ours = attributes.get("kind") == "mitsonar data set"
             known = attributes.get("format")
+            check_plain(attributes, "its zarr.json")
         except Exception as error:  # a damaged file or a storage that does not answer: whatever it leads to
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise MitsonarError(f"no data set at {place.url}: {reason}; give what `mitsonar dataset make` wrote") from None
@@ -141,11 +149,11 @@ class DataStore:
             )
         try:
             store = cls(place, group)
-            if min(len(store), store.shard_frames, int(attributes["chunk_frames"]), len(store.scenes)) < 1:
-                raise ValueError("numbers below 1")
-            [float(attributes[name]) for name in store.modality.settled]
-            dict(attributes["versions"]), str(attributes["variant"])
-        except (KeyError, TypeError, ValueError, MitsonarError) as error:
+            _check_attributes(attributes, store.recipe, store.modality)
+            store.scenes  # noqa: B018
+            if store.ready:
+                store._check_rows()
+        except Exception as error:  # attributes lead to whatever their bytes do
             raise MitsonarError(
                 f"the attributes of {place.url} are damaged ({type(error).__name__}: {error}): remove it and make it again"
             ) from None
@@ -193,6 +201,7 @@ class DataStore:
                 ) from None
             if not isinstance(found, zarr.Array):
                 raise MitsonarError(f"{self.place.url}/{name} is no array: remove the data set and make it again")
+            self._check_array(name, found)
             self._arrays[name] = found
         return self._arrays[name]
 
@@ -204,13 +213,70 @@ class DataStore:
         """
         array = self.array(name)
         try:
-            return np.asarray(array[index])
-        except (ValueError, RuntimeError, OSError) as error:
-            reason = " ".join(str(error).split())[:160]
+            values = np.asarray(array[index])
+        except Exception as error:  # damaged bytes raise whatever they lead to
+            reason = " ".join(str(error).split())[:160] or type(error).__name__
             raise MitsonarError(
                 f"{self.place.url}: {name} is damaged ({reason}); `mitsonar dataset check` tells where, "
                 "`mitsonar dataset make --verify` mends it"
             ) from None
+        most = {"sequence": int(self.about["sequences"]) - 1, "scene": max(self.scenes)}.get(name)
+        if values.size and most is not None and not (values.min() >= 0 and values.max() <= most):
+            raise MitsonarError(
+                f"{self.place.url}: {name} is damaged (numbers are 0..{most}, got {values.min()}..{values.max()}); "
+                "`mitsonar dataset make --verify` mends it"
+            )
+        if name in ("pose", "vehicle_pose", "time_s") and not np.isfinite(values).all():
+            raise MitsonarError(
+                f"{self.place.url}: {name} is damaged (nan or inf); `mitsonar dataset make --verify` mends it"
+            )
+        return values
+
+    def _check_rows(self) -> None:
+        """That the frames promised are no more than the bytes of their poses, motions or times can hold.
+
+        Raises:
+            ValueError: they are.
+        """
+        if len(self) <= FEW_ROWS:
+            return
+        stored = 0
+        for key in ("pose/c/0/0", "motion/c/0/0", "time_s/c/0"):
+            with contextlib.suppress(OSError):
+                stored = max(stored, int(self.place.fs.size(f"{self.place.root}/{key}") or 0))
+        if len(self) > rows_that_fit(stored):
+            raise ValueError(f"{len(self):,} frames are more than the {stored:,} bytes of their poses can hold")
+
+    def _check_array(self, name: str, found: zarr.Array) -> None:
+        """That an array has the type, the shape and the pieces that the recipe gives it.
+
+        Raises:
+            MitsonarError: it has others.
+        """
+        wanted = self._wanted.get(name)
+        if wanted is None:
+            return
+        shape, kind = wanted
+        pieces = found.shards or found.chunks
+        whole = (self.shard_frames, *shape[1:]) if name in self.rendered else (1, *shape[1:]) if name == SEAL else shape
+        fits = all(piece > 0 for piece in found.chunks) and tuple(pieces) == whole
+        if found.shape != shape or found.dtype.kind != np.dtype(kind).kind or not fits:
+            raise MitsonarError(
+                f"{self.place.url}/{name} is {found.dtype} {str(found.shape)[:60]} in pieces of {str(pieces)[:60]}, not "
+                f"{kind} {shape} in pieces of {whole}: it is damaged; remove the data set and make it again"
+            )
+
+    @cached_property
+    def _wanted(self) -> dict[str, tuple[tuple[int, ...], Any]]:
+        """Shape and type of each array."""
+        frames = len(self)
+        table = {name: ((frames, *one.shape), one.kind) for name, one in self.modality.stored.items()}
+        table |= {name: (axis.values.shape, axis.values.dtype) for name, axis in self.modality.axes.items()}
+        widths = {"pose": 6, "vehicle_pose": 6, "motion": 3, "velocity": 4}
+        table |= {name: ((frames, width), np.dtype(np.float64)) for name, width in widths.items()}
+        table |= {"time_s": ((frames,), np.dtype(np.float64))}
+        table |= {name: ((frames,), np.dtype(np.int32)) for name in ("scene", "sequence")}
+        return table | {SEAL: ((self.shards, len(self.rendered), 2), np.dtype(np.uint64))}
 
     # ---------------------------------------------------------------- shards
 
@@ -392,6 +458,39 @@ class DataStore:
         )
         with zarr.config.set({"array.write_empty_chunks": True}):
             array[...] = values
+
+
+def _check_attributes(about: dict[str, Any], recipe: Recipe, modality: Modality) -> None:
+    """The numbers of a store, against each other and its recipe.
+
+    Raises:
+        MitsonarError, KeyError, ValueError: a number that cannot be.
+    """
+    sequences = whole_number(about["sequences"], "sequences", 1, recipe.sequences)
+    most = MOST_FRAMES
+    if recipe.flight.kind == "random":
+        most = sequences * recipe.flight.pings
+        whole_number(about["frames"], "frames", most, most)
+    frames = whole_number(about["frames"], "frames", 1, min(most, MOST_FRAMES))
+    shard = whole_number(about["shard_frames"], "shard_frames", 1, MOST_FRAMES)
+    if shard % whole_number(about["chunk_frames"], "chunk_frames", 1, shard):
+        raise ValueError("shard_frames is no multiple of chunk_frames")
+    total, numbers = 0, set()
+    for scene in about["scenes"]:
+        numbers.add(whole_number(scene["number"], "number of a scene", 0, 2**31))
+        whole_number(scene["group"], "group of a scene", 0, len(recipe.scenes) - 1)
+        whole_number(scene["seed"], "seed of a scene", 0, 2**64)
+        total += whole_number(scene["sequences"], "sequences of a scene", 1, sequences)
+    if total != sequences or len(numbers) != len(about["scenes"]):
+        raise ValueError(f"scenes have {total:,} sequences, {sequences:,} are promised for {frames:,} frames")
+    for name in modality.settled:
+        if type(about[name]) not in (int, float) or not 0 < about[name] < math.inf:
+            raise ValueError(f"{name} must be a finite number above 0")
+    versions = about["versions"]
+    if not (isinstance(versions, dict) and isinstance(about["variant"], str)):
+        raise ValueError("versions or variant is something else")
+    if not all(type(about[name]) is bool for name in ("ready", "finished")):
+        raise ValueError("ready and finished must be true or false")
 
 
 def planned(plan: Plan, modality: Modality) -> dict[str, NDArray[Any]]:

@@ -35,9 +35,7 @@ COMPARISON = RunKind(
 class AnswerFolder:
     """Answers that nobody keeps: of a comparison without a folder."""
 
-    def load(
-        self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int
-    ) -> dict[str, Answers] | None:
+    def load(self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int) -> dict[str, Answers] | None:
         """What an earlier run has found of ``count`` pairs; None where it has not."""
         return None
 
@@ -68,9 +66,7 @@ class AnswersOnDisk(AnswerFolder):
     def _path(self, name: str, ending: str) -> Path:
         return self.run.path / (re.sub(r"[^\w.-]+", "-", name.replace("%", "percent")) + ending)
 
-    def load(
-        self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int
-    ) -> dict[str, Answers] | None:
+    def load(self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int) -> dict[str, Answers] | None:
         """What an earlier run has found of ``count`` pairs; None where it has not.
 
         Raises:

@@ -11,10 +11,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.whole_files import read_yaml
 
 __all__ = ["PRESETS", "load_sonar", "preset", "preset_sources", "sonar_from"]
 
@@ -227,13 +226,10 @@ def load_sonar(name_or_file: str | Path) -> Sonar:
             return preset(text)
         raise MitsonarError(f"a sonar's file ends in .yaml: got {text}; rename it, or name a preset")
     try:
-        fields = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MitsonarError(
-            f"cannot read sonar file {text}: {error.strerror}; give a preset's name or an existing YAML file"
-        ) from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MitsonarError(f"{text} is not YAML: {' '.join(str(error).split())}; see docs/sonar.md") from None
+        fields = read_yaml(text, "sonar file")
+    except MitsonarError as error:
+        more = "; see docs/sonar.md" if "not YAML" in str(error) else " or a preset's name"
+        raise MitsonarError(f"{error}{more}") from None
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MitsonarError(f"{text} must hold `key: value` lines of a sonar; see docs/sonar.md")
     fields.setdefault("name", Path(text).stem)
@@ -244,4 +240,6 @@ def sonar_from(fields: dict[str, Any]) -> Sonar:
     """A sonar from its fields, the key ``preset`` (optional) naming the one they change."""
     fields = dict(fields)
     base = fields.pop("preset", None)
+    if not all(isinstance(key, str) for key in fields) or not isinstance(base, str | None):
+        raise MitsonarError("the keys of a sonar must be words, and preset the name of one; see docs/sonar.md")
     return Sonar.create(**fields) if base is None else preset(str(base)).replace(**fields)

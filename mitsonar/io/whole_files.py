@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import zipfile
 from pathlib import Path
@@ -13,8 +14,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.io.plain_data import parse_json, parse_yaml
 
-__all__ = ["read_json", "read_npz", "write_json", "write_whole"]
+__all__ = [
+    "at_most",
+    "read_bytes",
+    "read_json",
+    "read_npz",
+    "read_yaml",
+    "refuse_beyond_memory",
+    "write_json",
+    "write_whole",
+]
+
+LARGEST_JSON = 2**27
+"""Bytes of a JSON file."""
+
+LARGEST_YAML = 2**20
+"""Bytes of a YAML file; people write them."""
+
+INFLATION = 1032
+"""Deflated data can grow by no more."""
+
+MOST_PARTS = 10_000
+"""Arrays of an npz file."""
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
@@ -33,27 +56,130 @@ def write_json(path: str | Path, value: dict[str, Any]) -> None:
     write_whole(path, (json.dumps(value, indent=2) + "\n").encode())
 
 
+def at_most(path: str | Path, limit: int) -> bytes:
+    """The bytes of a file, or the first ``limit`` + 1 of them; devices that never end are no exception.
+
+    Raises:
+        OSError, ValueError: as :func:`open` does.
+    """
+    parts: list[bytes] = []
+    with Path(path).open("rb") as file:
+        while sum(map(len, parts)) <= limit and (part := file.read(min(2**24, limit + 1))):
+            parts.append(part)
+    return b"".join(parts)[: limit + 1]
+
+
+def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
+    """The bytes of a file that is not larger than it can be.
+
+    Args:
+        path: of the file.
+        what: it is, for errors.
+        limit: bytes.
+
+    Raises:
+        MitsonarError: no such file, not readable, or larger.
+    """
+    try:
+        content = at_most(path, limit)
+    except FileNotFoundError:
+        raise MitsonarError(f"no such file: {path}") from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MitsonarError(f"cannot read {what} {path}: {reason}; give an existing file") from None
+    if len(content) > limit:
+        raise MitsonarError(f"{what} {path} is larger than {limit:,} bytes: it is damaged, or something else")
+    return content
+
+
 def read_json(path: str | Path) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
-        MitsonarError: no such file, not JSON, or not an object.
+        MitsonarError: no such file, not JSON, not an object, or of a size that cannot be.
     """
-    try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise MitsonarError(f"no such file: {path}") from None
-    except (OSError, ValueError, RecursionError) as error:  # the last where it is nested too deep
-        raise MitsonarError(f"cannot read {path}: {error}") from None
+    value = parse_json(read_bytes(path, "file", LARGEST_JSON), str(path))
     if not isinstance(value, dict):
         raise MitsonarError(f"{path} must hold a JSON object")
     return value
 
 
+def read_yaml(path: str | Path, what: str, also: str = "") -> Any:
+    """The value in a YAML file.
+
+    Args:
+        path: of the file.
+        what: it is, for errors.
+        also: what may be given besides a file, for errors.
+
+    Raises:
+        MitsonarError: no such file, not YAML, or of a size that cannot be.
+    """
+    try:
+        content = at_most(path, LARGEST_YAML)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MitsonarError(f"cannot read {what} {path}: {reason}; give a YAML file{also}") from None
+    if len(content) > LARGEST_YAML:
+        raise MitsonarError(f"{path} is larger than {LARGEST_YAML:,} bytes: it is no {what}")
+    try:
+        return parse_yaml(content.decode("utf-8"), str(path))
+    except UnicodeDecodeError as error:
+        raise MitsonarError(f"{path} is not YAML: {error}") from None
+
+
 def read_npz(path: str | Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file by name; what its bytes lead to where it is damaged is the caller's to answer."""
+    """The arrays of an npz file by name: numbers and texts, each checked against its size in the file before it is made.
+
+    What bytes lead to where they are damaged is the caller's to answer; errors of ours are ``ValueError``.
+    """
     with zipfile.ZipFile(path) as file:  # read to the end, or NumPy would not see each part's checksum
-        if any(entry.comment for entry in file.infolist()):  # a damaged length there swallows other parts
+        parts = file.infolist()
+        if any(entry.comment for entry in parts):  # a damaged length there swallows other parts
             raise ValueError("its list of parts is damaged")
-        parts = {name.removesuffix(".npy"): io.BytesIO(file.read(name)) for name in file.namelist()}
-    return {name: np.lib.format.read_array(part, allow_pickle=False) for name, part in parts.items()}
+        if len(parts) > MOST_PARTS or len({entry.filename for entry in parts}) < len(parts):
+            raise ValueError("its list of parts holds a name twice, or too many")
+        if sum(entry.compress_size for entry in parts) > Path(path).stat().st_size:
+            raise ValueError("its parts overlap")
+        for entry in parts:
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{entry.filename} is packed in a way that NumPy does not use")
+            if entry.file_size > INFLATION * entry.compress_size + 64:
+                raise ValueError(f"{entry.filename} says that it unpacks to {entry.file_size:,} bytes, more than can be")
+        refuse_beyond_memory(sum(entry.file_size for entry in parts), str(path))
+        return {entry.filename.removesuffix(".npy"): _array_in(file.read(entry), entry.filename) for entry in parts}
+
+
+def refuse_beyond_memory(size: int, source: str) -> None:
+    """Refuse what this machine cannot hold.
+
+    Args:
+        size: bytes.
+        source: is named in errors.
+
+    Raises:
+        MitsonarError: more than half of the machine's memory.
+    """
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if size > there // 2:
+        raise MitsonarError(
+            f"{source} would take {size / 2**30:,.4g} GiB of memory, this machine has {there / 2**30:,.4g}: it is damaged, "
+            "or must be cut into pieces"
+        )
+
+
+def _array_in(content: bytes, name: str) -> NDArray[Any]:
+    """An array of an npz file; its header is checked before anything is made of it."""
+    part = io.BytesIO(content)
+    versions = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    found = np.lib.format.read_magic(part)
+    if found not in versions:
+        raise ValueError(f"{name} has the version {found} of NumPy's format")
+    shape, fortran_order, kind = versions[found](part)
+    if kind.hasobject or kind.names is not None or kind.kind not in "biufcU":
+        raise ValueError(f"{name} holds neither numbers nor text but {str(kind)[:60]}")
+    if any(length < 0 for length in shape) or math.prod(shape) * kind.itemsize != len(content) - part.tell():
+        raise ValueError(f"{name} says that its shape is {str(shape)[:60]}, its bytes are {len(content) - part.tell():,}")
+    values = np.frombuffer(content, kind, math.prod(shape), part.tell()) if kind.itemsize and math.prod(shape) else None
+    made = np.zeros(shape, kind) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
+    return np.array(made)  # writable, as others expect it

@@ -18,7 +18,8 @@ from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.motion.pose import Trajectory
 from mitsonar.motion.trajectory_errors import associated
-from mitsonar.records.sonar_frames import LABELS, PER_FRAME, SonarFrames
+from mitsonar.records.columns import check_column, open_group
+from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
 
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore
@@ -305,25 +306,37 @@ def _group(path: Path) -> Any:
 
 def _of_zarr(path: Path, name: str) -> FrameSource:
     """Frames of a long run, or of one that was not finished."""
-    group = _group(path)
     try:
-        arrays = {name: array for name, array in group.arrays() if name not in (*LABELS, "pitch_rad")}
+        found, done = open_group(path, COLUMNS, "time_s", "frames_done")
+        arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
+        arrays = {name: array for name, array in arrays.items() if name not in (*LABELS, "pitch_rad")}
         image = arrays["image"]
-        done = int(group.attrs.get("frames_done", image.shape[0]))
-        table = {
+        table: dict[str, Any] = {
             name: array[:done] if name in PER_FRAME else array[...] for name, array in arrays.items() if name != "image"
         }
-        table |= {name: np.array(value) for name, value in group.attrs.items() if name != "frames_done"}
+        table |= {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
         nothing = np.zeros((0, *image.shape[1:]), dtype=image.dtype)
         none_of = {name: values[:0] for name, values in table.items() if name in PER_FRAME}
     except Exception as error:
         raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
     like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
+    for name in ("poses", "height_m"):
+        if name in table:
+            check_column(table[name], name, COLUMNS[name], {"frames": done, "six": 6}, str(path))
+    times = table["time_s"]
+    if times.ndim == 1:
+        check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
     if done < image.shape[0]:
         said = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
         warnings.warn(said, MitsonarWarning, stacklevel=3)
     poses, height = table.get("poses"), table.get("height_m")
-    return FrameSource._of(like, table["time_s"], poses, height, lambda index: _picked(image, index), name)
+
+    def images(index: Index) -> NDArray[Any]:
+        picked = _picked(image, index)
+        check_column(picked, "image", COLUMNS["image"], {}, str(path))
+        return picked
+
+    return FrameSource._of(like, table["time_s"], poses, height, images, name)
 
 
 def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.io.plain_data import parse_json, whole_number
 from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
 from mitsonar.io.whole_files import write_json, write_whole
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
@@ -114,7 +115,7 @@ class OdometryFolder:
         for number, line in enumerate(whole.splitlines(), start=1):
             try:
                 pair, estimate = _estimate_in(line)
-            except (ValueError, KeyError, TypeError):
+            except Exception:  # a line leads to whatever its bytes do
                 raise MitsonarError(f"{journal}, line {number} is damaged: begin again with --overwrite") from None
             estimates[pair] = estimate
         return estimates
@@ -247,11 +248,21 @@ def _line_of(pair: int, estimate: Estimate) -> str:
 
 
 def _estimate_in(line: bytes) -> tuple[int, Estimate]:
-    said = json.loads(line)
-    covariance = None if said["covariance"] is None else np.array(said["covariance"], dtype=float).reshape(3, 3)
-    motion = Motion(*(float(value) for value in said["motion"]))
-    about = dict(said.get("about", {}))
-    return int(said["pair"]), Estimate(motion, covariance, bool(said["valid"]), str(said["reason"]), about)
+    """The number of a pair and its estimate; whatever is wrong raises."""
+    said = parse_json(line, "the line")
+    covariance = None if said["covariance"] is None else np.array(said["covariance"], dtype=float)
+    motion = np.array(said["motion"], dtype=float)
+    if motion.shape != (3,) or not isinstance(said["reason"], str) or type(said["valid"]) is not bool:
+        raise ValueError("motion, reason or believe is something else")
+    if said["valid"] and not np.isfinite(motion).all():
+        raise ValueError("the motion is not finite")
+    if covariance is not None and (covariance.shape != (3, 3) or (np.diagonal(covariance) < 0).any()):
+        raise ValueError("covariance is something else")
+    about = said.get("about", {})
+    if not isinstance(about, dict):
+        raise ValueError("about is no table")
+    pair = whole_number(said["pair"], "pair", 0, 2**40)
+    return pair, Estimate(Motion(*(float(value) for value in motion)), covariance, said["valid"], said["reason"], about)
 
 
 def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:

@@ -39,6 +39,13 @@ __all__ = [
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
+LARGEST_TUM = 2**30
+"""Bytes of a trajectory."""
+
+FARTHEST = 1e12
+"""Of places [m], times [s] and numbers of a quaternion in a file."""
+
+
 class Pose(NamedTuple):
     """Where the sonar is: x, y, z [m], pitch, roll, heading [rad]."""
 

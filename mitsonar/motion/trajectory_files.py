@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.whole_files import at_most, write_whole
 from mitsonar.motion.conventions import Convention
 
 __all__ = ["read_csv", "read_tum", "write_csv", "write_tum"]
@@ -66,6 +66,13 @@ def write_tum(path: str | Path, table: Table, convention: Convention) -> None:
     np.savetxt(path, table, fmt="%.9f", header=f"time_s x y z qx qy qz qw {axes}")
 
 
+LARGEST = 2**30
+"""Bytes of a trajectory."""
+
+FARTHEST = 1e12
+"""Of places [m], times [s] and numbers of a quaternion in a file."""
+
+
 def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Table | None]:
     """The numbers of a CSV file: times and positions ``(poses, 4)``, then either quaternions ``(poses, 4)`` or, with None
     beside, pitch, roll and turn about the vertical ``(poses, 3)`` [rad].
@@ -113,10 +120,14 @@ def write_csv(path: str | Path, table: Table, convention: Convention) -> None:
 
 def _text(path: str | Path) -> str:
     try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        content = at_most(path, LARGEST)
+        text = content.decode("utf-8-sig")
+    except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not text"
         raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM or CSV file") from None
+    if len(content) > LARGEST:
+        raise MitsonarError(f"trajectory {path} is larger than {LARGEST:,} bytes: it is no TUM or CSV file, or cut it")
+    return text
 
 
 def _refuse_another(path: str | Path, line: str, convention: Convention) -> None:
@@ -136,11 +147,12 @@ def _refuse_disorder(path: str | Path, number: int, rows: list[list[float]]) -> 
 
 
 def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
+    words = line.split()
     try:
-        row = [float(word) for word in line.split()]
+        row = [float(word) for word in words] if len(words) == 8 and "_" not in line else []
     except ValueError:
         row = []
-    if len(row) != 8 or not np.isfinite(row).all() or np.linalg.norm(row[4:]) < 1e-6:
+    if len(row) != 8 or not (np.abs(row) <= FARTHEST).all() or not np.linalg.norm(row[4:]) >= 1e-6:
         raise MitsonarError(
             f"trajectory {path}, line {number}: expected `time x y z qx qy qz qw` as finite numbers with a "
             f"quaternion other than zero, got {line.strip()[:60]!r}"
@@ -197,10 +209,11 @@ def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention
 
 def _csv_row(path: str | Path, number: int, words: list[str], places: list[int]) -> list[float]:
     try:
-        row = [float(words[place]) for place in places]
+        row = [] if "_" in "".join(words) else [float(words[place]) for place in places]
     except (ValueError, IndexError):
         row = []
-    if not row or not np.isfinite(row).all() or (len(places) == 8 and np.linalg.norm(row[4:]) < 1e-6):
+    zero = len(places) == 8 and bool(row) and not np.linalg.norm(row[4:]) >= 1e-6
+    if not row or not (np.abs(row) <= FARTHEST).all() or zero:
         raise MitsonarError(
             f"trajectory {path}, line {number}: expected finite numbers in the columns that its first line names, and no "
             f"quaternion of zero, got {','.join(words)[:60]!r}"

@@ -9,19 +9,20 @@ import zipfile
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mitsonar.datasets.arrangement import LABELS, Labels
+from mitsonar.datasets.arrangement import LABELS, Coordinates, Labels, Layout
 from mitsonar.datasets.batches import Batches
-from mitsonar.errors import MitsonarError, meant, nearest_names
+from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.plain_data import check_plain
+from mitsonar.io.whole_files import read_bytes, write_whole
 from mitsonar.motion.motion_errors import AXES
 from mitsonar.networks.create import NETWORKS, create_network
 from mitsonar.networks.gaussian_head import GaussianHead
@@ -53,6 +54,12 @@ LATER: dict[str, Any] = {"range_levels": (int, type(None)), "halves": bool}
 
 LARGEST = 8 * 2**30
 """Bytes of a checkpoint once unpacked."""
+
+LARGEST_OPTION = 1_000_000
+"""Of a network: sizes, channels, layers."""
+
+FEW_WEIGHTS = 10_000_000
+"""So many may be made before it is known that they fit no file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,12 +142,13 @@ class Checkpoint:
             MitsonarError: an unknown network or option, or weights that do not fit it.
         """
         written = f"the checkpoint was written by mitsonar {self.version}, this is {version('mitsonar')}"
+        self._check_fit(written)
         with torch.random.fork_rng(devices=[]):
             try:
                 network = create_network(self.network, **self.options)
             except MitsonarError as error:
                 raise MitsonarError(f"{error} ({written})") from None
-            except (RuntimeError, TypeError, ValueError, ArithmeticError) as error:
+            except Exception as error:  # options lead to whatever they do
                 raise MitsonarError(f"no {self.network} has these options, {self.options}: {_first_line(error)}") from None
         try:
             network.load_state_dict(self.weights)
@@ -149,6 +157,30 @@ class Checkpoint:
                 f"the weights do not fit a {self.network} with options {self.options}: {_mismatch(error)} ({written})"
             ) from None
         return network.eval().requires_grad_(False)
+
+    def _check_fit(self, written: str) -> None:
+        """That options and weights fit each other, before memory is taken for a network that only its options promise.
+
+        Raises:
+            MitsonarError: they do not.
+        """
+        large = [name for name, value in _numbers_in(self.options) if not abs(value) <= LARGEST_OPTION]
+        if large:
+            raise MitsonarError(
+                f"no {self.network} has these options, {shortened(self.options)}: {large[0]} is beyond {LARGEST_OPTION:,}"
+            )
+        try:
+            with torch.device("meta"), torch.random.fork_rng(devices=[]):
+                promised = create_network(self.network, **self.options).state_dict()
+        except Exception:  # said by build, where it happens again
+            return
+        there = sum(values.numel() for values in self.weights.values())
+        wanted = sum(values.numel() for values in promised.values())
+        if wanted > 2 * there + FEW_WEIGHTS:
+            raise MitsonarError(
+                f"the weights do not fit a {self.network} with options {shortened(self.options)}: they are {there:,}, "
+                f"it has {wanted:,} ({written})"
+            )
 
     # ---------------------------------------------------------------- what it says
 
@@ -198,6 +230,10 @@ class Checkpoint:
         if isinstance(answer, GaussianHead):
             mean, covariance = (values.detach().cpu().double().numpy() for values in answer)
             return mean, covariance
+        names = self.labels["names"]
+        if not isinstance(answer, Tensor) or answer.ndim != 2 or answer.shape[1] != len(names):
+            got = tuple(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__
+            raise MitsonarError(f"the {self.network} answers {got}, its labels are {', '.join(names)}: the file is damaged")
         return self.coder.decode(answer.detach().cpu().numpy()), None
 
     @property
@@ -236,7 +272,7 @@ class Checkpoint:
         ]
         for level, found in self.metrics.items():
             rmse = found.get("rmse") if isinstance(found, dict) else None
-            if isinstance(rmse, list):
+            if isinstance(rmse, list) and len(rmse) <= len(AXES) and _are_numbers(rmse, len(rmse)):
                 units = [axis.unit for axis in AXES[: len(rmse)]]
                 values = " / ".join(f"{value:.3g} {unit}" for value, unit in zip(rmse, units, strict=True))
                 rows.append((f"RMSE, noise {level}", f"{values} in validation"))
@@ -272,13 +308,12 @@ class Checkpoint:
                     f"{path} holds no {FILE}: give the folder of a training that has validated once, or a checkpoint"
                 )
             path = path / FILE
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
+        if not path.exists():
             raise MitsonarError(
                 f"no checkpoint {path}: give a {FILE}, the folder of `mitsonar train`, or {' or '.join(SHIPPED)}"
                 f"{meant(path, SHIPPED)}"
-            ) from None
+            )
+        content = read_bytes(path, "checkpoint", LARGEST)
         return cls.from_bytes(content, str(path))
 
     @classmethod
@@ -312,9 +347,10 @@ def _unpacked(content: bytes, source: str) -> dict[Any, Any]:
         raise MitsonarError(f"{source} is not a checkpoint, or was cut off: give a {FILE} of `mitsonar train`")
     try:
         with zipfile.ZipFile(buffer) as parts:
-            if sum(part.file_size for part in parts.infolist()) > LARGEST:
+            packed = [part for part in parts.infolist() if part.compress_type != zipfile.ZIP_STORED]
+            if packed or sum(part.file_size for part in parts.infolist()) > min(LARGEST, len(content)):
                 raise MitsonarError(
-                    f"{source} would unpack to more than {LARGEST >> 30} GiB: it is no checkpoint of mitsonar"
+                    f"{source} would unpack to more than it is, or than {LARGEST >> 30} GiB: it is no checkpoint of mitsonar"
                 )
             wrong = parts.testzip()
         if wrong is not None:
@@ -337,6 +373,10 @@ def _faults(table: dict[Any, Any]) -> list[str]:
     found += [f"{key!r} is unknown" for key in table if key not in names]
     if found:
         return found
+    try:
+        check_plain({name: value for name, value in table.items() if name != "weights"}, "it")
+    except MitsonarError as error:
+        return [str(error)]
     texts, tables = (
         ("network", "model", "noise", "data", "version"),
         ("options", "arrangement", "labels", "sonar", "trained_at"),
@@ -350,6 +390,8 @@ def _faults(table: dict[Any, Any]) -> list[str]:
     for name, values in table["weights"].items():
         if not isinstance(values, Tensor):
             found.append(f"weights {name} are not numbers")
+        elif not _stored_whole(values):
+            found.append(f"weights {name} stand for more numbers than the file holds")
         elif not torch.isfinite(values).all():
             found.append(f"weights {name} hold nan or inf")
     words = table["arrangement"]
@@ -360,8 +402,39 @@ def _faults(table: dict[Any, Any]) -> list[str]:
     found += [f"arrangement {word} is not said" for word in later if not isinstance(words[word], LATER[word])]
     if not found and not (words["views"] and all(isinstance(view, str) for view in words["views"])):
         found.append("arrangement views are not names")
+    if not found:
+        found += _faults_of_words(words)
     receives = words["kind"] == "response" if not found else False
     return found + _faults_of_labels(table["labels"]) + _faults_of_sonar(table["sonar"], table["trained_at"], receives)
+
+
+def _faults_of_words(words: dict[str, Any]) -> list[str]:
+    """What is wrong with an arrangement whose words have the right types."""
+    known = {
+        "kind": ("image", "vector", "response"),
+        "layout": (*get_args(Layout), "columns"),
+        "coordinates": (*get_args(Coordinates), "delay"),
+    }
+    found = [f"arrangement {word} is {words[word][:40]!r}" for word, names in known.items() if words[word] not in names]
+    if not 1 <= words["frames"] <= 16 or not 0 <= words["cartesian_rows"] <= 2**24:
+        found.append("arrangement frames or cartesian_rows cannot be")
+    levels = words.get("range_levels")
+    if levels is not None and not 1 <= levels <= 2**24:
+        found.append("arrangement range_levels cannot be")
+    return found
+
+
+def _stored_whole(values: Tensor) -> bool:
+    """Whether a tensor has a number in the file for each of its own: an expanded one asks for memory that nobody sent."""
+    if values.layout != torch.strided or values.device.type != "cpu" or values.is_quantized:
+        return False
+    return values.numel() * values.element_size() <= values.untyped_storage().nbytes()
+
+
+def _numbers_in(options: dict[str, Any]) -> list[tuple[str, float]]:
+    """Numbers of a network's options, those of lists too, with the option's name."""
+    pairs = [(name, one) for name, value in options.items() for one in (value if isinstance(value, list) else [value])]
+    return [(name, one) for name, one in pairs if isinstance(one, int | float)]
 
 
 def _faults_of_labels(labels: dict[str, Any]) -> list[str]:

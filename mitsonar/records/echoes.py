@@ -61,6 +61,16 @@ CHANNELS = tuple(field.name for field in fields(Echoes))
 """Channels of the integrator ``echo`` and of an EXR of ``echoes/``, in this order; EXR files sort them by name."""
 
 
+LIMITS = (
+    *(("hit", 0, 1), ("reflectivity", 0, 1), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13), ("range_m", 0, 1e9)),
+    *(("shape_id", -1, 2**24), ("nx", -1.001, 1.001), ("ny", -1.001, 1.001), ("nz", -1.001, 1.001)),
+)
+"""Least and greatest values of channels."""
+
+INFLATION = 1032
+"""Deflated pixels can grow by no more."""
+
+
 def save_exr(path: str | Path, echoes: Echoes, sonar: Sonar) -> None:
     """Write one frame's echoes ``(rays_per_beam, columns)``, float32, one channel each."""
     import OpenEXR
@@ -84,8 +94,12 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
     if not Path(path).is_file():
         raise MitsonarError(f"no such echo file: {path}")
     try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            _check_header(file.header(), [str(name) for name in file.channels()], shape, Path(path).stat().st_size)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    except MitsonarError as error:
+        raise MitsonarError(f"{path} {error}") from None
     except Exception as error:  # OpenEXR raises bare exceptions of several kinds
         raise MitsonarError(f"cannot read echoes {path}: {error}; render them again with --exr") from None
     values: dict[str, NDArray[np.float32]] = {}
@@ -97,7 +111,21 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
         values[name] = np.ascontiguousarray(channels[name], dtype=np.float32).ravel()
         if not np.isfinite(values[name]).all():
             raise MitsonarError(f"{path}: channel {name} holds inf or nan; render the echoes again with --exr")
-    for name, low, high in (("hit", 0, 1), ("reflectivity", 0, 1), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13)):
+    for name, low, high in LIMITS:
         if values[name].min() < low or values[name].max() > high:
             raise MitsonarError(f"{path}: channel {name} must lie in {low}..{high}; render the echoes again with --exr")
     return Echoes(**values)
+
+
+def _check_header(header: dict[str, Any], names: list[str], shape: tuple[int, int], size: int) -> None:
+    """What a file promises, before its pixels are read.
+
+    Raises:
+        MitsonarError: another size than the sonar's, or more pixels than its bytes can hold.
+    """
+    low, high = (np.asarray(corner).tolist() for corner in header["dataWindow"])
+    found = (high[1] - low[1] + 1, high[0] - low[0] + 1)
+    if found != shape:
+        raise MitsonarError(f"must be {shape[1]} x {shape[0]} rays as its sonar: got {found}")
+    if len(names) > 100 or len(names) * 2 * shape[0] * shape[1] > INFLATION * size:
+        raise MitsonarError(f"promises {len(names)} channels of {shape[1]} x {shape[0]} rays in {size:,} bytes")

@@ -14,7 +14,9 @@ import zarr
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.records.sonar_frames import PER_FRAME, SonarFrames
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.records.columns import arrays_in, check_column
+from mitsonar.records.sonar_frames import COLUMNS, PER_FRAME, SonarFrames
 
 __all__ = ["LONGEST_NPZ", "FrameStore"]
 
@@ -57,11 +59,40 @@ class FrameStore:
             MitsonarError: there is none, or it is damaged.
         """
         try:
-            store = cls(zarr.open_group(path, mode="r+"), path)
+            store = cls(arrays_in(path, "r+")[0], path)
             store.frames, store.done  # noqa: B018
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except Exception as error:  # a damaged Zarr raises whatever its bytes lead to
             raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
         return store
+
+    def check(self, frames: int, sonar: Sonar, done: int) -> None:
+        """Check that the store is that of a run.
+
+        Args:
+            frames: of the whole run.
+            sonar: its instrument.
+            done: frames that the run says are written.
+
+        Raises:
+            MitsonarError: arrays are missing, of other shapes or cut otherwise, or fewer frames are written.
+        """
+        cells = (sonar.range_bins, sonar.beams)
+        sizes = {"frames": frames, "bins": cells[0], "beams": cells[1], "six": 6}
+        try:
+            if type(self.group.attrs["frames_done"]) is not int or not done <= self.done <= frames:
+                raise ValueError(f"it holds {self.done:,} frames, run.json says {done:,} of {frames:,}")
+            _, arrays = arrays_in(self.path, "r+")
+            for name, array in arrays.items():
+                if name in COLUMNS and not (name == "time_s" and array.shape == (frames, cells[1])):
+                    check_column(array, name, COLUMNS[name], sizes, "it")
+                wanted = (1, *array.shape[1:]) if array.ndim == 3 else array.shape
+                if array.chunks != wanted:
+                    raise ValueError(f"{name} is cut into pieces of {array.chunks}, not {wanted}")
+            lacking = {"image", "range_m", "bearing_rad", "time_s"} - set(arrays)
+            if lacking:
+                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+        except Exception as error:
+            raise MitsonarError(f"cannot go on with {self.path}: {error}; render again with --overwrite") from None
 
     @property
     def frames(self) -> int:

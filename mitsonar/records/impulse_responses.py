@@ -13,11 +13,23 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.io.whole_files import read_npz, write_whole
+from mitsonar.io.whole_files import read_npz, refuse_beyond_memory, write_whole
+from mitsonar.records.columns import Column, check_column, open_group, table_in
 
 __all__ = ["ImpulseResponses"]
 
 PER_PING = ("response", "time_s", "poses", "velocity", "height_m", "echoes", "dropped")
+
+COLUMNS = {
+    "response": Column(("pings", "receivers", "taps"), "c"),
+    "time_s": Column(("pings",), order="same"),
+    "poses": Column(("pings", "six"), low=-1e9, high=1e9),
+    "velocity": Column(("pings", "four"), low=-1e6, high=1e6),
+    "height_m": Column(("pings",), low=0, nan=True),
+    "echoes": Column(("pings", "receivers"), "i", low=0),
+    "dropped": Column(("pings", "receivers"), "i", low=0),
+}
+"""What the arrays of a file must be."""
 
 
 @dataclass
@@ -119,21 +131,21 @@ class ImpulseResponses:
             path = path / "responses.npz"
         try:
             if path.is_dir():
-                import zarr
-
-                group = zarr.open_group(path, mode="r")
-                table: dict[str, Any] = {name: array[...] for name, array in group.arrays()}
-                table |= {name: np.array(value) for name, value in group.attrs.items()}
+                table, _ = open_group(path, COLUMNS, "time_s")
+                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
+                table |= {name: one[...] for name, one in table.items() if not isinstance(one, np.ndarray)}
             else:
                 table = read_npz(path)
         except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
-            raise MitsonarError(f"cannot read responses {path}: {error}; give what `mitsonar impulse` wrote") from None
+            reason = " ".join(str(error).split())[:300] or type(error).__name__
+            raise MitsonarError(f"cannot read responses {path}: {reason}; give what `mitsonar impulse` wrote") from None
         missing = [name for name in ("response", "time_s", "sonar") if name not in table]
         if missing:
             raise MitsonarError(f"{path} lacks {', '.join(missing)}: it holds no impulse responses of mitsonar")
-        try:
-            sonar = ChannelSonar.create(**json.loads(str(table["sonar"])))
-            about = json.loads(str(table.get("about", "{}")))
-        except (json.JSONDecodeError, TypeError):
-            raise MitsonarError(f"{path}: the field sonar is not JSON; the file is damaged") from None
-        return cls(**{name: table[name] for name in PER_PING if name in table}, sonar=sonar, about=about)
+        sonar = ChannelSonar.create(**table_in(table, "sonar", str(path)))
+        about = table_in(table, "about", str(path), "{}")
+        values = {name: table[name] for name in PER_PING if name in table}
+        sizes = {"pings": len(np.atleast_1d(table["time_s"])), "receivers": len(sonar.receivers), "taps": sonar.taps}
+        for name in values:
+            check_column(values[name], name, COLUMNS[name], sizes | {"four": 4, "six": 6}, str(path))
+        return cls(**values, sonar=sonar, about=about)

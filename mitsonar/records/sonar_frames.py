@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, fields
+import math
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import read_npz
+from mitsonar.io.whole_files import read_npz, refuse_beyond_memory
+from mitsonar.records.columns import Column, check_column, number_of, open_group, table_in, text_of
 
 __all__ = ["LABELS", "SonarFrames", "to_uint8"]
 
@@ -20,6 +22,22 @@ LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int
 """Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
 
 PER_FRAME = ("image", "time_s", "poses", "height_m", *LABELS)
+
+IMAGE = ("frames", "bins", "beams")
+
+COLUMNS = {
+    "image": Column(IMAGE, "fu", low=0, high=255),
+    "range_m": Column(("bins",), low=0, high=1e6, order="strict"),
+    "bearing_rad": Column(("beams",), low=-math.pi, high=math.pi, order="strict"),
+    "time_s": Column(("frames",), order="same"),
+    "poses": Column(("frames", "six"), low=-1e9, high=1e9),
+    "height_m": Column(("frames",), low=0, nan=True),
+    "elevation_rad": Column(IMAGE, low=-math.pi, high=math.pi, nan=True),
+    "shape_id": Column(IMAGE, "i", low=-1),
+    "object_id": Column(IMAGE, "i"),
+    "shadow": Column(IMAGE, "u", low=0, high=2),
+}
+"""What the arrays of a file must be."""
 
 
 @dataclass
@@ -110,15 +128,15 @@ class SonarFrames:
         missing = [name for name in needed if name not in table]
         if missing:
             raise MitsonarError(f"{source} lacks {', '.join(missing)}: it is not a frames file of mitsonar")
+        sonar = Sonar.create(**table_in(table, "sonar", source))
+        about = table_in(table, "about", source, "{}")
         try:
-            sonar = Sonar.create(**json.loads(str(table["sonar"])))
-            about = json.loads(str(table.get("about", "{}")))
-        except (json.JSONDecodeError, TypeError):
-            raise MitsonarError(f"{source}: the field sonar is not JSON; the file is damaged") from None
-        values = {name: table[name] for name in ("image", "range_m", "bearing_rad", "time_s")}
-        values |= {name: table[name] for name in ("poses", "height_m", *LABELS) if name in table}
-        scale = float(table.get("level_scale", np.array(1.0)))
-        return cls(**values, sonar=sonar, level=str(table.get("level", "linear")), level_scale=scale, about=about)
+            level, scale = text_of(table, "level", "linear"), number_of(table, "level_scale", 1.0)
+        except MitsonarError as error:
+            raise MitsonarError(f"{source}: {error}") from None
+        values = {name: table[name] for name in COLUMNS if name in table}
+        _check_values(values, source)
+        return cls(**values, sonar=sonar, level=level, level_scale=scale, about=about)
 
     def save(self, path: str | Path) -> None:
         """Write ``frames.npz``."""
@@ -140,18 +158,38 @@ class SonarFrames:
             path = found[0]
         try:
             if path.is_dir():
-                import zarr
-
-                group = zarr.open_group(path, mode="r")
-                table: dict[str, Any] = {name: array[...] for name, array in group.arrays()}
-                table |= {name: np.array(value) for name, value in group.attrs.items()}
-                done = int(table.pop("frames_done", len(table["image"])))
-                table |= {name: table[name][:done] for name in PER_FRAME if name in table}
+                table, done = open_group(path, COLUMNS, "time_s", "frames_done")
+                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
+                arrays = {name: values for name, values in table.items() if not isinstance(values, np.ndarray)}
+                table |= {name: one[:done] if name in PER_FRAME else one[...] for name, one in arrays.items()}
             else:
                 table = read_npz(path)
         except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
-            raise MitsonarError(f"cannot read frames {path}: {error}; give frames.npz or a run's folder") from None
+            reason = " ".join(str(error).split())[:300] or type(error).__name__
+            raise MitsonarError(f"cannot read frames {path}: {reason}; give frames.npz or a run's folder") from None
         return cls.from_arrays(table, str(path))
+
+
+def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:
+    """The arrays of frames against each other and against what they may be.
+
+    Raises:
+        MitsonarError: types, shapes or values that cannot be.
+    """
+    sizes: dict[str, int] = {}
+    for name in ("range_m", "bearing_rad"):
+        check_column(values[name], name, COLUMNS[name], sizes, source)
+        sizes[COLUMNS[name].dims[0]] = len(values[name])
+    time = values["time_s"]
+    column = COLUMNS["time_s"] if time.ndim != 2 else replace(COLUMNS["time_s"], dims=("frames", "beams"))
+    check_column(time, "time_s", column, sizes, source)
+    sizes["frames"] = len(time)
+    sizes["six"] = 6
+    for name in [name for name in values if name not in ("range_m", "bearing_rad", "time_s")]:
+        check_column(values[name], name, COLUMNS[name], sizes, source)
+    image = values["image"]
+    if image.dtype.kind == "f" and image.size and image.max() > 1 + 1e-5:
+        raise MitsonarError(f"{source}: image must lie in 0..1, or be uint8: got up to {image.max():.6g}")
 
 
 def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:

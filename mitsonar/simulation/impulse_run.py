@@ -18,7 +18,8 @@ from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.pose import Trajectory
 from mitsonar.plotting.response_figure import response_png, waterfall_png
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.columns import check_column
+from mitsonar.records.impulse_responses import COLUMNS, ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.render_run import SIMULATORS
@@ -139,15 +140,28 @@ def _make(
         empty.save(url)
     try:
         group = zarr.open_group(url, mode="r+")
+        _check(group, len(flown), simulator.sonar)
         for part in simulator.pings(flown.poses[done:], velocity[done:], first=done):
             here = slice(part.first, part.first + len(part))
             for name in ("response", "height_m", "echoes", "dropped"):
                 group[name][here] = getattr(part, name)  # type: ignore[index]
             run.note(frames_done=here.stop)
             progress(len(part))
-    except (KeyError, ValueError) as error:
+    except MitsonarError:
+        raise
+    except Exception as error:  # a damaged Zarr raises whatever its bytes lead to
         raise MitsonarError(f"cannot go on with {url}: {error}; make it again with --overwrite") from None
     return ImpulseResponses.load(url)
+
+
+def _check(group: Any, pings: int, sonar: ChannelSonar) -> None:
+    """That a store is that of the run, before anything is written into it."""
+    sizes = {"pings": pings, "receivers": len(sonar.receivers), "taps": sonar.taps, "four": 4, "six": 6}
+    for name, column in COLUMNS.items():
+        array = group[name]
+        check_column(array, name, column, sizes, str(group.store_path))
+        if array.chunks != ((1, *array.shape[1:]) if array.ndim > 2 else array.shape):
+            raise ValueError(f"{name} is cut into pieces of {array.chunks}")
 
 
 def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[Paths]) -> None:

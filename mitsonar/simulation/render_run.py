@@ -152,6 +152,7 @@ def _make_frames(
     if done > 0:
         store = FrameStore.open(folder / "frames.zarr")
         tally = Tally.restore(source.sonar, made.notes.get("tally"))
+        store.check(len(trajectory), source.sonar, done)
     if store is not None and done == len(trajectory):
         return store
     batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
@@ -201,8 +202,8 @@ class StoredEchoes:
         if not (self.folder / "echoes").is_dir():
             raise MitsonarError(f"{folder} holds no echoes: render the run with --exr first")
         frames = SonarFrames.load(self.folder)
-        assert frames.poses is not None
-        assert frames.height_m is not None
+        if frames.poses is None or frames.height_m is None:
+            raise MitsonarError(f"the frames of {folder} lack poses or height_m: `mitsonar render` did not write them")
         self.trajectory = Trajectory(frames.poses, frames.time_s)
         self.height_m = frames.height_m
         self.traced = frames.sonar

@@ -12,6 +12,8 @@ from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.variant import ensure_variant
+from mitsonar.worlds.mesh_check import check_meshes_of
+from mitsonar.worlds.scene_text import check_nesting
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -52,16 +54,21 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
     """Load a Mitsuba scene; ``parameters`` replace its ``$name`` values, as in ``mi.load_file``.
 
     Raises:
-        MitsonarError: missing file, malformed XML, a plugin that refuses its properties.
+        MitsonarError: missing file, malformed XML, a damaged mesh, a plugin that refuses its properties.
     """
     path = find_scene(name_or_file)
-    ensure_variant()
+    variant = ensure_variant()
     import mitsuba as mi
 
     try:
         texts: dict[str, Any] = {key: str(value) for key, value in parameters.items()}
+        check_nesting(path, texts)
+        parser = mi.parser
+        check_meshes_of(parser.parse_file(parser.ParserConfig(variant), str(path), **texts), path.parent)
         # merged meshes would lose their ids; in parallel, one load in some 150 failed on a good file, and none is faster
         scene = mi.load_file(str(path), optimize=False, parallel=False, **texts)
+    except MitsonarError as error:
+        raise MitsonarError(f"cannot load scene {path}: {error}") from None
     except Exception as error:
         raise MitsonarError(f"cannot load scene {path}: {_reason(error)}{_parameters(path, error)}") from error
     if not isinstance(scene, mi.Scene):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.errors import MitsonarError, argument, meant
+from mitsonar.io.plain_data import parse_json, whole_number
+from mitsonar.worlds.mesh_check import check_counts
 from mitsonar.worlds.world import Floor, Mesh, Standpoint, World
 
 __all__ = ["FORMATS", "mesh_world"]
@@ -25,6 +28,20 @@ UNCOLOURED = 0.5
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
 """Rows of the turn that brings each axis up, by even permutations: nothing is mirrored."""
+
+
+LARGEST_M = 1e6
+FARTHEST_M = 1e9
+"""Of a model [m]: its extent, and its distance from the file's origin."""
+
+MOST_TRIANGLES = 50_000_000
+"""Of a model, each copy counted."""
+
+MOST_PIXELS = 2**26
+"""Of a model's picture."""
+
+LARGEST_FILE = 2**32
+"""Bytes of a model."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +87,19 @@ def mesh_world(
     if floor_m is not None and not 0 < floor_m <= 10_000:
         raise MitsonarError(f"{argument('floor_m')} must lie in 0..10000 m: got {floor_m:g}")
     value = _value(reflectivity)
-    pieces = [_piece(geometry, value) for geometry in _geometries(path)]
+    pieces = _pieces(path, value)
     turn = np.array(UP[up], dtype=float) * scale
     corners = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    if not np.isfinite(corners).all() or np.ptp(corners, axis=0).max() <= 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = float(np.ptp(corners, axis=0).max())
+    if not np.isfinite(corners).all() or extent <= 0:
         raise MitsonarError(f"{path} is broken: its vertices are not finite or all in one place; export it again")
+    if not (extent <= LARGEST_M and np.abs(corners).max() <= FARTHEST_M):
+        raise MitsonarError(
+            f"{path} spans {extent:.4g} m with scale {scale:g}: a model spans at most {LARGEST_M:g} m; give the scale in "
+            "metres a unit of the file"
+        )
     shift = np.array([*(low + high)[:2] / 2, low[2]])
     meshes, content = _merge(pieces, turn, shift)
     radius = float(np.linalg.norm(high - low)) / 2
@@ -115,6 +139,16 @@ def _value(reflectivity: str | float) -> str | float:
     return number
 
 
+def _pieces(path: Path, value: str | float) -> list[_Piece]:
+    """The geometries of a file with their reflectivity."""
+    geometries = _geometries(path)
+    try:
+        return [_piece(geometry, value) for geometry in geometries]
+    except Exception as error:  # colours and pictures lead to whatever their bytes do
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MitsonarError(f"cannot read the colours of {path}: {reason}; export the model again") from None
+
+
 def _geometries(path: Path) -> list[trimesh.Trimesh]:
     """The triangles of a file, moved to where its scene graph puts them."""
     if not path.is_file():
@@ -129,9 +163,13 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
             "'mitsonar[meshes]', or export the model as glb, obj, stl or ply"
         )
     try:
+        _check_file(path)
         scene = trimesh.load_scene(path, process=False)
+        _check_copies(scene)
         found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
         for geometry in found:
+            if np.shape(geometry.vertices)[1:] != (3,) or np.shape(geometry.faces)[1:] != (3,):
+                raise ValueError("a vertex or a triangle has not three numbers")
             if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
                 raise ValueError("a triangle names a vertex that is not there")
     except Exception as error:  # readers raise whatever the bytes lead them to
@@ -140,6 +178,56 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
     if not found:
         raise MitsonarError(f"{path} holds no triangles: export a mesh, not points or lines")
     return found
+
+
+def _check_file(path: Path) -> None:
+    """What a file promises, against its size, before a reader takes memory for it.
+
+    Raises:
+        ValueError: more than is there.
+    """
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise ValueError(f"it has {size:,} bytes, more than {LARGEST_FILE:,}")
+    kind = path.suffix.lower()
+    if kind == ".ply":
+        check_counts(path)
+    if kind in (".glb", ".gltf"):
+        _check_gltf(path, size)
+
+
+def _check_gltf(path: Path, size: int) -> None:
+    """That accessors of a glTF file point into bytes that are there."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        (length,) = struct.unpack_from("<I", content, 12)
+        content = content[20 : 20 + length]
+    tree = parse_json(content, "its JSON")
+    for accessor in tree.get("accessors", []):
+        view = tree["bufferViews"][accessor["bufferView"]] if "bufferView" in accessor else {"byteLength": 16 * size}
+        count = whole_number(accessor["count"], "count of an accessor", 0, 2**40)
+        if count > whole_number(view["byteLength"], "byteLength", 0, 2**40):
+            raise ValueError(f"an accessor promises {count:,} values in {view['byteLength']:,} bytes")
+    for buffer in tree.get("buffers", []):
+        there = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
+        there += [(path.parent / str(buffer["uri"])).stat().st_size] if not there else []
+        if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > there[0]:
+            raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, {there[0]:,} are there")
+
+
+def _check_copies(scene: trimesh.Scene) -> None:
+    """That a scene graph, which may place a geometry many times, and its pictures can be held."""
+    total = 0
+    for node in scene.graph.nodes_geometry:
+        geometry = scene.geometry[scene.graph[node][1]]
+        total += len(getattr(geometry, "faces", ()))
+        material: Any = getattr(geometry.visual, "material", None)
+        for name in ("baseColorTexture", "image"):
+            picture = getattr(material, name, None)
+            if picture is not None and picture.width * picture.height > MOST_PIXELS:
+                raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MOST_PIXELS:,}")
+    if total > MOST_TRIANGLES:
+        raise ValueError(f"it places {total:,} triangles, more than {MOST_TRIANGLES:,}")
 
 
 def _piece(geometry: trimesh.Trimesh, value: str | float) -> _Piece:

@@ -105,6 +105,8 @@ class Network(Trained):
             targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground))
         if not np.isfinite(targets).all():
             return rejected("the network's answer is not finite")
+        if targets.shape[1] != 3:
+            raise MitsonarError(f"a motion has three numbers: this {self._checkpoint.network} says {targets.shape[1]}")
         motion = Motion(*targets[0].tolist())
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
         reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion)

@@ -220,7 +220,9 @@ def answer_of(network: nn.Module, inputs: Any) -> Any:
     """
     try:
         return called(network, inputs)
-    except RuntimeError as error:
+    except MitsonarError:
+        raise
+    except (RuntimeError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise MitsonarError(f"the network cannot take these frames: {error}") from None
 
 

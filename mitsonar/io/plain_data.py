@@ -1,0 +1,145 @@
+"""What JSON and YAML files hold: tables, lists, texts and numbers, of a size that can be, nothing that refers to itself."""
+
+from __future__ import annotations
+
+import datetime
+import itertools
+import json
+from typing import Any
+
+import yaml
+
+from mitsonar.errors import MitsonarError
+
+__all__ = ["check_plain", "parse_json", "parse_yaml", "whole_number"]
+
+DEEPEST = 40
+"""Lists and tables within each other."""
+
+MOST_VALUES = 2_000_000
+"""Values of a file, those that are referred to counted each time."""
+
+MOST_OF_YAML = 100_000
+"""Values of a YAML file, which people write."""
+
+MOST_BRACKETS = 200
+"""Open ones in a YAML text, in comments too."""
+
+LARGEST_INTEGER = 2**64
+"""Beyond it there is no seed and no count."""
+
+
+def parse_json(text: str | bytes, source: str) -> Any:
+    """The value of a JSON text.
+
+    Args:
+        text: of the file.
+        source: is named in errors.
+
+    Raises:
+        MitsonarError: not JSON, or of a depth, a size or with integers that cannot be.
+    """
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise MitsonarError(f"{source} nests more than {DEEPEST} deep: it is damaged") from None
+    except ValueError as error:
+        raise MitsonarError(f"cannot read {source}: it is not JSON ({' '.join(str(error).split())[:160]})") from None
+    check_plain(value, source)
+    return value
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """The value of a YAML text; nothing in it is executed.
+
+    Args:
+        text: of the file.
+        source: is named in errors.
+
+    Raises:
+        MitsonarError: not YAML, something that refers to itself, or of a depth, a size or with integers that cannot be.
+    """
+    if _brackets(text) > MOST_BRACKETS:  # the reader would take seconds to find out
+        raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep")
+    loader: yaml.SafeLoader | None = None
+    try:
+        loader = yaml.SafeLoader(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _check_nodes(node, source)
+        value = loader.construct_document(node)
+    except MitsonarError:
+        raise
+    except RecursionError:
+        raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep") from None
+    except Exception as error:  # constructors of numbers and dates raise whatever the text leads to
+        raise MitsonarError(f"{source} is not YAML: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+    check_plain(value, source, MOST_OF_YAML)
+    return value
+
+
+def check_plain(value: Any, source: str, most: int = MOST_VALUES) -> None:
+    """Check that a value is tables, lists, texts, numbers and dates only, of a depth and size that can be.
+
+    Args:
+        value: as a reader of JSON, YAML or pickles gave it.
+        source: is named in errors.
+        most: values that it may hold.
+
+    Raises:
+        MitsonarError: it is not.
+    """
+    rest, count = [(value, 0)], 0
+    while rest:
+        one, depth = rest.pop()
+        count += 1
+        if depth > DEEPEST or count > most:
+            too = f"nests more than {DEEPEST} deep" if depth > DEEPEST else f"holds more than {most:,} values"
+            raise MitsonarError(f"{source} {too}, or refers to itself: it is damaged")
+        if isinstance(one, dict):
+            rest += [(inner, depth + 1) for pair in one.items() for inner in pair]
+        elif isinstance(one, list | tuple | set):
+            rest += [(inner, depth + 1) for inner in one]
+        elif type(one) is int:
+            if abs(one) > LARGEST_INTEGER:
+                raise MitsonarError(f"{source} holds an integer of {one.bit_length():,} bits: integers have at most 64")
+        elif not (one is None or isinstance(one, str | bytes | bool | float | datetime.date)):
+            raise MitsonarError(f"{source} holds a {type(one).__name__}: only tables, lists, texts and numbers are known")
+
+
+def whole_number(value: Any, name: str, low: int, high: int) -> int:
+    """A number of a file as an integer.
+
+    Raises:
+        MitsonarError: it is none, or outside ``low`` .. ``high``.
+    """
+    if type(value) is not int or not low <= value <= high:
+        said = repr(value)[:40] if isinstance(value, str | float | bool) or type(value) is int else type(value).__name__
+        raise MitsonarError(f"{name} must be a whole number in {low:,}..{high:,}: got {said}")
+    return value
+
+
+def _brackets(text: str) -> int:
+    """How many brackets are open at most, those in texts and comments too."""
+    return max(itertools.accumulate((one in "[{") - (one in "]}") for one in text if one in "[]{}"), default=0)
+
+
+def _check_nodes(node: yaml.Node, source: str) -> None:
+    """Depth and size of a YAML document before its values are made: an alias counts as all that it stands for."""
+    rest, count = [(node, 0)], 0
+    while rest:
+        one, depth = rest.pop()
+        count += 1
+        if depth > DEEPEST or count > MOST_OF_YAML:
+            raise MitsonarError(
+                f"{source} is not YAML that can be read: it nests more than {DEEPEST} deep, refers to itself, or holds more "
+                f"than {MOST_OF_YAML:,} values"
+            )
+        if isinstance(one, yaml.MappingNode):
+            rest += [(inner, depth + 1) for pair in one.value for inner in pair]
+        elif isinstance(one, yaml.SequenceNode):
+            rest += [(inner, depth + 1) for inner in one.value]

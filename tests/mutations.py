@@ -1,0 +1,231 @@
+"""Files made hostile: bytes, values, arrays and texts changed at random by a seed, and what a reader makes of them."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import resource
+import signal
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from mitsonar.errors import MitsonarError
+
+Rng = np.random.Generator
+
+LONGEST_S = 20
+"""Of a reader; beyond it hangs."""
+
+MOST_MEMORY = 2**31
+"""Bytes that a reader may ask for; beyond it fails."""
+
+STRANGE: list[Any] = [
+    *(None, True, False, 0, 1, -1, 2, 3.5, -0.0, 1e300, -1e300, float("nan"), float("inf"), 10**12, 10**18, 2**63, -(2**63)),
+    *(10**400, "", "a", "1", "nan", "\0", "ü" * 40, [], [0], [[]], [1, 2, 3], ["a"], {}, {"a": 1}, {"": None}),
+]
+"""What may stand where something else should."""
+
+TEXTS = ["\0", ":", "- ", "{", "[", "]", "&a", "*a", "<<: *a", "!!int ''", "!!python/object:os.system ", "9" * 5000]
+TEXTS += [
+    "nan",
+    "-",
+    "1e999",
+    "\n",
+    "  ",
+    "0x" + "f" * 99,
+    "1:1:1",
+    "2001-99-99",
+    "'",
+    '"',
+    "%",
+    "@",
+    "~",
+    "-1",
+    "10000000000",
+]
+
+
+def changed_bytes(rng: Rng, content: bytes) -> bytes:
+    """Some bytes of a file changed, removed, doubled or cut off."""
+    made = bytearray(content)
+    for _ in range(1 if rng.random() < 0.7 else 3):
+        place = int(rng.integers(len(made) + 1))
+        length = int(rng.integers(1, 9))
+        match int(rng.choice([0, 0, 0, 1, 2, 2, 3, 4, 5])):
+            case 0:
+                made[place : place + 1] = bytes([int(rng.integers(256))])
+            case 1:
+                made[place : place + length] = bytes(rng.integers(0, 256, length, dtype=np.uint8))
+            case 2:
+                made[place : place + 4] = int(rng.choice([0, 1, 10**8, 2 * 10**9, 2**31 - 1, 2**32 - 1])).to_bytes(
+                    4, "little"
+                )
+            case 3:
+                del made[place : place + length]
+            case 4:
+                made[place:place] = made[place : place + length]
+            case _:
+                del made[place:]
+    return bytes(made)
+
+
+def changed_text(rng: Rng, content: bytes) -> bytes:
+    """Some words of a text replaced by strange ones, or its bytes changed."""
+    if rng.random() < 0.3:
+        return changed_bytes(rng, content)
+    words = content.decode("utf-8", "replace").split(" ")
+    for _ in range(1 if rng.random() < 0.7 else 3):
+        place, strange = int(rng.integers(len(words))), TEXTS[int(rng.integers(len(TEXTS)))]
+        words[place] = strange if rng.random() < 0.6 else words[place] + strange
+    return " ".join(words).encode()
+
+
+def changed_value(rng: Rng, value: Any) -> Any:
+    """A value as JSON holds it, with one or two of its parts replaced, removed or added."""
+    made = copy.deepcopy(value)
+    for _ in range(int(rng.integers(1, 3))):
+        path = _some_path(rng, made)
+        if not path:
+            return _strange(rng)
+        inner = made
+        for key in path[:-1]:
+            inner = inner[key]
+        choice = rng.random()
+        if choice < 0.15:
+            del inner[path[-1]]
+        elif choice < 0.25 and isinstance(inner, dict):
+            inner["more"] = _strange(rng)
+        else:
+            inner[path[-1]] = _strange(rng)
+    return made
+
+
+def _strange(rng: Rng) -> Any:
+    if rng.random() < 0.02:
+        deep: Any = []
+        for _ in range(120):
+            deep = [deep]
+        return deep
+    return copy.deepcopy(STRANGE[int(rng.integers(len(STRANGE)))])
+
+
+def _some_path(rng: Rng, value: Any) -> list[Any]:
+    """Keys that lead to a part of a value."""
+    path: list[Any] = []
+    while isinstance(value, dict | list) and len(value) and (not path or rng.random() < 0.8):
+        keys = list(value) if isinstance(value, dict) else list(range(len(value)))
+        path.append(keys[int(rng.integers(len(keys)))])
+        value = value[path[-1]]
+    return path
+
+
+def changed_json(rng: Rng, content: bytes) -> bytes:
+    """A JSON file with parts of its value, or its bytes, changed."""
+    if rng.random() < 0.2:
+        return changed_bytes(rng, content)
+    value = json.loads(content)
+    if "attributes" in value and rng.random() < 0.7:
+        value["attributes"] = changed_value(rng, value["attributes"])
+        return json.dumps(value).encode()
+    return json.dumps(changed_value(rng, value)).encode()
+
+
+def changed_arrays(rng: Rng, table: dict[str, Any]) -> dict[str, Any]:
+    """Arrays with other types, shapes and values; texts of JSON with other values."""
+    made = dict(table)
+    for _ in range(int(rng.integers(1, 3))):
+        if not made:
+            break
+        name = str(rng.choice(sorted(made)))
+        made[name] = _changed_array(rng, np.asarray(made[name]))
+        if rng.random() < 0.1:
+            del made[name]
+    return made
+
+
+def _changed_array(rng: Rng, values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind == "U" and values.ndim == 0 and rng.random() < 0.7:
+        content = str(values).encode()
+        return np.array(changed_json(rng, content).decode("utf-8", "replace") if content[:1] == b"{" else str(_strange(rng)))
+    made = np.array(values)
+    match int(rng.integers(8)):
+        case 0:
+            return np.array(rng.choice(np.array([0.0, -1.0, np.nan, np.inf, 1e300])))
+        case 1:
+            return np.array("text")
+        case 2:
+            with np.errstate(all="ignore"):
+                kind = str(rng.choice(["f2", "f4", "f8", "i8", "u1", "c8", "?", "U3"]))
+                return made.astype(kind) if made.dtype.kind not in "Uc" else np.zeros(made.shape, kind)
+        case 3:
+            return made[..., None]
+        case 4:
+            return made[1:] if made.ndim else made.reshape(1)
+        case 5:
+            return made.reshape(-1) if made.ndim else np.array([])
+        case 6:
+            return made[::-1] if made.ndim else made
+        case _:
+            if made.dtype.kind in "fc" and made.size:
+                made.reshape(-1)[int(rng.integers(made.size))] = rng.choice(np.array([np.nan, np.inf, -1e30, 1e300, -1.0]))
+            return made
+
+
+def npz(table: dict[str, Any]) -> bytes:
+    """The bytes of an npz file."""
+    buffer = io.BytesIO()
+    with np.errstate(all="ignore"):
+        np.savez_compressed(buffer, **table)
+    return buffer.getvalue()
+
+
+def with_part(content: bytes, name: str, part: bytes) -> bytes:
+    """A zip file with one part replaced."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new:
+        for entry in old.namelist():
+            new.writestr(entry, part if entry == name else old.read(entry))
+    return buffer.getvalue()
+
+
+# ---------------------------------------------------------------- what becomes of them
+
+
+@contextmanager
+def limits() -> Iterator[None]:
+    """A reader that hangs, or asks for more memory than :data:`MOST_MEMORY`, fails."""
+
+    def hangs(*_: Any) -> None:
+        raise AssertionError(f"a reader takes more than {LONGEST_S} s")
+
+    with open("/proc/self/statm", encoding="ascii") as file:
+        now = int(file.read().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    before = signal.signal(signal.SIGALRM, hangs)
+    signal.alarm(LONGEST_S)
+    resource.setrlimit(resource.RLIMIT_AS, (now + MOST_MEMORY, hard))
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def outcome(read: Callable[[], Any]) -> str:
+    """``read`` or ``refused``; whatever else a reader raises is the test's failure."""
+    with limits(), np.errstate(all="ignore"):
+        try:
+            read()
+        except MitsonarError as error:
+            said = str(error)
+            assert said.strip(), "a refusal says nothing"
+            assert "Traceback" not in said
+            assert len(said) < 2000, f"a refusal is {len(said)} letters long: {said[:200]}"
+            return "refused"
+    return "read"

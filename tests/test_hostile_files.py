@@ -1,0 +1,794 @@
+"""Files that are damaged or made to harm: every reader reads them well or refuses them by one sentence, and never ends."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from helpers import TINY, Command, by_itself, refused
+from hostile_readers import (
+    READERS,
+    RECIPE,
+    STATE,
+    TALLY,
+    attack,
+    frames,
+    make_checkpoint,
+    make_exr,
+    make_frames_zarr,
+    make_meshes,
+    make_store,
+    read_exr,
+    read_meshes,
+    responses,
+    serialized,
+)
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as some
+from mutations import changed_bytes, limits, npz, outcome, with_part
+
+from mitsonar.errors import MitsonarError
+from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.sonar_frames import SonarFrames
+
+SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
+"""Readers that take 20 ms and more a mutant."""
+
+learn = pytest.mark.learn
+
+
+def cases() -> list[Any]:
+    needs = {"checkpoint", "sonar, noise, training"}
+    return [pytest.param(name, marks=learn if name in needs else ()) for name in READERS]
+
+
+def refusal(read: Callable[[], Any]) -> str:
+    """The sentence by which a reader refuses, within limits of time and memory."""
+    with limits(), pytest.raises(MitsonarError) as error:
+        read()
+    return str(error.value)
+
+
+# ---------------------------------------------------------------- mutants
+
+
+@pytest.mark.parametrize("name", cases())
+def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    """300 of each kind, 30 where reading one takes tens of milliseconds."""
+    count = 30 if name in SLOW else 300
+    found = attack(name, tmp_path, count)
+    assert found["read"] + found["refused"] == count
+    assert found["refused"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", cases())
+def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
+    found = attack(name, tmp_path, 10_000, first=300)
+    print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
+    assert min(found.values()) > 0
+
+
+def test_the_harness_sees_what_it_looks_for() -> None:
+    """Tracebacks, hangs and large allocations fail."""
+    with pytest.raises(ZeroDivisionError):
+        outcome(lambda: 1 / 0)
+    with pytest.raises(MemoryError):
+        outcome(lambda: np.ones(2**32))
+    assert outcome(lambda: None) == "read"
+
+
+# ---------------------------------------------------------------- hypothesis
+
+values = some.recursive(
+    some.none() | some.booleans() | some.integers(-(10**20), 10**20) | some.floats() | some.text(max_size=8),
+    lambda inner: some.lists(inner, max_size=3) | some.dictionaries(some.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+quick = settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+
+
+@quick
+@given(key=some.sampled_from([*TINY["sonar"], "jitter", "seed", "sound_speed", "range_min", "range_max"]), value=values)
+def test_any_value_of_a_sonar(key: str, value: Any) -> None:
+    from mitsonar.instruments.named_sonars import sonar_from
+
+    outcome(lambda: sonar_from({**TINY["sonar"], key: value}).bearing_rad)
+
+
+@quick
+@given(
+    key=some.sampled_from(
+        ["carrier_hz", "sampling_hz", "frequency_step_hz", "range_max", "bandwidth_hz", "receivers", "model"]
+    ),
+    value=values,
+)
+def test_any_value_of_a_channel(key: str, value: Any) -> None:
+    from mitsonar.instruments.channel_sonar import ChannelSonar
+
+    outcome(lambda: ChannelSonar.create(**{key: value}).delay_s)
+
+
+@quick
+@given(content=some.text(max_size=60))
+def test_any_text_as_yaml_and_json(content: str) -> None:
+    from mitsonar.io.plain_data import parse_json, parse_yaml
+
+    outcome(lambda: parse_yaml(content, "it"))
+    outcome(lambda: parse_json(content, "it"))
+
+
+@quick
+@given(content=some.binary(max_size=200))
+def test_any_bytes_as_files(content: bytes, tmp_path: Path) -> None:
+    from mitsonar.io.whole_files import read_json
+    from mitsonar.motion.pose import Trajectory
+    from mitsonar.worlds.mesh_check import check_mesh
+
+    path = tmp_path / "any"
+    path.write_bytes(content)
+    (tmp_path / "run").mkdir(exist_ok=True)
+    for read in (read_json, SonarFrames.load, ImpulseResponses.load, Trajectory.load_tum):
+        outcome(lambda read=read: read(path))  # type: ignore[misc]
+    for kind in ("ply", "obj", "serialized"):
+        outcome(lambda kind=kind: check_mesh(path, kind))  # type: ignore[misc]
+
+
+# ---------------------------------------------------------------- meshes that end Mitsuba
+
+
+SCENE = """<scene version="3.0.0">
+  <sensor type="imaging_sonar">
+    <string name="preset" value="didson300"/>
+    <integer name="beams" value="4"/><integer name="rays_per_beam" value="8"/><integer name="range_bins" value="8"/>
+    <transform name="to_world"><lookat origin="0,-4,3" target="0,0,0" up="0,0,1"/></transform>
+  </sensor>
+  {}
+</scene>"""
+
+NAMED = {
+    "plain": '<shape type="ply"><string name="filename" value="bad.ply"/></shape>',
+    "parameter": '<default name="mesh" value="bad.ply"/><shape type="ply"><string name="filename" value="$mesh"/></shape>',
+    "included": '<include filename="inner/part.xml"/>',
+    "group": '<shape type="shapegroup" id="g"><shape type="ply"><string name="filename" value="bad.ply"/></shape></shape>'
+    '<shape type="instance"><ref id="g"/></shape>',
+}
+
+
+def ply(index: int = 2, count: int = 3, vertices: int = 4, faces: int = 1, order: str = "little", x: float = 0.0) -> bytes:
+    """Four vertices and one triangle."""
+    letter = "<" if order == "little" else ">"
+    head = f"ply\nformat binary_{order}_endian 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\n"
+    head += f"property float z\nelement face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    body = struct.pack(f"{letter}12f", x, 0, 0, 1, 0, 0, 1, 1, 0, 0, 1, 0)
+    return head.encode() + body + struct.pack(f"{letter}B3i", count, 0, 1, index)
+
+
+@pytest.mark.parametrize("index", [4, -1, 10**5, 10**8, 2 * 10**9])
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_an_index_beyond_the_vertices_is_refused(index: int, order: str, tmp_path: Path) -> None:
+    from mitsonar.worlds.mesh_check import check_mesh
+
+    (tmp_path / "good.ply").write_bytes(ply(order=order))
+    check_mesh(tmp_path / "good.ply", "ply")
+    (tmp_path / "bad.ply").write_bytes(ply(index, order=order))
+    assert "a triangle names vertex" in refusal(lambda: check_mesh(tmp_path / "bad.ply", "ply"))
+
+
+@pytest.mark.parametrize("how", NAMED)
+def test_a_scene_names_a_bad_mesh(how: str, tmp_path: Path, variant: str) -> None:
+    """Through a default, an included file, a group: Mitsuba would read it and end the process."""
+    from mitsonar.simulation.scene import load_scene
+
+    (tmp_path / "bad.ply").write_bytes(ply(10**8))
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "inner" / "part.xml").write_text(f'<scene version="3.0.0">{NAMED["plain"]}</scene>')
+    (tmp_path / "scene.xml").write_text(SCENE.format(NAMED[how]))
+    assert "a triangle names vertex 100,000,000" in refusal_without_limit(lambda: load_scene(tmp_path / "scene.xml"))
+    (tmp_path / "bad.ply").write_bytes(ply(3))
+    load_scene(tmp_path / "scene.xml")
+
+
+def refusal_without_limit(read: Callable[[], Any]) -> str:
+    with pytest.raises(MitsonarError) as error:
+        read()
+    return str(error.value)
+
+
+def test_a_parameter_names_a_bad_mesh(tmp_path: Path, variant: str) -> None:
+    from mitsonar.simulation.scene import load_scene
+
+    (tmp_path / "good.ply").write_bytes(ply())
+    (tmp_path / "other.ply").write_bytes(ply(99))
+    (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["parameter"].replace("bad.ply", "good.ply")))
+    load_scene(tmp_path / "scene.xml")
+    assert "names vertex 99" in refusal_without_limit(lambda: load_scene(tmp_path / "scene.xml", mesh="other.ply"))
+
+
+@pytest.mark.parametrize("index", [10**5, 2 * 10**9])
+def test_render_of_a_bad_mesh_is_one_sentence(index: int, mitsonar: Command, tmp_path: Path) -> None:
+    """It was a segmentation fault, and a traceback."""
+    (tmp_path / "bad.ply").write_bytes(ply(index))
+    (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["plain"]))
+    refused(mitsonar("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "names vertex")
+
+
+def test_render_of_a_bad_mesh_in_a_process_of_its_own(tmp_path: Path) -> None:
+    (tmp_path / "bad.ply").write_bytes(ply(10**8))
+    (tmp_path / "scene.xml").write_text(SCENE.format(NAMED["plain"]))
+    refused(by_itself("render", "scene.xml", "-o", "out", cwd=tmp_path), "bad.ply", "names vertex")
+
+
+def test_amphora_mutants_never_end_mitsuba(tmp_path: Path) -> None:
+    """Mutants that the check lets pass are given to Mitsuba, in processes of their own."""
+    from mitsonar.simulation.scene import shipped_scenes
+    from mitsonar.worlds.mesh_check import check_mesh
+
+    content = (shipped_scenes()["observatory"].parent / "meshes" / "amphora.ply").read_bytes()
+    passed = 0
+    for seed in range(40):
+        path = tmp_path / f"{seed}.ply"
+        path.write_bytes(changed_bytes(np.random.default_rng(seed), content))
+        if outcome(lambda path=path: check_mesh(path, "ply")) == "read":  # type: ignore[misc]
+            passed += 1
+            if passed <= 2:
+                script = (
+                    "import sys, mitsuba as mi, drjit as dr; mi.set_variant('llvm_ad_mono');"
+                    "s = mi.load_dict({'type': 'scene', 'a': {'type': 'ply', 'filename': sys.argv[1]}});"
+                    "r = mi.Ray3f(mi.Point3f(0, 0, 9), mi.Vector3f(0, 0, -1)); print(s.ray_intersect(r).t)"
+                )
+                done = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, timeout=120)
+                assert done.returncode == 0, done.stderr[-500:]
+    assert 0 < passed < 40
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (ply(count=4), "lists of vertex_indices must have 3"),
+        (ply(vertices=10**9), "need more bytes than are there"),
+        (ply(faces=10**18), "need more bytes than are there"),
+        (ply(faces=0), "no triangles"),
+        (ply(vertices=3), "bytes"),
+        (ply(x=float("nan")), "finite"),
+        (ply(x=float("inf")), "finite"),
+        (ply() + b"more", "left over"),
+        (b"ply\n", "no header"),
+        (b"", "no header"),
+        (ply().replace(b"float x", b"float w"), "x, y and z"),
+        (ply().replace(b"vertex_indices", b"vertex_indicos"), "vertex_index"),
+        (ply().replace(b"element vertex 4", b"element vertex -4"), "header has the line"),
+        (ply().replace(b"element vertex 4", b"element vertex " + b"4" * 5000), "header has the line"),
+    ],
+)
+def test_a_ply_must_hold_what_it_promises(content: bytes, words: str, tmp_path: Path) -> None:
+    from mitsonar.worlds.mesh_check import check_mesh
+
+    (tmp_path / "a.ply").write_bytes(content)
+    said = refusal(lambda: check_mesh(tmp_path / "a.ply", "ply"))
+    assert words in said
+    assert "a.ply is damaged" in said
+
+
+def test_other_meshes_must_hold_what_they_promise(tmp_path: Path) -> None:
+    from mitsonar.worlds.mesh_check import check_mesh
+
+    corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\n"
+    box = np.eye(3)
+    files = {
+        "a.obj": (f"{corners}f 1 2 9\n".encode(), "names"),
+        "b.obj": (f"{corners}vt 0 0\nf 1/1 2/1 3/7\n".encode(), "names"),
+        "c.obj": (f"{corners}f 1 2\n".encode(), "3 corners"),
+        "d.obj": (b"v 0 0 nan\nv 1 0 0\nv 1 1 0\nf 1 2 3\n", "finite"),
+        "e.serialized": (serialized(box, [[0, 1, 3]]), "names vertex 3"),
+        "f.serialized": (serialized(box, [[0, 1, 2]], vertices=10**12), "more bytes"),
+        "g.serialized": (serialized(box, [[0, 1, 2]], triangles=2**60), "more bytes"),
+        "h.serialized": (serialized(box, [[0, 1, 2]])[:-4] + b"\xff\xff\xff\xff", "more than fit"),
+    }
+    for name, (content, words) in files.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        assert words in refusal(lambda path=path: check_mesh(path, path.suffix[1:])), name  # type: ignore[misc]
+
+
+def test_mitsuba_reads_what_the_check_was_given(tmp_path: Path, variant: str) -> None:
+    """The serialized file of the tests is Mitsuba's format, and text and binary PLY are alike to the check."""
+    import mitsuba as mi
+
+    make_meshes(tmp_path)
+    read_meshes(tmp_path)
+    for name, kind in (("model.ply", "ply"), ("text.ply", "ply"), ("model.obj", "obj"), ("model.serialized", "serialized")):
+        shape = mi.load_dict({"type": kind, "filename": str(tmp_path / name)})
+        assert shape.face_count() == 12, name
+
+
+def test_the_check_costs_milliseconds_once(tmp_path: Path) -> None:
+    from mitsonar.simulation.scene import shipped_scenes
+    from mitsonar.worlds.mesh_check import _check_once, check_mesh
+
+    path = shipped_scenes()["observatory"].parent / "meshes" / "observatory.ply"
+    _check_once.cache_clear()
+    begun = time.process_time()
+    check_mesh(path, "ply")
+    assert time.process_time() - begun < 0.1
+    check_mesh(path, "ply")
+    assert _check_once.cache_info().hits == 1
+
+
+def test_a_deep_scene_is_refused(tmp_path: Path) -> None:
+    """Mitsuba's XML parser calls itself: 10,000 elements within each other end the process."""
+    deep = '<shape type="shapegroup">' * 10_000 + "</shape>" * 10_000
+    (tmp_path / "deep.xml").write_text(f'<scene version="3.0.0">{deep}</scene>')
+    (tmp_path / "outer.xml").write_text(
+        '<scene version="3.0.0"><default name="f" value="deep"/><include filename="$f.xml"/></scene>'
+    )
+    from mitsonar.simulation.scene import load_scene
+
+    for name in ("deep.xml", "outer.xml"):
+        assert "deep" in refusal_without_limit(lambda name=name: load_scene(tmp_path / name))  # type: ignore[misc]
+
+
+# ---------------------------------------------------------------- user's models
+
+
+def test_a_model_of_infinite_extent(tmp_path: Path) -> None:
+    from mitsonar.worlds.user_mesh import mesh_world
+
+    text = "v -1.7e308 0 0\nv 1.7e308 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "far.obj").write_text(text)
+    assert "far.obj" in refusal(lambda: mesh_world(tmp_path / "far.obj"))
+    (tmp_path / "wide.obj").write_text(text.replace("1.7e308", "1e9"))
+    assert "give the scale" in refusal(lambda: mesh_world(tmp_path / "wide.obj"))
+
+
+def test_a_model_that_promises_millions_of_points(tmp_path: Path) -> None:
+    from mitsonar.worlds.user_mesh import mesh_world
+
+    (tmp_path / "many.ply").write_bytes(ply(vertices=169_000_000))
+    assert "promises" in refusal(lambda: mesh_world(tmp_path / "many.ply"))
+    make_meshes(tmp_path)
+    content = (tmp_path / "model.glb").read_bytes()
+    length = struct.unpack_from("<I", content, 12)[0]
+    tree = json.loads(content[20 : 20 + length])
+    tree["accessors"][0]["count"] = 169_000_000
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
+    (tmp_path / "many.glb").write_bytes(head + text + rest)
+    assert "169,000,000" in refusal(lambda: mesh_world(tmp_path / "many.glb"))
+
+
+# ---------------------------------------------------------------- npz
+
+
+BAD_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
+    "a scalar for an array": ({"range_m": np.array(3.0)}, "range_m must be float"),
+    "text for an array": ({"image": np.array("x")}, "image must be"),
+    "an array for text": ({"level": np.zeros(3)}, "level must be one text"),
+    "a scale of nan": ({"level_scale": np.array(np.nan)}, "level_scale must be a finite number"),
+    "complex pixels": ({"image": np.zeros((3, 6, 4), complex)}, "image must be"),
+    "pixels of nan": ({"image": np.full((3, 6, 4), np.nan, np.float32)}, "nan or inf"),
+    "negative pixels": ({"image": np.full((3, 6, 4), -1, np.float32)}, "must lie in 0"),
+    "pixels above 1": ({"image": np.full((3, 6, 4), 2, np.float32)}, "0..1"),
+    "ranges that fall": ({"range_m": np.arange(6.0)[::-1].copy()}, "must grow"),
+    "ranges of inf": ({"range_m": np.array([1, 2, 3, 4, 5, np.inf])}, "nan or inf"),
+    "bearings that fall": ({"bearing_rad": -np.arange(4.0)}, "must"),
+    "times that go back": ({"time_s": np.array([0.0, 2.0, 1.0])}, "must not fall"),
+    "times of nan": ({"time_s": np.array([0.0, np.nan, 1.0])}, "nan or inf"),
+    "poses of five": ({"poses": np.zeros((3, 5))}, "poses must be float"),
+    "poses of inf": ({"poses": np.full((3, 6), np.inf)}, "nan or inf"),
+    "a negative height": ({"height_m": np.array([1.0, -2.0, 1.0])}, "must lie in 0"),
+    "labels of floats": ({"shape_id": np.zeros((3, 6, 4))}, "shape_id must be int"),
+    "shadow of 7": ({"shadow": np.full((3, 6, 4), 7, np.uint8)}, "0..2"),
+    "a list as sonar": ({"sonar": np.array("[1]")}, "sonar is not JSON"),
+    "deep JSON": ({"sonar": np.array("[" * 100_000)}, "sonar is not JSON"),
+    "a huge integer": ({"sonar": np.array('{"beams": ' + "9" * 5000 + "}")}, "sonar"),
+    "about a list": ({"about": np.array("[1]")}, "about"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FRAMES)
+def test_frames_that_cannot_be(name: str, tmp_path: Path) -> None:
+    change, words = BAD_FRAMES[name]
+    path = tmp_path / "frames.npz"
+    frames().save(path)
+    with np.load(path) as table:
+        path.write_bytes(npz({**table, **change}))
+    assert words in refusal(lambda: SonarFrames.load(path))
+
+
+BAD_RESPONSES: dict[str, tuple[dict[str, Any], str]] = {
+    "a scalar": ({"response": np.array(1j)}, "response must be complex"),
+    "floats": ({"response": np.zeros((2, 4, 200))}, "response must be complex"),
+    "nan": ({"velocity": np.full((2, 4), np.nan)}, "nan or inf"),
+    "negative counts": ({"echoes": np.full((2, 4), -1)}, "must lie in 0"),
+    "counts of floats": ({"echoes": np.ones((2, 4))}, "echoes must be int"),
+    "times that go back": ({"time_s": np.array([1.0, 0.0])}, "must not fall"),
+    "deep JSON": ({"sonar": np.array("[" * 100_000)}, "sonar is not JSON"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_RESPONSES)
+def test_responses_that_cannot_be(name: str, tmp_path: Path) -> None:
+    change, words = BAD_RESPONSES[name]
+    path = tmp_path / "responses.npz"
+    responses().save(path)
+    with np.load(path) as table:
+        path.write_bytes(npz({**table, **change}))
+    assert words in refusal(lambda: ImpulseResponses.load(path))
+
+
+def header(shape: str, descr: str = "<f8") -> bytes:
+    text = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode()
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        header("(1000000000000,)"),
+        header("(-1, 3)"),
+        header("(3,)", "|O"),
+        header("(" * 200 + ")" * 200),
+        header(f"({'9' * 6000},)"),
+        b"\x93NUMPY\x09\x00",
+        b"",
+    ],
+)
+def test_an_npz_promises_no_more_than_its_bytes(part: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "frames.npz"
+    frames().save(path)
+    path.write_bytes(with_part(path.read_bytes(), "time_s.npy", part))
+    assert "cannot read frames" in refusal(lambda: SonarFrames.load(path))
+
+
+def test_a_part_that_would_unpack_beyond_memory(tmp_path: Path) -> None:
+    """The list of parts says 2 TB of a part that has 20 bytes."""
+    path = tmp_path / "frames.npz"
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("image.npy", b"0" * 1000)
+        file.filelist[0].file_size = 2**41
+    path.write_bytes(buffer.getvalue())
+    assert "unpacks to" in refusal(lambda: SonarFrames.load(path))
+
+
+# ---------------------------------------------------------------- Zarr
+
+
+def changed_metadata(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def set_attributes(folder: Path, **fields: Any) -> None:
+    changed_metadata(folder / "zarr.json", lambda value: value["attributes"].update(fields))
+
+
+@pytest.fixture(scope="module")
+def data_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stores")
+    make_store(folder)
+    return folder / "data.zarr"
+
+
+@pytest.fixture
+def spoilt(data_set: Path, tmp_path: Path) -> Path:
+    import shutil
+
+    return Path(shutil.copytree(data_set, tmp_path / "data.zarr"))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        *({"frames": value} for value in (10**12, 10**18, 1e300, -1, 0, "50", None, [50], True, 49)),
+        *({"sequences": value} for value in (10**12, 1e300, 0, "10")),
+        *({"shard_frames": value} for value in (0, -5, 1e300, "5")),
+        *({"chunk_frames": value} for value in (0, 3.5, None)),
+        *({"scenes": value} for value in ([], None, 5, [{}], [{"number": 0, "group": 9, "seed": 0, "sequences": 10}])),
+        *({"level_scale": value} for value in ("nan", "1", -1, [1])),
+        {"recipe": [1]},
+        {"recipe": {"name": []}},
+        {"versions": 5},
+        {"finished": "yes"},
+    ],
+    ids=str,
+)
+def test_attributes_of_a_data_set_that_cannot_be(fields: dict[str, Any], spoilt: Path) -> None:
+    """``frames`` of 10^12 hung the check, of 10^18 ended the process."""
+    from mitsonar.datasets.store import DataStore
+
+    set_attributes(spoilt, **fields)
+    assert "damaged" in refusal(lambda: DataStore.open(spoilt))
+
+
+def test_check_of_a_promise_of_10_to_the_12_frames(spoilt: Path, mitsonar: Command) -> None:
+    set_attributes(spoilt, frames=10**12)
+    refused(mitsonar("dataset", "check", spoilt), "damaged")
+
+
+@pytest.mark.parametrize("length", [10**12, 10**18, 0, -1, 1e300])
+@pytest.mark.parametrize("name", ["image", "sequence", "seal", "range_m"])
+def test_arrays_of_a_data_set_of_another_shape(name: str, length: Any, spoilt: Path) -> None:
+    from mitsonar.datasets.store import DataStore
+
+    changed_metadata(spoilt / name / "zarr.json", lambda value: value["shape"].__setitem__(0, length))
+    store = DataStore.open(spoilt)
+    assert name in refusal(lambda: store.read(name))
+
+
+@pytest.mark.parametrize("length", [0, -1, 10**15])
+def test_chunks_of_a_data_set_that_cannot_be(length: int, spoilt: Path) -> None:
+    from mitsonar.datasets.store import DataStore
+
+    def change(value: dict[str, Any]) -> None:
+        value["chunk_grid"]["configuration"]["chunk_shape"][0] = length
+
+    changed_metadata(spoilt / "pose" / "zarr.json", change)
+    store = DataStore.open(spoilt)
+    assert "pose" in refusal(lambda: store.read("pose"))
+
+
+def test_numbers_of_sequences_that_cannot_be(spoilt: Path) -> None:
+    """``bincount`` would ask for memory by the largest."""
+    import zarr
+
+    from mitsonar.datasets.store import DataStore
+
+    zarr.open_group(spoilt, mode="r+")["sequence"][3] = 2**31 - 1
+    assert "sequence is damaged" in refusal(lambda: DataStore.open(spoilt).read("sequence"))
+
+
+@pytest.mark.parametrize("rows", [10**12, 10**18, 0])
+def test_frames_of_a_run_of_10_to_the_12_rows(rows: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    make_frames_zarr(tmp_path)
+    for name in ("image", "time_s", "poses", "height_m", "shape_id", "shadow"):
+        changed_metadata(tmp_path / "frames.zarr" / name / "zarr.json", lambda value: value["shape"].__setitem__(0, rows))
+    assert "frames.zarr" in refusal(lambda: SonarFrames.load(tmp_path / "frames.zarr"))
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("done", [10**12, -1, 1e300, "3", None])
+def test_frames_done_of_a_run_that_cannot_be(done: Any, tmp_path: Path) -> None:
+    make_frames_zarr(tmp_path)
+    set_attributes(tmp_path / "frames.zarr", frames_done=done)
+    assert "frames_done" in refusal(lambda: SonarFrames.load(tmp_path / "frames.zarr"))
+
+
+# ---------------------------------------------------------------- YAML and JSON
+
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefghi", "bcdefghij", strict=True)
+)
+MERGES = "a: &a {k: 1}\n" + "".join(
+    f"{name}: &{name} {{<<: [{', '.join([f'*{before}'] * 9)}]}}\n"
+    for before, name in zip("abcdefghi", "bcdefghij", strict=True)
+)
+HOSTILE_YAML = {
+    "5,000 digits": "beams: " + "9" * 5000,
+    "5,000 hexadecimal digits": "beams: 0x" + "f" * 5000,
+    "a list for a number": "beams: [1, 2]",
+    "a table for a number": "beams: {a: 1}",
+    "itself": "beams: &a [*a]",
+    "itself as a key": "&a ? *a : 1",
+    "laughs": LAUGHS,
+    "laughs by merging": MERGES,
+    "deep": "beams: " + "[" * 5000,
+    "deep and whole": "beams: " + "[" * 100 + "]" * 100,
+    "python": "beams: !!python/object/apply:os.system ['true']",
+    "an empty integer": "beams: !!int ''",
+    "a date that cannot be": "beams: 2001-99-99",
+    "keys of numbers": "1: 2",
+    "a byte of 0": "beams: \0",
+    "large": "name: " + "x" * 2**21,
+    "nan": "range_min: .nan",
+    "inf": "range_max: .inf",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_YAML)
+@pytest.mark.parametrize("kind", ["recipe", "sonar", "noise", "training"])
+def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
+    from mitsonar.acoustics.noise import load_noise
+    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.instruments.named_sonars import load_sonar
+
+    path = tmp_path / f"{kind}.yaml"
+    path.write_text(HOSTILE_YAML[name])
+    read: dict[str, Callable[[Any], Any]] = {"recipe": load_recipe, "sonar": load_sonar, "noise": load_noise}
+    if kind == "training":
+        pytest.importorskip("torch")
+        from mitsonar.config.training_recipe import load_training_recipe
+
+        read["training"] = load_training_recipe
+    begun = time.monotonic()
+    assert len(refusal(lambda: read[kind](str(path)))) < 2000
+    assert time.monotonic() - begun < 10
+
+
+@pytest.mark.parametrize("value", [10**400, [1], {"a": 1}, "x", float("nan"), None])
+@pytest.mark.parametrize(
+    "key", ["seed", "frames", "flight.pings", "flight.height_m", "sonar.beams", "world.size_m", "split.seed"]
+)
+def test_values_of_a_recipe_that_cannot_be(key: str, value: Any) -> None:
+    import copy
+
+    from mitsonar.config.data_recipe import recipe_from, set_key
+
+    fields = copy.deepcopy(TINY)
+    set_key(fields, key, value)
+    assert len(refusal(lambda: recipe_from(fields))) < 1000
+
+
+def test_aliases_that_help_are_read(tmp_path: Path) -> None:
+    from mitsonar.instruments.named_sonars import load_sonar
+
+    (tmp_path / "s.yaml").write_text("range_min: &near 1.0\nrange_max: 9\nazimuth_fov_deg: *near\n")
+    assert load_sonar(tmp_path / "s.yaml").azimuth_fov_deg == 1.0
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"a":' * 5000, '{"a": ' + "9" * 5000 + "}", '{"a": 1' + "0" * 400 + "}", "[]", "\0"]
+)
+def test_json_made_to_harm(text: str, tmp_path: Path) -> None:
+    from mitsonar.io.whole_files import read_json
+
+    (tmp_path / "a.json").write_text(text)
+    assert "a.json" in refusal(lambda: read_json(tmp_path / "a.json"))
+
+
+def test_a_device_that_never_ends() -> None:
+    from mitsonar.io.whole_files import read_yaml
+
+    assert "larger than" in refusal(lambda: read_yaml("/dev/zero", "recipe"))
+
+
+# ---------------------------------------------------------------- run.json
+
+
+BAD_STATES: dict[str, dict[str, Any]] = {
+    **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12)},
+    **{f"gain {value}": {"gain": value} for value in ("2", 0, -1.0, float("nan"), None)},
+    **{f"tally {value}": {"tally": value} for value in (None, [], {}, {**TALLY, "worst": 3}, {**TALLY, "rays": {"a": 1}})},
+    "tally of texts": {"tally": {**TALLY, "pixels": "9"}},
+    "worst frame": {"tally": {**TALLY, "worst": [1, 99]}},
+    "warnings": {"warnings": "none"},
+    "finished": {"finished": "no"},
+    "recipe": {"recipe": [1]},
+}
+
+
+@pytest.mark.parametrize("name", BAD_STATES)
+def test_a_run_that_cannot_go_on(name: str, tmp_path: Path) -> None:
+    """Counts of another type were tracebacks on --resume."""
+    from mitsonar.simulation.render_run import begin
+
+    (tmp_path / "run.json").write_text(json.dumps(STATE | BAD_STATES[name]))
+    said = refusal(lambda: begin(tmp_path, RECIPE, "frames", overwrite=False, resume=True))
+    assert "damaged" in said
+    assert "--overwrite" in said
+
+
+def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
+    from mitsonar.mapping.odometry_run import OdometryFolder
+
+    state = {"kind": "mitsonar odometry", "finished": False, "recipe": {"a": 1}}
+    good = {"pair": 0, "motion": [0, 0, 0], "covariance": None, "valid": True, "reason": ""}
+    for change in ({"recipe": [1]}, {"recipe": 5}):
+        (tmp_path / "run.json").write_text(json.dumps(state | change))
+        assert "damaged" in refusal(
+            lambda: OdometryFolder.begin(tmp_path, {"recipe": {"a": 1}}, overwrite=False, resume=True)
+        )
+    lines = [
+        {"pair": "1"},
+        {"pair": -1},
+        {"motion": [1]},
+        {"motion": [1, 2, float("nan")]},
+        {"covariance": [[1]]},
+        {"about": 3},
+    ]
+    lines += [{"valid": 1}, {"reason": None}, {"covariance": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}]
+    for line in lines:
+        (tmp_path / "estimates.jsonl").write_text(json.dumps(good | line) + "\n")
+        assert "line 1 is damaged" in refusal(lambda: OdometryFolder(tmp_path, state).kept())
+
+
+# ---------------------------------------------------------------- checkpoints, echoes, trajectories
+
+
+@learn
+@pytest.mark.parametrize("how", ["expanded", "meta", "sparse", "wide", "frames", "rmse"])
+def test_checkpoints_that_ask_for_too_much(how: str, tmp_path: Path) -> None:
+    """An expanded tensor of a few bytes asked for 4 GB."""
+    import torch
+
+    from mitsonar.networks.checkpoint import Checkpoint
+
+    make_checkpoint(tmp_path)
+    path = tmp_path / "network.ckpt"
+    table = torch.load(path, weights_only=True)
+    name = next(iter(table["weights"]))
+    match how:
+        case "expanded":
+            table["weights"][name] = torch.zeros(1).expand(10**9)
+        case "meta":
+            table["weights"][name] = torch.empty(10**12, device="meta")
+        case "sparse":
+            table["weights"][name] = torch.eye(3).to_sparse()
+        case "wide":
+            table["options"]["width"] = 500.0
+        case "frames":
+            table["arrangement"]["frames"] = 10**9
+        case _:
+            table["options"]["size"] = [10**6, 10**6]
+    torch.save(table, path)
+    refusal(lambda: Checkpoint.load(path).build())
+
+
+@learn
+def test_an_answer_of_another_arity(tmp_path: Path) -> None:
+    import torch
+
+    from mitsonar.estimation.learned.trained_network import answer_of
+    from mitsonar.networks.checkpoint import Checkpoint
+
+    make_checkpoint(tmp_path)
+    checkpoint = Checkpoint.load(tmp_path / "network.ckpt")
+    network, image = checkpoint.build(), torch.zeros(1, 1, 40, 24)
+    assert "cannot take" in refusal(lambda: answer_of(network, (image, image, image)))
+    assert "answers" in refusal(lambda: checkpoint.decode(torch.zeros(1, 7)))
+    assert "answers" in refusal(lambda: checkpoint.decode((image, image)))  # type: ignore[arg-type]
+
+
+def test_echoes_that_promise_more_than_is_there(tmp_path: Path) -> None:
+    make_exr(tmp_path)
+    path = tmp_path / "e.exr"
+    content = path.read_bytes()
+    place = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+    path.write_bytes(content[: place + 8] + struct.pack("<ii", 2**30, 2**30) + content[place + 16 :])
+    assert "e.exr" in refusal(lambda: read_exr(tmp_path))
+    path.write_bytes(content[: len(content) // 2])
+    assert "e.exr" in refusal(lambda: read_exr(tmp_path))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("0 0 0 0 0 0 0 nan", "0 1e300 0 0 0 0 0 1", "0 0 0 0 1e300 0 0 1", "0 0 0 0 0 0 0 0", "0 1_0 0 0 0 0 0 1"),
+        *("inf 0 0 0 0 0 0 1", "0 0 0", "a b c d e f g h", "0 " * 5000),
+    ],
+)
+def test_lines_of_a_trajectory_that_cannot_be(line: str, tmp_path: Path) -> None:
+    from mitsonar.motion.pose import Trajectory
+
+    (tmp_path / "p.tum").write_text(line + "\n")
+    assert "line 1" in refusal(lambda: Trajectory.load_tum(tmp_path / "p.tum"))
+
+
+def test_times_of_a_trajectory_do_not_go_back(tmp_path: Path) -> None:
+    from mitsonar.motion.pose import Trajectory
+
+    (tmp_path / "p.tum").write_text("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n")
+    assert "time must increase" in refusal(lambda: Trajectory.load_tum(tmp_path / "p.tum"))
+
+
+def test_good_files_are_those_of_yaml() -> None:
+    """What the tests call a recipe is one."""
+    assert yaml.safe_load(yaml.safe_dump(TINY)) == TINY
