@@ -4,7 +4,7 @@ VENV ?= .venv
 PIP = $(VENV)/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt
 SOURCES = pyproject.toml constraints.txt
 
-.PHONY: demo test lint bench clean system
+.PHONY: demo test lint bench bench-quick clean system
 
 demo: $(VENV)/.installed
 	@rm -rf out/demo
@@ -23,6 +23,10 @@ bench: $(VENV)/.tested
 	$(PIP) -e '.[bench]'
 	$(VENV)/bin/python benchmarks/bench_render.py
 	$(VENV)/bin/python benchmarks/bench_dataset.py
+
+# every script of benchmarks/, docs/ and scenes/ with --quick: does each still work?
+bench-quick: $(VENV)/.tested
+	$(VENV)/bin/python benchmarks/run_quick.py
 
 system:
 	@.ci/system_libraries

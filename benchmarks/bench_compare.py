@@ -3,7 +3,7 @@
     python benchmarks/bench_compare.py --out bench [--pairs 1000] [--perturbed 200] [--only rocky-field]
 
 Makes the data sets, one pair a sequence, and runs `mitsonar compare` on each; what is there is kept, so that a run that was
-broken off goes on. About three hours on two cores; the tables lie in OUT/*/table.md.
+broken off goes on. About three hours on two cores; the tables lie in OUT/*/table.md. `--quick` does one set with two pairs.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 FIELDS = "scenes=[{count: 20, sequences: 17, world: {size_m: 30}},{count: 33, sequences: 20, world: {size_m: 50}}]"
@@ -25,6 +26,9 @@ SETS = {
 SEED = 4101  # not that of any recipe: scenes that no training has seen
 
 METHODS = "zero,ecc,flow,phase,direct"
+SMALL = ("scenes=[{count: 2, sequences: 4, world: {size_m: 20, a_side: [8, 12]}}]", "sonar.rays_per_beam=200")
+"""What `--quick` changes in a recipe of rocky fields."""
+
 PERTURBED = "zero,ecc,flow,direct,direct:heave_std_m=0.01"
 
 
@@ -34,13 +38,25 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=1000)
     parser.add_argument("--perturbed", type=int, default=200, help="pairs of the perturbed rows; 0: none")
     parser.add_argument("--only", choices=SETS)
+    parser.add_argument("--quick", action="store_true", help="two pairs of one set, kept nowhere: within a minute")
     asked = parser.parse_args()
+    if not asked.quick:
+        return compare_all(asked)
+    with tempfile.TemporaryDirectory() as folder:
+        few = {"out": Path(folder), "pairs": 2, "perturbed": 2, "only": "rocky-field"}
+        compare_all(argparse.Namespace(**{**vars(asked), **few}))
+
+
+def compare_all(asked: argparse.Namespace) -> None:
+    """Make the data sets and compare the estimators on each."""
     asked.out.mkdir(parents=True, exist_ok=True)
     for name in [asked.only] if asked.only else SETS:
         data = asked.out / f"{name}.zarr"
-        run("dataset", "make", name, "--set", SETS[name], "--set", "flight.pings=2", "--seed", SEED, "-o", data)
+        changes = (*(SMALL if asked.quick else (SETS[name],)), "flight.pings=2")
+        sets = [word for change in changes for word in ("--set", change)]
+        run("dataset", "make", name, *sets, "--seed", SEED, "-o", data)
         common = (data, "--part", "all", "--reference", "direct")
-        levels = ("--noise", "none,low,high", "--limit", 10)
+        levels = ("--noise", "high" if asked.quick else "none,low,high", "--limit", min(10, asked.pairs))
         run("compare", *common, *levels, "--prior", "--estimators", METHODS, "--pairs", asked.pairs, "-o", asked.out / name)
         if asked.perturbed:
             few = ("--pairs", asked.perturbed, "--noise", "none", "--limit", 0, "--perturb")

@@ -22,15 +22,64 @@ from collections.abc import Iterator
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
 
-SIZES = (1_000, 5_000)
-"""Sequences of five frames: 5,000 and 25,000 frames, over 30 worlds each."""
 
-QUICK = (300, 900)
+class Size(NamedTuple):
+    """How much is done.
+
+    Attributes:
+        crews: recipes, and how many processes work on each.
+        sequences: of five frames, of the two data sets that are made.
+        changes: of the recipes.
+        samples: that are rendered as a training would.
+        buffer: of that training.
+        stored: sequences of the data set that is read.
+        batch: pairs read at a time.
+        batches: read each time.
+        rocks: of a kind along an edge of the largest field.
+    """
+
+    crews: tuple[tuple[str, int], ...]
+    sequences: tuple[int, int]
+    changes: tuple[str, ...]
+    samples: int
+    buffer: int
+    stored: int
+    batch: int
+    batches: int
+    rocks: int
+
+
+RECIPES = ("rocky-field", "rocky-field-physical")
+
+FULL = Size(
+    crews=tuple((recipe, workers) for recipe in RECIPES for workers in (1, 2)),
+    sequences=(1_000, 5_000),
+    changes=(),
+    samples=15_000,
+    buffer=500,
+    stored=400,
+    batch=50,
+    batches=8,
+    rocks=130,
+)
+"""5,000 and 25,000 frames, over 30 worlds each."""
+
+QUICK = Size(
+    crews=(("rocky-field", 1), ("rocky-field-physical", 2)),
+    sequences=(4, 20),
+    changes=("scenes=[{count: 2, sequences: 20}]", "world={family: rocky-field, size_m: 20, a_side: [5, 9]}"),
+    samples=40,
+    buffer=10,
+    stored=10,
+    batch=5,
+    batches=2,
+    rocks=20,
+)
 SAMPLE_S = 3.0
 """Between two looks at the memory: a look stops what it looks at."""
 
@@ -42,33 +91,33 @@ def main() -> None:
     """Print the tables, or everything as JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print for programs")
-    parser.add_argument("--quick", action="store_true", help="a third of the frames")
+    parser.add_argument("--quick", action="store_true", help="a few frames over two small worlds: within a minute")
     parser.add_argument("--only", default="make,rendered,read,field", help="which parts, with commas between")
     parser.add_argument("--rendered", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--field", nargs=1, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.rendered:
         recipe, workers, samples = args.rendered
-        return print(json.dumps(rendered(recipe, int(workers), int(samples))))
+        return print(json.dumps(rendered(recipe, int(workers), int(samples), QUICK if args.quick else FULL)))
     if args.field:
-        return print(json.dumps(largest_field(Path(args.field[0]))))
+        return print(json.dumps(largest_field(Path(args.field[0]), (QUICK if args.quick else FULL).rocks)))
     parts = args.only.split(",")
-    sizes = QUICK if args.quick else SIZES
+    size = QUICK if args.quick else FULL
+    again = ("--quick",) if args.quick else ()
     result: dict[str, Any] = {"machine": machine(), "make": [], "rendered": [], "read": []}
     with tempfile.TemporaryDirectory(prefix="bench-dataset-") as folder:
         made = Path(folder) / "read.zarr"
-        for recipe in ("rocky-field", "rocky-field-physical"):
-            for workers in (1, 2) if "make" in parts else ():
-                result["make"].append(note(making(recipe, workers, sizes, Path(folder))))
-        for recipe in ("rocky-field", "rocky-field-physical"):
-            for workers in (0, 2) if "rendered" in parts else ():
-                samples = str(3 * sizes[1])
-                result["rendered"].append(note(in_a_process("--rendered", recipe, str(workers), samples)))
+        for recipe, workers in size.crews if "make" in parts else ():
+            result["make"].append(note(making(recipe, workers, size, Path(folder))))
+        for recipe, workers in size.crews if "rendered" in parts else ():
+            crew = 0 if workers == 1 else workers
+            words = ("--rendered", recipe, str(crew), str(size.samples))
+            result["rendered"].append(note(in_a_process(*again, *words)))
         if "read" in parts:
-            command(["dataset", "make", "rocky-field", "--sequences", "400", "-o", str(made)])
-            result["read"] = [note(row) for row in reading(made)]
+            command(["dataset", "make", "rocky-field", *changed(size), "--sequences", str(size.stored), "-o", str(made)])
+            result["read"] = [note(row) for row in reading(made, size)]
         if "field" in parts:
-            result["field"] = note(in_a_process("--field", str(Path(folder) / "field")))
+            result["field"] = note(in_a_process(*again, "--field", str(Path(folder) / "field")))
     print(json.dumps(result, indent=2) if args.json else tables(result))
 
 
@@ -91,16 +140,19 @@ def machine() -> dict[str, Any]:
     }
 
 
+def changed(size: Size) -> list[str]:
+    """Changes of a recipe on the command line."""
+    return [word for change in size.changes for word in ("--set", change)]
+
+
 def command(words: list[str]) -> None:
     """Run a command of mitsonar to its end."""
-    subprocess.run(
-        [sys.executable, "-m", "mitsonar", *words], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    subprocess.run([sys.executable, "-m", "mitsonar", *words], check=True, stdout=subprocess.DEVNULL)
 
 
 def in_a_process(*words: str) -> Any:
     """What this script, started anew, prints: its memory is its own then."""
-    out = subprocess.run([sys.executable, __file__, *words], check=True, capture_output=True, text=True).stdout
+    out = subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.PIPE, text=True).stdout
     return json.loads(out.splitlines()[-1])
 
 
@@ -118,12 +170,23 @@ def memory(process: psutil.Process) -> float:
 # ---------------------------------------------------------------- parts
 
 
-def making(recipe: str, workers: int, sizes: tuple[int, int], folder: Path) -> dict[str, Any]:
+def making(recipe: str, workers: int, size: Size, folder: Path) -> dict[str, Any]:
     """Seconds, memory and bytes of the command, for two sizes; what a frame more costs."""
     seconds, peaks = [], []
-    for size in sizes:
-        url = folder / f"{recipe}-{workers}-{size}.zarr"
-        words = ["dataset", "make", recipe, "--sequences", str(size), "--workers", str(workers), "-o", str(url)]
+    for sequences in size.sequences:
+        url = folder / f"{recipe}-{workers}-{sequences}.zarr"
+        words = [
+            "dataset",
+            "make",
+            recipe,
+            *changed(size),
+            "--sequences",
+            str(sequences),
+            "--workers",
+            str(workers),
+            "-o",
+            str(url),
+        ]
         start, samples = time.perf_counter(), []
         run = psutil.Popen([sys.executable, "-m", "mitsonar", *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while run.poll() is None:
@@ -133,9 +196,11 @@ def making(recipe: str, workers: int, sizes: tuple[int, int], folder: Path) -> d
         if run.returncode:
             raise SystemExit(f"mitsonar {' '.join(words)} failed: run it by hand")
         seconds.append(time.perf_counter() - start)
-        peaks.append((max(samples), max(samples[len(samples) // 4 : len(samples) // 2]), max(samples[-len(samples) // 4 :])))
+        quarter = max(1, len(samples) // 4)
+        second = samples[quarter : 2 * quarter] or samples
+        peaks.append((max(samples), max(second), max(samples[-quarter:])))
         stored = sum(path.stat().st_size for path in url.rglob("*") if path.is_file())
-    frames = [5 * size for size in sizes]
+    frames = [5 * sequences for sequences in size.sequences]
     each = (seconds[1] - seconds[0]) / (frames[1] - frames[0])
     return {
         "recipe": recipe,
@@ -151,14 +216,18 @@ def making(recipe: str, workers: int, sizes: tuple[int, int], folder: Path) -> d
     }
 
 
-def rendered(recipe: str, workers: int, samples: int) -> dict[str, Any]:
+def rendered(recipe: str, workers: int, samples: int, size: Size) -> dict[str, Any]:
     """Samples a second that training would get, over some worlds; when the first comes, a buffer of others is there."""
-    from mitsonar import RenderedPairs
+    import yaml
 
-    pairs = RenderedPairs(recipe, seed=1, length=samples, gain=1.0 if recipe == "rocky-field" else 0.05)
+    from mitsonar import RenderedPairs, load_recipe
+
+    changes = {key: yaml.safe_load(value) for key, _, value in (change.partition("=") for change in size.changes)}
+    words = {"seed": 1, "length": samples, "buffer": size.buffer, "gain": 1.0 if recipe == "rocky-field" else 0.05}
+    pairs = RenderedPairs(load_recipe(recipe, changes), **words)
     process, peak, taken = psutil.Process(), 0.0, 0
     begun = first = time.perf_counter()
-    for number, (_, label) in enumerate(pairs.loader(50, workers=workers)):
+    for number, (_, label) in enumerate(pairs.loader(size.batch, workers=workers)):
         if number == 0:
             first = time.perf_counter()
         taken += len(label)
@@ -169,18 +238,19 @@ def rendered(recipe: str, workers: int, samples: int) -> dict[str, Any]:
         "workers": workers,
         "samples": taken,
         "pairs a second": taken / (time.perf_counter() - begun),
-        "pairs a second, once running": (taken - 50 - pairs.buffer * max(workers, 1)) / (time.perf_counter() - first),
+        "pairs a second, once running": (taken - size.batch - pairs.buffer * max(workers, 1))
+        / (time.perf_counter() - first),
         "peak GiB": peak,
     }
 
 
-def reading(url: Path) -> Iterator[dict[str, Any]]:
-    """Samples a second out of a store, in batches of 50, arrangements taking turns."""
+def reading(url: Path, size: Size) -> Iterator[dict[str, Any]]:
+    """Samples a second out of a store, in batches, arrangements taking turns."""
     import torch
 
     from mitsonar import SonarPairs
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(min(2, torch.get_num_threads()))
     kinds: dict[str, dict[str, Any]] = {
         "polar, no noise": {},
         "polar, high noise": {"noise": "high"},
@@ -192,21 +262,21 @@ def reading(url: Path) -> Iterator[dict[str, Any]]:
     for _ in range(5):
         for name, pairs in sets.items():
             start = time.perf_counter()
-            for batch, _ in enumerate(pairs.loader(50)):
-                if batch == 7:
+            for batch, _ in enumerate(pairs.loader(size.batch)):
+                if batch == size.batches - 1:
                     break
-            times[name].append((time.perf_counter() - start) / 400)
+            times[name].append((time.perf_counter() - start) / (size.batch * size.batches))
     for name, values in times.items():
         yield {"arrangement": name, "pairs a second": 1 / float(np.median(values[1:]))}
 
 
-def largest_field(folder: Path) -> dict[str, Any]:
-    """Seconds to build, write and load 130 x 130 rocks of each kind, and the memory of it all."""
+def largest_field(folder: Path, rocks: int) -> dict[str, Any]:
+    """Seconds to build, write and load a field of rocks, and the memory of it all."""
     from mitsonar.simulation.scene import load_scene
     from mitsonar.worlds.rocky_field import RockyField
 
     start = time.perf_counter()
-    world = RockyField(size_m=50, a_side=(130, 130)).build(0)
+    world = RockyField(size_m=50, a_side=(rocks, rocks)).build(0)
     built = time.perf_counter()
     path = world.write(folder)
     written, triangles = time.perf_counter(), world.faces
@@ -215,6 +285,7 @@ def largest_field(folder: Path) -> dict[str, Any]:
     status = Path("/proc/self/status").read_text()
     peak = int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 2**20
     return {
+        "rocks": rocks,
         "triangles": triangles,
         "build s": built - start,
         "write s": written - built,
@@ -260,7 +331,8 @@ def tables(result: dict[str, Any]) -> str:
         f = result["field"]
         lines += [
             "",
-            f"Largest rocky field, 3 x 130 x 130 rocks, {f['triangles']:,} triangles: built in {f['build s']:.1f} s, "
+            f"Largest rocky field, 3 x {f['rocks']} x {f['rocks']} rocks, {f['triangles']:,} triangles: "
+            f"built in {f['build s']:.1f} s, "
             f"written in {f['write s']:.1f} s, loaded in {f['load s']:.1f} s, {f['peak GiB']:.2f} GiB at most.",
         ]
     return "\n".join(lines)

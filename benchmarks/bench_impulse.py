@@ -2,6 +2,7 @@
 
     python benchmarks/bench_impulse.py speed [--threads 2]
     python benchmarks/bench_impulse.py leak [--samples 100]
+    python benchmarks/bench_impulse.py --quick           # both, over a field of 8 x 8 m
 
 `speed`: responses a second of the standard configuration over a field of flat objects (50 x 50 m, 2048 x 2048 cells), 800
 taps, some 50,000 echoes each, tracing included; the direct sum of eq. 5.15 beside it; memory after more and more of them;
@@ -22,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,21 +35,46 @@ from mitsonar.worlds.families import create_family
 HEIGHT_M, FASTEST, APART_S = 10.0, 2.0, 0.05
 
 
+class Size(NamedTuple):
+    """How much is done.
+
+    Attributes:
+        world: options of the fields of flat objects.
+        pings: that rates and memory are measured with, before and after.
+        repeats: of each rate.
+        steps: velocities that are tried along each axis.
+    """
+
+    world: dict[str, Any]
+    pings: tuple[int, int, int, int]
+    repeats: int
+    steps: int
+
+
+FULL = Size({}, (48, 50, 100, 200), 6, 41)
+QUICK = Size({"size_m": 24.0, "seabed_cells": 256, "rectangles": 20, "ellipses": 20}, (4, 2, 2, 2), 2, 9)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["speed", "leak"])
+    parser.add_argument("what", choices=["speed", "leak"], nargs="?")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--samples", type=int, default=100, help="of the leak test")
     parser.add_argument("--rays", type=int, default=50_000, help="a receiver, of the leak test in the model rays")
+    parser.add_argument("--quick", action="store_true", help="both, small: within a minute")
     asked = parser.parse_args()
+    if asked.what is None and not asked.quick:
+        parser.error("say what: speed, leak, or --quick")
     ensure_variant()
     use_threads(asked.threads)
     print(f"{cpu()}, {asked.threads} threads, {time.strftime('%Y-%m-%d')}")
-    if asked.what == "speed":
-        speed()
-    else:
+    size = QUICK if asked.quick else FULL
+    samples, rays = (5, 2000) if asked.quick else (asked.samples, asked.rays)
+    if asked.quick or asked.what == "speed":
+        speed(size)
+    if asked.quick or asked.what == "leak":
         for model in ("rays", "scatterers"):
-            leak(ChannelSonar(model=model, rays=asked.rays), asked.samples)
+            leak(ChannelSonar(model=model, rays=rays), samples, size)
 
 
 def cpu() -> str:
@@ -57,10 +83,10 @@ def cpu() -> str:
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
 
-def field_of(seed: int) -> Any:
+def field_of(seed: int, size: Size = FULL) -> Any:
     """A field of flat objects (Almanza-Medina, 5.4.1)."""
     with tempfile.TemporaryDirectory() as folder:
-        path, parameters = create_family("flat-objects").prepare(seed, Path(folder) / "world")
+        path, parameters = create_family("flat-objects", **size.world).prepare(seed, Path(folder) / "world")
         return load_scene(path, **parameters)
 
 
@@ -76,16 +102,16 @@ def flights(count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.floa
 # ---------------------------------------------------------------- speed
 
 
-def speed() -> None:
+def speed(size: Size) -> None:
     """Rates, shares and memory."""
-    scene = field_of(1)
+    scene = field_of(1, size)
     for model in ("scatterers", "rays"):
         sonar = ChannelSonar(model=model)
         begun = time.perf_counter()
         simulator = ChannelSimulator(scene, sonar)
         ready = time.perf_counter() - begun
-        poses, velocity = flights(48, 2)
-        made = [rate_of(simulator, poses, velocity) for _ in range(6)][1:]
+        poses, velocity = flights(size.pings[0], 2)
+        made = [rate_of(simulator, poses, velocity) for _ in range(size.repeats)][1:]
         rate, echoes = float(np.median([one[0] for one in made])), made[0][1]
         print(
             f"{model}: {rate:.0f} responses/s of {sonar.taps} taps from {echoes:,.0f} echoes each; scene ready in "
@@ -95,8 +121,9 @@ def speed() -> None:
         direct = direct_seconds(paths.delay_s, paths.amplitude, sonar)
         print(f"  the direct sum of eq. 5.15 for one: {direct:.2f} s, {direct * rate:.0f} times as long as one response")
         shares(simulator, poses, velocity)
-        sizes = [memory_after(simulator, pings) for pings in (50, 100, 200)]
-        print(f"  largest memory after 50, 150, 350 more pings: {', '.join(f'{size:.0f}' for size in sizes)} MiB")
+        sizes = [memory_after(simulator, pings) for pings in size.pings[1:]]
+        pings = ", ".join(map(str, np.cumsum(size.pings[1:])))
+        print(f"  largest memory after {pings} more pings: {', '.join(f'{mib:.0f}' for mib in sizes)} MiB")
 
 
 def rate_of(simulator: ChannelSimulator, poses: Any, velocity: Any) -> tuple[float, float]:
@@ -151,12 +178,12 @@ def memory_after(simulator: ChannelSimulator, pings: int) -> float:
 # ---------------------------------------------------------------- leak
 
 
-def leak(sonar: ChannelSonar, samples: int) -> None:
+def leak(sonar: ChannelSonar, samples: int, size: Size) -> None:
     """Errors of velocities read from one response alone, as displacements in 50 ms."""
-    templates, tried = templates_of(sonar)
+    templates, tried = templates_of(sonar, size.steps)
     true, found = [], []
     for seed in range(5):
-        simulator = ChannelSimulator(field_of(10 + seed), sonar)
+        simulator = ChannelSimulator(field_of(10 + seed, size), sonar)
         poses, velocity = flights(samples // 5, 100 + seed)
         response = np.concatenate([part.response for part in simulator.pings(poses, velocity)])
         found += [most_alike(one, templates, tried) for one in response]
@@ -171,7 +198,7 @@ def leak(sonar: ChannelSonar, samples: int) -> None:
     )
 
 
-def templates_of(sonar: ChannelSonar, steps: int = 41) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+def templates_of(sonar: ChannelSonar, steps: int) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
     """Responses of a bare floor for each velocity ``(velocities, receivers, taps)``, of unit length, and the velocities."""
     import mitsuba as mi
 

@@ -4,6 +4,7 @@
     python benchmarks/bench_impulse_motion.py noise --out bench/impulse
     python benchmarks/bench_impulse_motion.py courses --out bench/impulse
     python benchmarks/bench_impulse_motion.py figure --out bench/impulse
+    python benchmarks/bench_impulse_motion.py --quick      # all four, five samples of a small field, kept nowhere
 
 Samples are made as the data sets `impulse-*` make them, over 5 scenes that no network saw (seed 4201), and kept in OUT: a
 run that is broken off goes on. `rows`: every row of table 5.2 by each estimator, the thesis's figure and the bound of the
@@ -23,6 +24,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +44,7 @@ from mitsonar.mapping.response_source import ResponseSource
 from mitsonar.mapping.trajectory_smoothing import path_of
 from mitsonar.motion.courses import COURSES, course
 from mitsonar.motion.motion_errors import in_units
-from mitsonar.motion.pose import Pose, motions, velocities
+from mitsonar.motion.pose import Pose, Trajectory, motions, velocities
 
 SEED, SCENES = 4201, 5
 
@@ -68,13 +70,19 @@ ROWS = {
 }
 """Data sets, and the RMSE of the thesis's network in its own simulator (`rays`), sideways / forward [mm]."""
 
+SMALL = {
+    "world": {"family": "flat-objects", "size_m": 30.0, "seabed_cells": 300, "rectangles": 20, "ellipses": 20},
+    "scenes": [{"count": SCENES, "sequences": 2}],
+}
+"""What `--quick` changes in a recipe."""
+
 COSTLY = {"impulse-wideband-19200": 0.3, "impulse-circular-19200": 0.3, "impulse-wideband-9600": 0.5}
 """Part of the samples for rows whose likelihood takes long."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["rows", "noise", "courses", "figure"])
+    parser.add_argument("what", choices=list(PARTS), nargs="?")
     parser.add_argument("--out", type=Path, default=Path("bench/impulse"))
     parser.add_argument("--samples", type=int, default=100)
     parser.add_argument("--only", choices=[*ROWS, *COURSES], nargs="*")
@@ -82,20 +90,42 @@ def main() -> None:
     parser.add_argument("--estimators", default="zero,correlation,likelihood")
     parser.add_argument("--pings", type=int, default=10, help="of each motion of a course")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--quick", action="store_true", help="all four, small, kept nowhere: within a minute")
     asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
+    if asked.what is None and not asked.quick:
+        parser.error(f"say what: {', '.join(PARTS)}, or --quick")
     os.environ["OMP_NUM_THREADS"] = "1"
     print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, model {asked.model}", flush=True)
-    {"rows": rows, "noise": noise, "courses": courses, "figure": figure}[asked.what](asked)
+    if not asked.quick:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        with workers(asked.processes) as asked.pool:
+            return PARTS[asked.what](asked)
+    with tempfile.TemporaryDirectory() as folder, workers(1) as asked.pool:
+        asked.out, asked.samples, asked.pings, asked.processes = Path(folder), SCENES, 2, 1
+        for part, only in (("rows", "impulse-two-receivers"), ("noise", "impulse-standard"), ("courses", "sinusoid")):
+            asked.only = [only]
+            asked.estimators = "zero,correlation,likelihood" if part == "rows" else "correlation"
+            PARTS[part](asked)
+        figure(asked)
+
+
+def workers(processes: int) -> AbstractContextManager[Any]:
+    """A pool of processes that answer :func:`told`."""
+    return multiprocessing.get_context("spawn").Pool(processes)
+
+
+def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
+    """A recipe over scenes that no network saw."""
+    return load_recipe(name, {"seed": SEED, "channel.model": asked.model, **(SMALL if asked.quick else {})})
 
 
 # ---------------------------------------------------------------- samples
 
 
-def made(out: Path, name: str, model: str, samples: int) -> list[ImpulseResponses]:
+def made(asked: argparse.Namespace, name: str) -> list[ImpulseResponses]:
     """Samples of a data set's kind, from OUT or new."""
-    recipe = load_recipe(name, {"seed": SEED, "channel.model": model})
-    path = out / f"{name}-{model}-{samples}.npz"
+    recipe, samples = recipe_of(asked, name), asked.samples
+    path = asked.out / f"{name}-{asked.model}-{samples}.npz"
     if not path.exists():
         parts = list(fresh(recipe, samples))
         np.savez(
@@ -161,8 +191,7 @@ def estimates(
     path = asked.out / f"{label}-{name}.json"
     if not path.exists():
         work = [(name, options, one) for one in samples]
-        with multiprocessing.get_context("spawn").Pool(asked.processes) as pool:
-            answers = pool.map(told, work, chunksize=max(1, len(work) // (4 * asked.processes)))
+        answers = asked.pool.map(told, work, chunksize=max(1, len(work) // (4 * asked.processes)))
         path.write_text(json.dumps(answers))
     return np.array(json.loads(path.read_text()))
 
@@ -193,16 +222,16 @@ def rows(asked: argparse.Namespace) -> None:
     """Every row of table 5.2."""
     print(HEAD, flush=True)
     for name in asked.only or ROWS:
-        samples = made(asked.out, name, asked.model, asked.samples)
-        true, part = truth(samples), COSTLY.get(name, 1.0)
+        samples = made(asked, name)
+        true, some = truth(samples), slice(1, 2) if asked.quick else slice(None, None, round(1 / COSTLY.get(name, 1.0)))
         turning = bool(np.abs(true[:, 2]).max() > 1e-9)
         for estimator in asked.estimators.split(","):
-            used = samples[:: round(1 / part)] if estimator == "likelihood" else samples
+            used = samples[some] if estimator == "likelihood" else samples
             options = {"yaw": True} if turning and estimator == "likelihood" else {}
             answers = estimates(asked, f"{name}-{asked.model}-{asked.samples}", estimator, used, **options)
             bound = bound_of(asked, name, used, turning) if estimator == "likelihood" and asked.model == "scatterers" else ""
             figure = ROWS[name] if estimator == "likelihood" else ""
-            mine = true[:: round(1 / part)] if estimator == "likelihood" else true
+            mine = true[some] if estimator == "likelihood" else true
             print(f"| {name} ({len(used)}) | {estimator} | {said(answers, mine)} | {figure} | {bound} |", flush=True)
 
 
@@ -232,7 +261,7 @@ def noise(asked: argparse.Namespace) -> None:
         flush=True,
     )
     for name in asked.only or ("impulse-standard", "impulse-ten-80khz"):
-        samples = made(asked.out, name, asked.model, asked.samples)
+        samples = made(asked, name)
         true = truth(samples)
         cases: dict[str, list[ImpulseResponses]] = {}
         for snr in (30.0, 20.0, 10.0, 0.0):
@@ -275,6 +304,12 @@ def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponse
 # ---------------------------------------------------------------- courses
 
 
+def course_of(asked: argparse.Namespace, name: str, around: Pose) -> Trajectory:
+    """A course, or its first positions."""
+    flown = course(name, around)
+    return Trajectory(flown.poses[:4], flown.time_s[:4]) if asked.quick else flown
+
+
 def courses(asked: argparse.Namespace) -> None:
     """Table 5.6: motion by motion, and where the path ends."""
     print(
@@ -282,9 +317,9 @@ def courses(asked: argparse.Namespace) -> None:
         "|---|---|---|---|---|---|---|",
         flush=True,
     )
-    recipe = load_recipe("impulse-standard", {"seed": SEED, "channel.model": asked.model})
+    recipe = recipe_of(asked, "impulse-standard")
     for name in asked.only or COURSES:
-        flown, steps = course(name, Pose(0, 0, 10)), asked.pings - 1
+        flown, steps = course_of(asked, name, Pose(0, 0, 10)), asked.pings - 1
         path = asked.out / f"course-{name}-{asked.model}-{asked.pings}.npz"
         if not path.exists():
             fine = flown.resample((len(flown) - 1) * steps + 1)
@@ -323,9 +358,9 @@ def figure(asked: argparse.Namespace) -> None:
     """Paths of the sinusoid: true, by impulse responses (after `courses`), by sonar images."""
     from matplotlib.figure import Figure
 
-    recipe = load_recipe("impulse-standard", {"seed": SEED, "channel.model": asked.model})
+    recipe = recipe_of(asked, "impulse-standard")
     scene = simulator_of(recipe, scenes_of(recipe, recipe.sequences)[0]).tracer.scene
-    flown = course("sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
+    flown = course_of(asked, "sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
     sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
     frames = Simulator(scene, sonar).render(flown)
     seen = odometry(frames, create_estimator("direct"), start=Pose(*flown.poses[0]))
@@ -353,6 +388,8 @@ def figure(asked: argparse.Namespace) -> None:
     axes.grid(alpha=0.3)
     drawn.savefig(asked.out / "sinusoid.png", dpi=110)
 
+
+PARTS = {"rows": rows, "noise": noise, "courses": courses, "figure": figure}
 
 if __name__ == "__main__":
     main()

@@ -4,15 +4,16 @@
 
 Takes the data sets of `bench_compare.py` (made where they are missing), and makes others: heights of 1.5 to 6 m, pitches of
 20 and 50 deg, another sonar, hulls. What is there is kept, so that a run that was broken off goes on. The tables lie in
-OUT/networks-*/table.md.
+OUT/networks-*/table.md. `--quick` does two sets with two pairs each.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 
-from bench_compare import SEED, SETS, run
+from bench_compare import SEED, SETS, SMALL, run
 
 HOME = ("rocky-field", "rocky-field-physical")
 FEW = "scenes=[{count: 20, sequences: 10, world: {size_m: 30}}]"
@@ -46,7 +47,18 @@ def main() -> None:
     parser.add_argument("--perturbed", type=int, default=200, help="pairs of the perturbed rows; 0: none")
     parser.add_argument("--elsewhere", type=int, default=200, help="pairs of other geometries; 0: none")
     parser.add_argument("--only", choices=[*HOME, *ELSEWHERE])
+    parser.add_argument("--quick", action="store_true", help="two pairs of two sets, kept nowhere: within a minute")
     asked = parser.parse_args()
+    if not asked.quick:
+        return compare_all(asked)
+    with tempfile.TemporaryDirectory() as folder:
+        few = {"out": Path(folder), "pairs": 2, "perturbed": 0, "elsewhere": 2}
+        for name in (HOME[0], "height-1.5"):
+            compare_all(argparse.Namespace(**{**vars(asked), **few, "only": name}))
+
+
+def compare_all(asked: argparse.Namespace) -> None:
+    """Make the data sets and compare networks and estimators on each."""
     asked.out.mkdir(parents=True, exist_ok=True)
     elsewhere = ",".join(filter(None, ["zero", "ecc", "direct", asked.corrnet]))
     networks = [name for name in asked.networks.split(",") if name]
@@ -54,17 +66,24 @@ def main() -> None:
         data = asked.out / f"{name}{'' if name in HOME else '-few'}.zarr"
         common = (data, "--part", "all", "--reference", "direct")
         if name in HOME:
-            make(data, name, SETS[name], "flight.pings=2")
+            make(data, name, *(SMALL if asked.quick else (SETS[name],)), "flight.pings=2")
             forced = "" if name == HOME[0] else ":force=1"  # the other model's bearing is a cone's
             methods = ",".join([elsewhere, *(network + forced for network in networks)])
-            levels = ("--noise", "none,low,high", "--limit", 10)
+            levels = ("--noise", "high" if asked.quick else "none,low,high", "--limit", min(10, asked.pairs))
             compare(asked.out / f"networks-{name}", *common, *levels, "--pairs", asked.pairs, "--estimators", methods)
             if asked.perturbed:
                 few = ("--pairs", asked.perturbed, "--noise", "high", "--limit", 0, "--perturb")
                 compare(asked.out / f"networks-{name}-perturbed", *common, *few, "--estimators", methods)
         elif asked.elsewhere:  # networks that know one geometry only would refuse these
-            make(data, *ELSEWHERE[name])
-            levels = ("--noise", "none,high", "--limit", 5, "--pairs", asked.elsewhere)
+            make(data, *ELSEWHERE[name], *(SMALL if asked.quick else ()))
+            levels = (
+                "--noise",
+                "high" if asked.quick else "none,high",
+                "--limit",
+                min(5, asked.elsewhere),
+                "--pairs",
+                asked.elsewhere,
+            )
             compare(asked.out / f"networks-{name}", *common, *levels, "--estimators", elsewhere)
 
 

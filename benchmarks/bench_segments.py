@@ -5,6 +5,7 @@
     python benchmarks/bench_segments.py heights --out bench/segments
     python benchmarks/bench_segments.py paths --out bench/segments [--rows RUN,RUN]
     python benchmarks/bench_segments.py halves --out bench/segments --frames lamprey2_first30.npz
+    python benchmarks/bench_segments.py --quick            # all five, a few coarse pairs, one epoch, kept nowhere
 
 The chapter's figures and its table are made by `mitsonar reproduce 4.12`, 4.14, 4.15 and 4.5. Here: `leak`, PoseNetVec on
 1,000 pairs of circular segments from 10 m, its pairs dealt out one by one as the thesis shuffles them, and by sequence; each
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -54,7 +56,7 @@ HEAD = (
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=list(PARTS))
+    parser.add_argument("what", choices=list(PARTS), nargs="?")
     parser.add_argument("--out", type=Path, default=Path("bench/segments"))
     parser.add_argument("--sequences", type=int, default=5000, help="that `ours` learns from, five pings each")
     parser.add_argument("--physical", type=int, default=600, help="the same of the physical model")
@@ -66,10 +68,51 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, help="lamprey2_first30.npz of a real DIDSON at rest, for halves")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="all parts, a few coarse pairs, kept nowhere: within a minute")
     asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
+    if asked.what is None and not asked.quick:
+        parser.error(f"say what: {', '.join(PARTS)}, or --quick")
     print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {asked.threads} threads", flush=True)
+    if asked.quick:
+        return quick(asked)
+    asked.out.mkdir(parents=True, exist_ok=True)
     PARTS[asked.what](asked)
+
+
+def quick(asked: argparse.Namespace) -> None:
+    """All parts on a few coarse pairs."""
+    with tempfile.TemporaryDirectory() as folder:
+        few = {"out": Path(folder), "sequences": 8, "physical": 8, "unseen": 2, "width": 0.05, "epochs": 0.2, "threads": 1}
+        asked = argparse.Namespace(**{**vars(asked), **few})
+        leak(asked)
+        asked.rows = "circular-512,circular-1024-physical"
+        ours(asked)
+        heights(asked)
+        asked.rows = str(asked.out / "runs" / "ours-circular-512")
+        paths(asked)
+        halves(asked)
+
+
+COARSE = {
+    "sonar.beams": 100,
+    "sonar.rays_per_beam": 100,
+    "world": {"family": "rocky-field", "size_m": 50, "a_side": [10, 15]},
+}
+COARSE_HULL = {
+    "sonar.rays_per_beam": 100,
+    "world": {"family": "ship-hull", "groups_a_side": [3, 3], "anodes_a_side": [3, 3]},
+}
+"""What `--quick` changes in data sets."""
+
+
+def coarse(asked: argparse.Namespace, changes: dict[str, Any] = COARSE) -> dict[str, Any]:
+    """Changes of a data set's recipe."""
+    return changes if asked.quick else {}
+
+
+def short(asked: argparse.Namespace) -> dict[str, Any]:
+    """Changes of a training's recipe."""
+    return {"epochs": 1, "batch": 4} if asked.quick else {}
 
 
 # ---------------------------------------------------------------- data
@@ -77,7 +120,14 @@ def main() -> None:
 
 def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -> Path:
     """Vectors from 10 m up at 1024 levels, made or gone on with."""
-    words = {"store": "vectors", "segments": QUADRANTS + CONES, "name": name, "sonar.range_bins": 1024, **changes}
+    words = {
+        "store": "vectors",
+        "segments": QUADRANTS + CONES,
+        "name": name,
+        "sonar.range_bins": 1024,
+        **coarse(asked),
+        **changes,
+    }
     path = asked.out / f"{name}.zarr"
     make_dataset(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=asked.workers)
     return path
@@ -85,20 +135,25 @@ def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -
 
 def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: Any) -> Path:
     """Pairs, each of a sequence of its own, over other scenes."""
-    count = pairs or asked.unseen
+    count = asked.unseen if asked.quick else pairs or asked.unseen
     scenes = [{"count": -(-count // 50), "sequences": 50}]
     return data(asked, name, count, **{"seed": 7919, "scenes": scenes, "flight.pings": 2, **changes})
 
 
 def many(asked: argparse.Namespace) -> Path:
     """What ours learns from in the thesis's model: 20,000 pairs."""
-    return data(asked, "many10", asked.sequences, scenes=[{"count": -(-asked.sequences // 125), "sequences": 125}])
+    return data(asked, "many10", asked.sequences, scenes=groups(asked, asked.sequences, 125))
 
 
 def physical(asked: argparse.Namespace) -> Path:
     """And in the physical one."""
-    scenes = [{"count": -(-asked.physical // 75), "sequences": 75}]
-    return data(asked, "phys10", asked.physical, scenes=scenes, **PHYSICAL)
+    return data(asked, "phys10", asked.physical, scenes=groups(asked, asked.physical, 75), **PHYSICAL)
+
+
+def groups(asked: argparse.Namespace, sequences: int, each: int) -> list[dict[str, int]]:
+    """Scenes of so many sequences each; two at least, since the split is by scene."""
+    each = sequences // 2 if asked.quick else each
+    return [{"count": -(-sequences // each), "sequences": each}]
 
 
 PHYSICAL = {"sonar.model": "physical", "segments": CONES + QUADRANTS}
@@ -135,11 +190,17 @@ def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged:
 def leak(asked: argparse.Namespace) -> None:
     """The chapter's way to validate, and another."""
     print(HEAD)
-    learnt = data(asked, "thousand10", 250, segments=["whole", "starboard", *QUADRANTS, *CONES])
+    learnt = data(asked, "thousand10", 6 if asked.quick else 250, segments=["whole", "starboard", *QUADRANTS, *CONES])
     judged_by = unseen(asked, segments=["whole", "starboard", *QUADRANTS, *CONES])
     for by in ("sample", "sequence"):
         split = {"by": by, "train": 0.95, "validation": 0.05}
-        words = {"split": split, "network.width": asked.width, "input.range_levels": 512, "validate.every_minutes": 2}
+        words = {
+            "split": split,
+            "network.width": asked.width,
+            "input.range_levels": 512,
+            "validate.every_minutes": 2,
+            **short(asked),
+        }
         recipe = load_training_recipe("portion-circular-10m-vector", words)
         judged = {"validation": (learnt, "validation"), "unseen scenes": (judged_by, "all")}
         row(asked, f"leak-{by}", recipe, learnt, judged)
@@ -184,6 +245,7 @@ def ours(asked: argparse.Namespace) -> None:
             "noise": made.noise,
             "epochs": asked.epochs * made.times,
             "split": {"by": "scene", "train": 0.95, "validation": 0.05},
+            **({"batch": 4} if asked.quick else {}),
         }
         if made.model == "physical":
             learnt, judged = physical(asked), {"unseen scenes": (unseen(asked, "unseenp10", 300, **PHYSICAL), "all")}
@@ -202,7 +264,9 @@ def heights(asked: argparse.Namespace) -> None:
     print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | believed | ms |\n" + 9 * "|---" + "|")
     for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
         path = asked.out / f"{recipe}.zarr"
-        make_dataset(load_recipe(recipe, {"store": "vectors"}), str(path), workers=asked.workers)
+        changes = coarse(asked, COARSE if recipe == "height-rocky" else COARSE_HULL)
+        few = 10 if asked.quick else None
+        make_dataset(load_recipe(recipe, {"store": "vectors", **changes}), str(path), sequences=few, workers=asked.workers)
         for noise in ("none", "high"):
             print(height_row(path, recipe, noise, interval), flush=True)
 
@@ -236,7 +300,9 @@ def paths(asked: argparse.Namespace) -> None:
     if not asked.rows:
         raise SystemExit("paths needs --rows: folders of trained networks of c1..c4 from 10 m, with commas between them")
     path = asked.out / "runs10.zarr"
-    make_dataset(load_recipe("looking-down-runs", {"sonar.range_bins": 1024}), str(path), workers=asked.workers)
+    make_dataset(
+        load_recipe("looking-down-runs", {"sonar.range_bins": 1024, **coarse(asked)}), str(path), workers=asked.workers
+    )
     print(
         "| network | path | pairs | believed | RMSE sideways / forward mm / yaw deg | end off, mm (of path) |\n"
         + 6 * "|---"
@@ -244,7 +310,7 @@ def paths(asked: argparse.Namespace) -> None:
     )
     for run in asked.rows.split(","):
         network = ViewNetwork(Checkpoint.load(run))
-        for number, name in enumerate(("sideways_50", "sideways_54") * 2):
+        for number, name in enumerate((("sideways_50", "sideways_54") * 2)[: 1 if asked.quick else None]):
             source = open_views(str(path), network.views, network.kind, sequence=number)
             out = asked.out / "paths" / f"{Path(run).name}-{number}"
             found = run_odometry(source, run, network, out, overwrite=True)
@@ -266,16 +332,25 @@ def halves(asked: argparse.Namespace) -> None:
     """Two halves of a forward-looking sonar, learnt on simulated hulls with the chapter's noise (4.4.5)."""
     print(HEAD)
     learnt = asked.out / "hulls.zarr"
-    make_dataset(load_recipe("ship-hull"), str(learnt), sequences=300, workers=asked.workers)
+    hull = coarse(asked, {**COARSE_HULL, "scenes": [{"count": 2, "sequences": 4}]})
+    make_dataset(load_recipe("ship-hull", hull), str(learnt), sequences=8 if asked.quick else 300, workers=asked.workers)
     other = asked.out / "hulls-unseen.zarr"
     gain = DataStore.open(str(learnt)).about["gain"]  # one sonar
-    words = {"seed": 7919, "name": "hulls-unseen", "gain": gain}
-    make_dataset(load_recipe("ship-hull", words), str(other), sequences=100, workers=asked.workers)
+    words = {**hull, "seed": 7919, "name": "hulls-unseen", "gain": gain}
+    make_dataset(load_recipe("ship-hull", words), str(other), sequences=2 if asked.quick else 100, workers=asked.workers)
     noise = "0.04,0.02,0.04"
-    given = {"input": {"kind": "vector", "halves": True}, "noise": noise, "data": "ship-hull", "data_changes": {}}
+    given = {
+        "input": {"kind": "vector", "halves": True},
+        "noise": noise,
+        "data": "ship-hull",
+        "data_changes": {},
+        **short(asked),
+    }
+    if asked.quick:
+        given["split"] = {"by": "scene", "train": 0.5, "validation": 0.5}
     for name, recipe in (
         ("halves-posenetvec", load_training_recipe("portion-circular-vector", {**given, "network.width": asked.width})),
-        ("halves-profilenet", load_training_recipe("profilenet-quadrants", {**given, "epochs": 60})),
+        ("halves-profilenet", load_training_recipe("profilenet-quadrants", {"epochs": 60, **given})),
     ):
         row(asked, name, recipe, learnt, {"unseen scenes": (other, "all")})
         if asked.frames is not None:

@@ -10,17 +10,23 @@ much larger the errors of simple slopes are: they take the wrong weight of each 
 With --poses the limit of the motion that follows: tiles tell shifts, and the geometry of level ground tells motions by them.
 S is then of the mean over many draws of the rays, and their variance in one ping is noise. Whoever knows the scene has
 S / (2 N) instead: the ratio of both is what not knowing it costs. Beside them stands the oracle of `mitsonar limit`.
+`--quick` makes a small data set of its own and does both.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from mitsonar.acoustics.noise import NoiseModel, information, load_noise
+from mitsonar.config.data_recipe import load_recipe
+from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.store import DataStore
@@ -47,16 +53,35 @@ SLOPES = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data")
+    parser.add_argument("data", nargs="?")
     parser.add_argument("--noise", default="high")
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--poses", type=int, default=0, help="for the limit of the motion; 0: none")
+    parser.add_argument("--quick", action="store_true", help="of four frames of its own: within a minute")
     asked = parser.parse_args()
-    noise = load_noise(asked.noise)
-    store = DataStore.open(asked.data)
-    shifts(store, noise, asked.frames)
-    if asked.poses:
-        motions(asked.data, noise, asked.poses)
+    if asked.quick:
+        return quick(asked.noise)
+    if asked.data is None:
+        parser.error("a data set is missing: give DATA.zarr, or --quick")
+    both(asked.data, asked.noise, asked.frames, asked.poses)
+
+
+def quick(noise: str) -> None:
+    """Of a small data set that is made for it."""
+    changes: dict[str, Any] = {"scenes": [{"count": 2, "sequences": 2}], "sonar.rays_per_beam": 200, "flight.pings": 2}
+    changes["world"] = {"family": "rocky-field", "size_m": 20.0, "a_side": [8, 12]}
+    with tempfile.TemporaryDirectory() as folder:
+        data = str(Path(folder) / "small.zarr")
+        make_dataset(load_recipe("rocky-field", changes), data)
+        both(data, noise, 4, 2)
+
+
+def both(data: str, noise: str, frames: int, poses: int) -> None:
+    """What tells shifts, and with poses the limit of motions."""
+    level = load_noise(noise)
+    shifts(DataStore.open(data), level, frames)
+    if poses:
+        motions(data, level, poses)
 
 
 def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:

@@ -1,6 +1,7 @@
 """Table 2.1 and the synthetic trajectories of Almanza-Medina (2.3, 3.5.1), with estimators that need no training.
 
     python benchmarks/bench_trajectories.py [--only table21,trajectories] [--frames N] [--every N] [--out DIR]
+    python benchmarks/bench_trajectories.py --quick       # eight frames of each run, one seabed, kept nowhere
 
 `table21`: three runs over six seabeds (recipe pattern-runs), every consecutive pair, or one of N. `trajectories`: 904 frames
 over a rocky field that no recipe has, and two runs over the pattern; drift, and mosaics along true and estimated paths. Two
@@ -99,6 +100,9 @@ RECIPES = {"thesis": "rocky-field", "physical": "rocky-field-physical"}
 
 HEIGHT_M, PITCH_DEG = 2.5, 35.0
 FIELD_M, FIELD_SEED, FRAMES = 50.0, 904, 904
+COARSE = {"rays_per_beam": 300, "rays_across": 1}
+"""What `--quick` changes in a sonar."""
+
 """The field of the trajectories; the recipes' worlds have other seeds (hashes of the data set's seed and the scene)."""
 
 SLOW, FAST, CREEPING, BRAKED = 0.105, 0.378, 0.063, 0.357
@@ -116,7 +120,7 @@ NOISE_OF = {
 
 @dataclass(frozen=True)
 class Job:
-    """One run of one method; ``frames`` is how many are used at most, 0 for all."""
+    """One run of one method; ``frames`` is how many are used at most, 0 for all; ``coarse`` takes few rays and few rocks."""
 
     part: str
     run: str
@@ -126,6 +130,7 @@ class Job:
     noise: str
     every: int
     frames: int
+    coarse: bool = False
 
     @property
     def name(self) -> str:
@@ -134,20 +139,27 @@ class Job:
         return "-".join([*words, *([str(self.frames)] if self.frames else [])])
 
 
-def jobs(parts: Iterable[str], frames: int, every: int) -> Iterator[Job]:
+class Table(NamedTuple):
+    """Rows of table 2.1: seabeds and settings."""
+
+    textures: tuple[str, ...]
+    settings: tuple[Setting, ...]
+
+
+def jobs(parts: Iterable[str], frames: int, every: int, table: Table, coarse: bool) -> Iterator[Job]:
     """All that is to be run, the most important first."""
     if "trajectories" in parts:
-        yield from (trajectory_job(run, model, frames) for model in RECIPES for run in NOISE_OF)
+        yield from (trajectory_job(run, model, frames, coarse) for model in RECIPES for run in NOISE_OF)
     if "table21" in parts:
-        for setting in SETTINGS:
+        for setting in table.settings:
             own = setting._replace(every=setting.every * every)
-            yield from (Job("table21", run, texture, *own, frames) for texture in TEXTURES for run in RUNS)
+            yield from (Job("table21", run, texture, *own, frames, coarse) for texture in table.textures for run in RUNS)
 
 
-def trajectory_job(run: str, model: str, frames: int, method: str = "direct") -> Job:
+def trajectory_job(run: str, model: str, frames: int, coarse: bool = False) -> Job:
     """The job of a trajectory."""
     texture = "gaussian" if run in RUNS else "rocky-field"
-    return Job("trajectories", run, texture, method, model, NOISE_OF[run], 1, frames)
+    return Job("trajectories", run, texture, "direct", model, NOISE_OF[run], 1, frames, coarse)
 
 
 # ---------------------------------------------------------------- command
@@ -161,22 +173,32 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/trajectories"), help="data sets, results, estimates")
     parser.add_argument("--pictures", type=Path, help="where pictures go (default: OUT)")
     parser.add_argument("--every", type=int, default=1, help="of table21, only one of so many pairs")
+    parser.add_argument("--quick", action="store_true", help="eight frames of each run, one seabed: within a minute")
     args = parser.parse_args()
     parts = args.only.split(",")
     if not set(parts) <= set(PARTS):
         parser.error(f"--only takes {', '.join(PARTS)}: got {args.only}")
+    if not args.quick:
+        return benchmark(args, parts, Table(TEXTURES, SETTINGS))
+    with tempfile.TemporaryDirectory(prefix="bench-trajectories-") as folder:
+        few = {"frames": 8, "every": 1, "out": Path(folder), "pictures": None}
+        benchmark(argparse.Namespace(**{**vars(args), **few}), parts, Table(TEXTURES[:1], SETTINGS[:2]))
+
+
+def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
+    """Run what is missing, draw, print the tables."""
     args.out.mkdir(parents=True, exist_ok=True)
     if "table21" in parts:
         for model in RECIPES:
-            make_pattern_runs(args.out, model)
-    wanted = list(jobs(parts, args.frames, args.every))
+            make_pattern_runs(args.out, model, args.quick)
+    wanted = list(jobs(parts, args.frames, args.every, table, args.quick))
     results = run_all(wanted, args.out)
     pictures = args.pictures or args.out
     if "trajectories" in parts:
         draw(args.out, pictures, args.frames)
     print(machine(args.frames, args.every))
     if "table21" in parts:
-        print("\n" + "\n".join(table21([row for row in results if row["part"] == "table21"], args.every)))
+        print("\n" + "\n".join(table21([row for row in results if row["part"] == "table21"], args.every, table)))
     if "trajectories" in parts:
         print("\n" + "\n".join(trajectory_table([row for row in results if row["part"] == "trajectories"])))
 
@@ -187,7 +209,7 @@ def run_all(wanted: list[Job], out: Path) -> list[dict[str, Any]]:
     done = {}
     for line in log.read_text().splitlines() if log.exists() else []:
         row = json.loads(line)
-        done[Job(**{key: row[key] for key in Job.__dataclass_fields__})] = row
+        done[Job(**{key: row[key] for key in Job.__dataclass_fields__ if key in row})] = row
     missing = [job for job in wanted if job not in done]
     context, begun = multiprocessing.get_context("spawn"), time.perf_counter()
     with ProcessPoolExecutor(WORKERS, mp_context=context, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
@@ -230,14 +252,17 @@ def pattern_runs(out: Path, model: str) -> Path:
     return out / f"pattern-runs-{model}.zarr"
 
 
-def make_pattern_runs(out: Path, model: str) -> None:
-    """The shipped recipe with the sonar of a model, made as a user would."""
+def make_pattern_runs(out: Path, model: str, coarse: bool) -> None:
+    """The shipped recipe with the sonar of a model, made as a user would; coarse: the runs over the first seabed only."""
     fields = yaml.safe_load(shipped_recipes()["pattern-runs"].read_text(encoding="utf-8"))
     fields["sonar"] = yaml.safe_load(shipped_recipes()[RECIPES[model]].read_text(encoding="utf-8"))["sonar"]
+    if coarse:
+        fields["sonar"] |= COARSE
     recipe = out / f"pattern-runs-{model}.yaml"
     recipe.write_text(yaml.safe_dump(fields), encoding="utf-8")
     note(f"making {pattern_runs(out, model)}")
     words = ["dataset", "make", str(recipe), "-o", str(pattern_runs(out, model))]
+    words += ["--sequences", str(len(RUNS)), "--workers", "1"] if coarse else []
     subprocess.run([sys.executable, "-m", "mitsonar", *words], check=True, stdout=sys.stderr)
 
 
@@ -299,7 +324,7 @@ def keep(job: Job, out: Path, found: list[Estimate], true: Array) -> None:
     )
 
 
-def table21(rows: list[dict[str, Any]], every: int) -> Iterator[str]:
+def table21(rows: list[dict[str, Any]], every: int, table: Table) -> Iterator[str]:
     """Markdown: a row a method and seabed, the thesis's and zero's among them."""
     yield "RMSE sideways mm / forward mm / yaw deg, over the three runs of section 2.3"
     yield ""
@@ -308,10 +333,10 @@ def table21(rows: list[dict[str, Any]], every: int) -> Iterator[str]:
     by = {
         (row["texture"], Setting(row["method"], row["model"], row["noise"], row["every"]), row["run"]): row for row in rows
     }
-    for texture in TEXTURES:
+    for texture in table.textures:
         cells = [" / ".join(f"{value:.4g}" for value in one) for one in TABLE_21[texture]]
         yield f"| {texture} | thesis, table 2.1 | its own | chapter2 | 1,547 | {' | '.join(cells)} | |"
-        for setting in SETTINGS:
+        for setting in table.settings:
             mine = [by[texture, setting._replace(every=setting.every * every), run] for run in RUNS]
             cells = [numbers(row["rmse"]) for row in mine]
             failed = sum(row["failures"] for row in mine)
@@ -350,27 +375,29 @@ def driven(run: str, rate_hz: float, frames: int = 0) -> Trajectory:
     return Trajectory(mounted(vehicle, Pose.from_degrees([0, 0, 0, PITCH_DEG, 0, 0])), np.arange(len(vehicle)) / rate_hz)
 
 
-def rendered(run: str, model: str, noise: str, frames: int) -> SonarFrames:
+def rendered(job: Job) -> SonarFrames:
     """The frames of a run as a sonar would store them: noisy, in 256 grey values."""
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
     from mitsonar.worlds.pattern import Pattern
     from mitsonar.worlds.rocky_field import RockyField
 
-    sonar = load_recipe(RECIPES[model]).instrument
-    family = Pattern(texture="gaussian") if run in RUNS else RockyField(size_m=FIELD_M)
+    sonar = load_recipe(RECIPES[job.model]).instrument.replace(**(COARSE if job.coarse else {}))
+    rocks = {"a_side": (9, 15)} if job.coarse else {}
+    family = Pattern(texture="gaussian") if job.run in RUNS else RockyField(size_m=FIELD_M, **rocks)
     with tempfile.TemporaryDirectory(prefix="bench-trajectories-") as folder:
         path, parameters = family.prepare(FIELD_SEED, Path(folder) / "world")
         simulator = Simulator(load_scene(path, **parameters), sonar)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MitsonarWarning)  # the recipes' window drops what lies beyond, and says so
-        made = simulator.render(driven(run, sonar.frame_rate_hz, frames), noise=NOISE_MODELS[noise], seed=1)
+        path = driven(job.run, sonar.frame_rate_hz, job.frames)
+        made = simulator.render(path, noise=NOISE_MODELS[job.noise], seed=1)
     return replace(made, image=to_uint8(made.image))
 
 
 def run_trajectory(job: Job, out: Path) -> dict[str, Any]:
     """Estimates of consecutive frames, the paths they make, how far these are off; frames are kept for mosaics."""
-    frames = rendered(job.run, job.model, job.noise, job.frames)
+    frames = rendered(job)
     assert frames.poses is not None
     true = Trajectory(frames.poses, frames.time_s)
     found, each = estimates_of(job.method, (frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)))

@@ -1,10 +1,12 @@
 """Draws docs/gallery/worlds.png: each world from above, lit from the side, and as the sonar that stands in it sees it.
 
-python docs/draw_worlds.py
+python docs/draw_worlds.py            # into docs/gallery
+python docs/draw_worlds.py --quick    # coarse, into a folder that is removed: does it still work?
 """
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 import warnings
 from pathlib import Path
@@ -29,7 +31,7 @@ SHOWN = {
 """Options of each family, and half the edge of what is drawn from above [m]."""
 
 
-def from_above(scene: Any, middle: tuple[float, float], half_m: float) -> np.ndarray:
+def from_above(scene: Any, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
     """A photograph, as if the water were clear; north is up."""
     import mitsuba as mi
 
@@ -41,12 +43,12 @@ def from_above(scene: Any, middle: tuple[float, float], half_m: float) -> np.nda
         {
             "type": "orthographic",
             "to_world": look @ mi.ScalarTransform4f().scale([half_m, half_m, 1]),
-            "film": {"type": "hdrfilm", "width": 700, "height": 700, "pixel_format": "luminance"},
+            "film": {"type": "hdrfilm", "width": pixels, "height": pixels, "pixel_format": "luminance"},
         }
     )
     shapes = {f"shape{number}": shape for number, shape in enumerate(scene.shapes())}
     lit = mi.load_dict({"type": "scene", "sun": sun, "sky": sky, **shapes})
-    picture = np.array(mi.render(lit, sensor=camera, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=64))
+    picture = np.array(mi.render(lit, sensor=camera, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=spp))
     return np.clip(picture[..., 0], 0, 1) ** (1 / 2.2)
 
 
@@ -61,7 +63,30 @@ def footprint_outline(sonar: mitsonar.Sonar, pose: Pose) -> tuple[np.ndarray, np
 
 
 def main() -> None:
-    """Draw and write the picture."""
+    """Draw and write the picture.
+
+    Raises:
+        SystemExit: a world is not seen.
+    """
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="coarse, and kept nowhere")
+    if not parser.parse_args().quick:
+        return draw(Path(__file__).parent / "gallery" / "worlds.png", 700, 64)
+    with tempfile.TemporaryDirectory() as folder:
+        draw(Path(folder) / "worlds.png", 40, 2)
+
+
+def draw(out: Path, pixels: int, spp: int) -> None:
+    """Draw all worlds.
+
+    Args:
+        out: the picture to write.
+        pixels: of an edge of what is seen from above.
+        spp: rays a pixel of it.
+
+    Raises:
+        SystemExit: a world is not seen.
+    """
     ensure_variant()
     warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
     figure, axes = plt.subplots(2, len(SHOWN), figsize=(4 * len(SHOWN), 8.2), layout="constrained")
@@ -76,14 +101,18 @@ def main() -> None:
         x, y = footprint_outline(sonar, pose)
         middle = (float(x.mean()), float(y.mean())) if half_m < 6 else (0.0, 0.0)
         extent = (middle[0] - half_m, middle[0] + half_m, middle[1] - half_m, middle[1] + half_m)
-        above.imshow(from_above(scene, middle, half_m), cmap="gray", extent=extent, vmin=0, vmax=1)
+        seen = from_above(scene, middle, half_m, pixels, spp)
+        if not (frames.image[0] > 0).mean() > 0.05 or not np.ptp(seen) > 0.1:
+            raise SystemExit(f"{name} is not seen: its picture or its sonar image is empty")
+        above.imshow(seen, cmap="gray", extent=extent, vmin=0, vmax=1)
         above.plot(x, y, color="tab:orange", lw=1)
         above.plot(pose.x, pose.y, "o", color="tab:orange", ms=5)
         above.set(title=name, xlim=extent[:2], ylim=extent[2:], xlabel="x, m", ylabel="y, m")
         fan = to_cartesian(frames.image[0], frames.range_m, frames.bearing_rad)
         below.imshow(fan.image, extent=fan.extent, cmap="copper", vmin=0, vmax=1)
         below.set(facecolor="black", xlabel="starboard, m", ylabel="ahead, m")
-    figure.savefig(Path(__file__).parent / "gallery" / "worlds.png", dpi=70)
+    figure.savefig(out, dpi=70)
+    print(f"{out}: {len(SHOWN)} worlds")
 
 
 if __name__ == "__main__":

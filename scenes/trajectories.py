@@ -1,9 +1,10 @@
 """Make the trajectories to fly in the shipped scenes (TUM files); each begins where its scene's own sonar is.
 
-Run `python trajectories.py .` in this folder after a change.
+Run `python trajectories.py .` in this folder after a change; `--quick` only tells whether they are what is shipped.
 """
 
 import argparse
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,12 +70,38 @@ TRAJECTORIES: dict[str, Callable[[], Trajectory]] = {
 
 
 def main() -> None:
-    """Write every trajectory into a folder."""
+    """Write every trajectory into a folder, or compare them with those that are shipped."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder for the TUM files")
+    parser.add_argument("out", type=Path, nargs="?", help="folder for the TUM files")
+    parser.add_argument("--quick", action="store_true", help="compare with the shipped files instead")
     arguments = parser.parse_args()
+    if arguments.quick:
+        return compare()
+    if arguments.out is None:
+        parser.error("a folder is missing: give OUT, or --quick")
+    write(arguments.out)
+
+
+def write(folder: Path) -> None:
+    """Write every trajectory."""
     for name, trajectory in TRAJECTORIES.items():
-        trajectory().save_tum(arguments.out / f"{name}.tum")
+        trajectory().save_tum(folder / f"{name}.tum")
+
+
+def compare() -> None:
+    """Compare with the shipped files.
+
+    Raises:
+        SystemExit: one differs by more than rounding.
+    """
+    shipped = Path(__file__).resolve().parent
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder))
+        for name in TRAJECTORIES:
+            made, had = (np.loadtxt(path / f"{name}.tum") for path in (Path(folder), shipped))
+            if made.shape != had.shape or not np.allclose(made, had, atol=1e-6):
+                raise SystemExit(f"{name}.tum is not what is made now: run `python trajectories.py .`")
+            print(f"{name}.tum: {len(made)} poses, as shipped")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib.util import find_spec
 from typing import Any
 
 import finufft
@@ -35,7 +34,14 @@ def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], mod
 
 @cache
 def _has_cufinufft() -> bool:
-    return find_spec("cufinufft") is not None and find_spec("torch") is not None
+    """Whether it is installed and loads: it finds CUDA's libraries in those of torch, if their versions agree."""
+    try:
+        import torch  # noqa: F401, I001  # first: its libraries are found then
+
+        import cufinufft  # noqa: F401
+    except (ImportError, OSError):
+        return False
+    return True
 
 
 def _on_the_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:

@@ -2,9 +2,11 @@
 
 Needs trimesh, pycollada and lxml. Only the container changes: scene-graph transforms are applied (metres, z up),
 identical vertices are merged, degenerate faces are dropped, and colours, normals and texture coordinates are left out.
+`--quick` converts a box of its own there and back.
 """
 
 import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -43,15 +45,37 @@ def save(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def main() -> None:
-    """Convert every mesh of the shipped scenes."""
+    """Convert every mesh of the shipped scenes, or a box."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("source", type=Path, help="folder with the COLLADA files")
-    parser.add_argument("out", type=Path, help="folder for the PLY files")
+    parser.add_argument("source", type=Path, nargs="?", help="folder with the COLLADA files")
+    parser.add_argument("out", type=Path, nargs="?", help="folder for the PLY files")
+    parser.add_argument("--quick", action="store_true", help="convert a box instead, and compare")
     arguments = parser.parse_args()
+    if arguments.quick:
+        return convert_box()
+    if arguments.out is None:
+        parser.error("folders are missing: give SOURCE and OUT, or --quick")
     for name, source in SOURCES.items():
         vertices, faces = load(arguments.source / source)
         save(arguments.out / name, vertices, faces)
         print(f"{name}: {len(faces)} faces, {vertices.min(axis=0)} to {vertices.max(axis=0)}")
+
+
+def convert_box() -> None:
+    """Convert a box from COLLADA to PLY.
+
+    Raises:
+        SystemExit: it is no longer the same box.
+    """
+    box = trimesh.creation.box((1, 2, 3))
+    with tempfile.TemporaryDirectory() as folder:
+        source, made = Path(folder, "box.dae"), Path(folder, "box.ply")
+        source.write_bytes(trimesh.exchange.dae.export_collada(box))
+        save(made, *load(source))
+        back = trimesh.load_mesh(made)
+    if back.faces.shape != (12, 3) or not np.allclose(back.bounds, box.bounds) or not np.isclose(back.volume, 6):
+        raise SystemExit(f"a box of 12 faces and 6 m3 came back as {len(back.faces)} faces and {back.volume:g} m3")
+    print("box.ply: 12 faces, 6 m3, as it went in")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Generate `rocks.ply`: stones strewn over the seabed around the sunken ship, half of them near its hull.
 
-Needs trimesh. The seed is fixed, so the same bytes come out each time.
+Needs trimesh. The seed is fixed, so the same bytes come out each time; `--quick` tells whether they are what is shipped.
 """
 
 import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -31,12 +32,23 @@ def rocks(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 def main() -> None:
-    """Write the mesh into a folder."""
+    """Write the mesh into a folder, or compare it with the one that is shipped.
+
+    Raises:
+        SystemExit: it differs.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder for the PLY file")
+    parser.add_argument("out", type=Path, nargs="?", help="folder for the PLY file")
+    parser.add_argument("--quick", action="store_true", help="compare with the shipped file instead")
     arguments = parser.parse_args()
+    if arguments.out is None and not arguments.quick:
+        parser.error("a folder is missing: give OUT, or --quick")
     vertices, faces = rocks(np.random.default_rng(5))
-    save(arguments.out / "rocks.ply", vertices, faces)
+    with tempfile.TemporaryDirectory() as folder:
+        made = (arguments.out or Path(folder)) / "rocks.ply"
+        save(made, vertices, faces)
+        if arguments.quick and made.read_bytes() != (Path(__file__).resolve().parent / "rocks.ply").read_bytes():
+            raise SystemExit("rocks.ply is not what is made now: run `python rocks.py .`")
     print(f"rocks.ply: {len(faces)} faces, {vertices.min(axis=0)} to {vertices.max(axis=0)}")
 
 

@@ -1,10 +1,11 @@
 """Generate the tileable greyscale textures of the shipped scenes: stand-ins for photographs of real surfaces.
 
 Each picture is a made-up luminance (albedo times a soft oblique light) with periodic boundaries. The seeds are fixed,
-so the same bytes come out each time.
+so the same bytes come out each time; `--quick` makes one, and tells whether it is what is shipped.
 """
 
 import argparse
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -131,12 +132,34 @@ TEXTURES: dict[str, Callable[[], Field]] = {"photo_sand": sand, "photo_gravel": 
 
 
 def main() -> None:
-    """Write every texture into a folder."""
+    """Write every texture into a folder, or compare one with the one that is shipped."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder for the PNG files")
+    parser.add_argument("out", type=Path, nargs="?", help="folder for the PNG files")
+    parser.add_argument("--quick", action="store_true", help="compare the sand with the shipped one instead")
     arguments = parser.parse_args()
+    if arguments.quick:
+        return compare("photo_sand")
+    if arguments.out is None:
+        parser.error("a folder is missing: give OUT, or --quick")
     for name, texture in TEXTURES.items():
         save(arguments.out / f"{name}.png", texture())
+
+
+def compare(name: str) -> None:
+    """Make a texture and compare it with the shipped one.
+
+    Raises:
+        SystemExit: grey levels differ by more than rounding.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        save(Path(folder, f"{name}.png"), TEXTURES[name]())
+        made, had = (
+            np.asarray(Image.open(path / f"{name}.png"), dtype=int)
+            for path in (Path(folder), Path(__file__).resolve().parent)
+        )
+    if made.shape != had.shape or np.abs(made - had).max() > 1:
+        raise SystemExit(f"{name}.png is not what is made now: run `python generate.py .`")
+    print(f"{name}.png: {made.shape[0]} x {made.shape[1]} pixels, as shipped")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,497 @@
+"""The first hour on a machine with a GPU, in steps of at most ten minutes that can be killed and go on.
+
+    python benchmarks/gpu/run.py install LOAD ... [--site FOLDER]      put the loads of pack.py together, install them
+    python benchmarks/gpu/run.py STEP --out OUT                        one step
+    python benchmarks/gpu/run.py --all --out OUT [--minutes 10]        the open steps, one after the other, for so long
+    python benchmarks/gpu/run.py --all --out OUT --scale 0.001 --device cpu
+    python benchmarks/gpu/run.py --quick                               the same, kept nowhere
+
+Each step prints what it found and writes it to OUT/state.json, its output to OUT/logs. A step that fails stops no other;
+`--again` tries it once more. README.md beside this file says what each step does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+sys.path.insert(0, str(HERE))
+
+import pack  # noqa: E402
+
+TABLE_32 = ("posenet-normx10", "posenet-quantised")
+TABLE_52 = (
+    *("impulse-standard", "impulse-two-receivers", "impulse-40khz", "impulse-60khz", "impulse-100khz", "impulse-160khz"),
+    *("impulse-narrow", "impulse-circular-4800", "impulse-wideband-9600", "impulse-wideband-19200"),
+    *("impulse-circular-19200", "impulse-high-objects", "impulse-ten-80khz", "impulse-ten-160khz", "impulse-ten-320khz"),
+)
+SMALL = 0.01
+"""Scales below this one train small networks on coarse data, one row of each table: a check of the steps, no result."""
+
+ALIKE = 0.01
+"""Two devices may differ by this part (rms) where they do not round alike: a ray on an edge falls into the next cell."""
+
+GRACE_S = 60.0
+"""That a command has to write its state, once it was asked to stop."""
+
+
+class Asked(NamedTuple):
+    """What a step is told.
+
+    Attributes:
+        out: folder of everything.
+        scale: part of the data of the tables, above 0 to 1.
+        device: cuda or cpu.
+        end: `time.monotonic()` at which the step should be over.
+    """
+
+    out: Path
+    scale: float
+    device: str
+    end: float
+
+    @property
+    def variant(self) -> str:
+        """Of Mitsuba."""
+        return "cuda_ad_mono" if self.device == "cuda" else "llvm_ad_mono"
+
+    @property
+    def small(self) -> bool:
+        """Whether this is only a check of the steps."""
+        return self.scale < SMALL
+
+
+class Found(NamedTuple):
+    """What a step found; ``done`` False: it goes on at the next call."""
+
+    said: dict[str, Any]
+    done: bool = True
+
+
+class Failed(Exception):
+    """A step could not be done; the sentence says why."""
+
+
+def main() -> None:
+    """Do what is asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("step", nargs="?", choices=["install", *STEPS], help="one step")
+    parser.add_argument("loads", nargs="*", type=Path, help="of install: folders of pack.py")
+    parser.add_argument("--all", action="store_true", help="all steps that are open")
+    parser.add_argument("--out", type=Path, default=Path("out/gpu"), help="state, logs, data, weights")
+    parser.add_argument("--minutes", type=float, default=10, help="of this call")
+    parser.add_argument("--scale", type=float, default=1.0, help="part of the data of the tables, above 0 to 1")
+    parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
+    parser.add_argument("--again", action="store_true", help="steps that failed, too")
+    parser.add_argument("--site", type=Path, default=Path("out/site"), help="of install: where to")
+    parser.add_argument("--quick", action="store_true", help="--all --scale 0.001 --device cpu, kept nowhere")
+    asked = parser.parse_args()
+    if asked.step == "install":
+        return install(asked.loads, asked.site)
+    if not 0 < asked.scale <= 1:
+        parser.error(f"--scale must be above 0 and at most 1: got {asked.scale:g}")
+    if asked.quick:
+        return quick()
+    if not asked.all and asked.step is None:
+        parser.error(f"say which step, or --all: {', '.join(STEPS)}")
+    names = list(STEPS) if asked.all else [asked.step]
+    states = go(names, asked.out, asked.scale, asked.device, asked.minutes, again=asked.again or not asked.all)
+    raise SystemExit(1 if "failed" in states.values() else 0)
+
+
+def quick() -> None:
+    """All steps at a thousandth on the CPU.
+
+    Raises:
+        SystemExit: one failed, or is not done.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        states = go(list(STEPS), Path(folder), 0.001, "cpu", 60)
+    wrong = [name for name, state in states.items() if state not in ("done", "left out")]
+    if wrong:
+        raise SystemExit(f"not done: {', '.join(wrong)}")
+
+
+# ---------------------------------------------------------------- state
+
+
+def go(names: list[str], out: Path, scale: float, device: str, minutes: float, again: bool = False) -> dict[str, str]:
+    """Do the steps that are open until the time is over.
+
+    Returns:
+        State of each: open, done, failed or left out.
+
+    Raises:
+        SystemExit: the folder was begun with other numbers.
+    """
+    out = out.resolve()
+    state = opened(out, {"scale": scale, "device": device})
+    end = time.monotonic() + 60 * minutes
+    for name in names:
+        had = state["steps"].setdefault(name, {"state": "open", "seconds": 0.0, "calls": 0})
+        if had["state"] == "done" or (had["state"] == "failed" and not again) or time.monotonic() > end:
+            continue
+        begun = time.monotonic()
+        print(f"== {name}", flush=True)
+        had["calls"] += 1
+        had.update(tried(name, Asked(out, scale, device, end)))
+        had["seconds"] += time.monotonic() - begun
+        keep(out, state)
+        print(f"{name}: {had['state']} after {had['seconds']:.0f} s in {had['calls']} calls", flush=True)
+        print("\n".join(f"    {key}: {value}" for key, value in had["found"].items()), flush=True)
+    states = {name: state["steps"][name]["state"] for name in names}
+    print(", ".join(f"{sum(s == kind for s in states.values())} {kind}" for kind in ("done", "open", "failed", "left out")))
+    return states
+
+
+def tried(name: str, asked: Asked) -> dict[str, Any]:
+    """Do a step, whatever becomes of it."""
+    if asked.small and name not in IN_SMALL:
+        return {"state": "left out", "found": {"why": f"below a scale of {SMALL:g} one row of each table is tried"}}
+    try:
+        found = STEPS[name](asked)
+    except Exception as error:  # no step may stop the others
+        return {"state": "failed", "found": {type(error).__name__: str(error)}}
+    return {"state": "done" if found.done else "open", "found": found.said}
+
+
+def opened(out: Path, about: dict[str, Any]) -> dict[str, Any]:
+    """The state of a folder, new or as it was left.
+
+    Raises:
+        SystemExit: it was begun with other numbers, or is damaged.
+    """
+    path = out / "state.json"
+    if not path.exists():
+        return {"about": about, "steps": {}}
+    try:
+        state: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        had = state["about"]
+    except (ValueError, KeyError, TypeError):
+        raise SystemExit(f"{path} is damaged: remove it, and the steps find what they had done") from None
+    if had != about:
+        raise SystemExit(f"{out} was begun with {had}, not {about}: ask for the same, or choose another --out")
+    return state
+
+
+def keep(out: Path, state: dict[str, Any]) -> None:
+    """Write the state, whole or not at all."""
+    out.mkdir(parents=True, exist_ok=True)
+    part = out / ".state.json.part"
+    part.write_text(json.dumps(state, indent=1, default=str), encoding="utf-8")
+    part.replace(out / "state.json")
+
+
+# ---------------------------------------------------------------- commands
+
+
+def command(asked: Asked, name: str, words: list[str], *, goes_on: bool = False, **environment: str) -> bool:
+    """Run Python with these words until the step's end; its output goes to OUT/logs/NAME.log.
+
+    Returns:
+        Whether it ended; False where it was stopped and ``goes_on`` when it is called again.
+
+    Raises:
+        Failed: it failed, or was stopped and cannot go on.
+    """
+    log = asked.out / "logs" / f"{name}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    paths = [str(ROOT / "benchmarks"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    world = {**os.environ, "MITSONAR_VARIANT": asked.variant, "PYTHONPATH": os.pathsep.join(paths), **environment}
+    with log.open("ab") as file:
+        file.write(f"$ {' '.join(words)}\n".encode())
+        file.flush()
+        run = subprocess.Popen(
+            [sys.executable, *words], cwd=asked.out, env=world, stdout=file, stderr=file, start_new_session=True
+        )
+        ended = waited(run, asked.end)
+    if ended and run.returncode == 0:
+        return True
+    if not ended and goes_on:
+        return False
+    last = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()][-3:]
+    why = f"exit status {run.returncode}" if ended else "not done in time"
+    raise Failed(f"{why}: {' | '.join(last)} (see {log})")
+
+
+def waited(run: subprocess.Popen[bytes], end: float) -> bool:
+    """Whether a command ended by itself; else it is asked to stop, and killed where it does not."""
+    try:
+        run.wait(max(1.0, end - time.monotonic()))
+        return True
+    except subprocess.TimeoutExpired:
+        run.send_signal(signal.SIGINT)
+    try:
+        run.wait(GRACE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(run.pid, signal.SIGKILL)
+        run.wait()
+    return False
+
+
+def mitsonar(*words: object) -> list[str]:
+    """A command of mitsonar."""
+    return ["-m", "mitsonar", *map(str, words)]
+
+
+# ---------------------------------------------------------------- steps
+
+
+def look(asked: Asked) -> Found:
+    """What the machine has, and what of the list of wheels it lacks."""
+    wanted = [one.partition("==")[0] for wheels in pack.listed().values() for one in wheels]
+    said: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count()}
+    said["missing"] = ", ".join(name for name in wanted if version_of(name) is None) or "nothing"
+    said |= {name: version_of(name) for name in ("mitsonar", "mitsuba", "drjit", "torch", "lightning", "cufinufft")}
+    for name, words in {
+        "gpu": ["nvidia-smi", "--query-gpu=name,driver_version,memory.total", "--format=csv,noheader"],
+        "torch on CUDA": [sys.executable, "-c", "import torch; print(torch.version.cuda, torch.cuda.is_available())"],
+        "Dr.Jit has": [
+            *(sys.executable, "-c"),
+            "import drjit as dr; print([b.name for b in (dr.JitBackend.CUDA, dr.JitBackend.LLVM) if dr.has_backend(b)])",
+        ],
+        "cufinufft loads": [sys.executable, "-c", "import torch, cufinufft; print(cufinufft.__version__)"],
+        "doctor": [sys.executable, *mitsonar("doctor")],
+    }.items():
+        said[name] = answer(words, asked)
+    return Found(said)
+
+
+def version_of(name: str) -> str | None:
+    """Version of an installed package."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def answer(words: list[str], asked: Asked) -> str:
+    """What a command prints, or why it prints nothing."""
+    world = {**os.environ, "MITSONAR_VARIANT": asked.variant}
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=world)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"no answer ({type(error).__name__})"
+    text = " / ".join(line.strip() for line in (done.stdout + done.stderr).splitlines() if line.strip())
+    return text if done.returncode == 0 else f"exit status {done.returncode}: {text[-300:]}"
+
+
+RENDERS = {
+    "thesis": ("render", "flat_floor", "--model", "thesis", "--frames", 2),
+    "physical": ("render", "pattern", "--model", "physical", "--frames", 2),
+    "labels": ("render", "objects", "--labels", "--frames", 1),
+    "scatterers": ("impulse", "hydrophones", "--velocity", "1,0.5", "--frames", 2),
+    "rays": ("impulse", "hydrophones", "--velocity", "1,0.5", "--frames", 2, "--model", "rays", "--set", "rays=20000"),
+}
+
+
+def same(asked: Asked) -> Found:
+    """The same small scenes on the device twice, which must agree bit for bit, and on the CPU, within `ALIKE`."""
+    said, wrong = {}, []
+    for name in ("thesis", "scatterers") if asked.small else RENDERS:
+        first, second, cpu = (made(asked, name, run) for run in ("first", "second", "cpu"))
+        for key in sorted(first):
+            if not np.array_equal(first[key], second[key], equal_nan=True):
+                wrong.append(f"{name}.{key} twice on {asked.device}: {differ(first[key], second[key]):.2g} rms")
+            error = differ(first[key], cpu[key])
+            equal = float(np.mean(first[key] == cpu[key])) if first[key].shape == cpu[key].shape else 0.0
+            said[f"{name}.{key}"] = f"{error:.2g} rms from the CPU, {equal:.2%} of the values equal"
+            if not error <= ALIKE:
+                wrong.append(f"{name}.{key}: {error:.2g} rms from the CPU, more than {ALIKE:g}")
+    if wrong:
+        raise Failed(f"{'; '.join(wrong)}; found: {said}")
+    return Found(said)
+
+
+def made(asked: Asked, name: str, run: str) -> dict[str, np.ndarray]:
+    """Numbers of a small run; that of the CPU is what all are compared with."""
+    out = asked.out / "same" / f"{name}-{run}"
+    variant = "llvm_ad_mono" if run == "cpu" else asked.variant
+    command(asked, "same", mitsonar(*RENDERS[name], "--overwrite", "-o", out), MITSONAR_VARIANT=variant)
+    kinds = {"image", "response", "elevation", "elevation_rad", "shadow"}
+    with np.load(next(out.glob("*.npz"))) as table:
+        found = {key: table[key] for key in table.files if key in kinds}
+    if not found:
+        raise Failed(f"{out} holds neither images nor responses")
+    return found
+
+
+def differ(one: np.ndarray, other: np.ndarray) -> float:
+    """Rms difference as a part of the rms value."""
+    if one.shape != other.shape:
+        return float("inf")
+    scale = float(np.sqrt(np.nanmean(np.abs(other.astype(np.complex128)) ** 2)))
+    return float(np.sqrt(np.nanmean(np.abs(one.astype(np.complex128) - other) ** 2))) / (scale or 1.0)
+
+
+def tests(asked: Asked) -> Found:
+    """The tests that need CUDA, or those of the variant on a CPU."""
+    if importlib.util.find_spec("pytest") is None:
+        raise Failed("pytest is missing: pack it with `pack.py --all`")
+    chosen = ["-m", "gpu", str(ROOT / "tests")] if asked.device == "cuda" else ["-k", "variant", str(ROOT / "tests")]
+    words = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml"), *chosen]
+    command(asked, "tests", words if asked.device == "cuda" else [*words[:-1], str(variant_tests())])
+    return Found({"said": last_line(asked, "tests")})
+
+
+def variant_tests() -> Path:
+    """The file of tests of the variant, wherever it lies."""
+    return next((ROOT / "tests").rglob("test_variant.py"))
+
+
+def last_line(asked: Asked, name: str) -> str:
+    """The last line of a log."""
+    text = (asked.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
+    return next(line for line in reversed(text.splitlines()) if line.strip())
+
+
+def render_speed(asked: Asked) -> Found:
+    """How fast frames are rendered; its table is in the log."""
+    few = ["--quick"] if asked.small else ["--without-open3d"]
+    script = str(ROOT / "benchmarks" / "bench_render.py")
+    command(asked, "render_speed", [script, "--variant", asked.variant, *few])
+    return Found(rows_of(asked, "render_speed"))
+
+
+def coherent_speed(asked: Asked) -> Found:
+    """How fast impulse responses are made."""
+    script = str(ROOT / "benchmarks" / "bench_impulse.py")
+    command(asked, "coherent_speed", [script, "--quick"] if asked.small else [script, "speed"])
+    return Found(rows_of(asked, "coherent_speed"))
+
+
+def rows_of(asked: Asked, name: str) -> dict[str, str]:
+    """Lines of a log that hold a result."""
+    text = (asked.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
+    mine = text.rpartition("\n$ ")[2].splitlines()[1:]
+    return {f"line {k}": line for k, line in enumerate(line for line in mine if line.strip() and line[0] not in "{-")}
+
+
+def row(table: str, name: str) -> Callable[[Asked], Found]:
+    """A row of a table: its data, training and evaluation by `mitsonar reproduce`, which goes on where it was stopped."""
+
+    def work(asked: Asked) -> Found:
+        out = asked.out / f"table-{table}"
+        words: list[object] = ["reproduce", table, "--rows", name, "-o", out, *effort(asked, table)]
+        words += ["--accelerator", "gpu" if asked.device == "cuda" else "cpu", "--devices", 1]
+        words += ["--workers", 1 if asked.device == "cuda" or asked.small else os.cpu_count()]
+        if not command(asked, f"table-{table}-{name}", mitsonar(*words), goes_on=True):
+            return Found({"so far": last_line(asked, f"table-{table}-{name}")}, done=False)
+        return Found(json.loads((out / "rows" / f"{name}.json").read_text(encoding="utf-8")))
+
+    return work
+
+
+def effort(asked: Asked, table: str) -> list[object]:
+    """What is spent on each row: all epochs; at a small scale some seconds on coarse data."""
+    bf16 = ["--set", "precision=bf16-mixed"] if asked.device == "cuda" else []
+    if not asked.small:
+        return ["--scale", asked.scale, "--minutes", 0, *bf16]
+    rocks = "{family: rocky-field, size_m: 20, a_side: [5, 9]}"
+    flat = "{family: flat-objects, size_m: 30, seabed_cells: 200, rectangles: 20, ellipses: 20}"
+    sequences = max(4, round(asked.scale * (40_000 if table == "3.2" else 3_000) / 4))
+    data = f"scenes: [{{count: 2, sequences: {sequences}}}], world: {rocks if table == '3.2' else flat}"
+    changes = ["network.width=0.03", f"data_changes={{{data}}}"]
+    return ["--scale", 1, "--minutes", 0.1, *(word for change in changes for word in ("--set", change))]
+
+
+def weights(asked: Asked) -> Found:
+    """Networks of the rows that are done, in bf16, in files below 16 MiB, in OUT/weights; `together` reads them again."""
+    import torch
+
+    said: dict[str, Any] = {}
+    for path in sorted(asked.out.glob("table-*/runs/*/network.ckpt")):
+        folder = asked.out / "weights" / path.parent.name
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in folder.iterdir():
+            old.unlink()
+        whole = folder / "network.bf16"
+        torch.save(halved(torch.load(path, map_location="cpu", weights_only=True)), whole)
+        for name, data in pack.split(whole.name, whole.read_bytes(), 15 * pack.MIB):
+            (folder / name).write_bytes(data)
+        whole.unlink() if len(list(folder.iterdir())) > 1 else None
+        back = together(folder)
+        if {key for key in back} != {key for key in torch.load(path, map_location="cpu", weights_only=True)}:
+            raise Failed(f"{folder} does not hold what {path} holds")
+        said[path.parent.name] = (
+            f"{len(list(folder.iterdir()))} files, {sum(p.stat().st_size for p in folder.iterdir()):,} bytes"
+        )
+    finished = all((asked.out / "table-3.2" / "rows" / f"{name}.json").exists() for name in TABLE_32[:1])
+    return Found(said or {"networks": "none yet"}, done=finished and bool(said))
+
+
+def halved(value: Any) -> Any:
+    """Tensors of 32-bit numbers in bf16, wherever they are."""
+    import torch
+
+    if isinstance(value, torch.Tensor):
+        return value.to(torch.bfloat16) if value.dtype == torch.float32 else value
+    if isinstance(value, dict):
+        return {key: halved(one) for key, one in value.items()}
+    return [halved(one) for one in value] if isinstance(value, list) else value
+
+
+def together(folder: Path) -> dict[str, Any]:
+    """A checkpoint of `weights` as mitsonar saves it: `torch.save(together(FOLDER), "network.ckpt")`."""
+    import torch
+
+    def full(value: Any) -> Any:
+        if isinstance(value, torch.Tensor):
+            return value.to(torch.float32) if value.dtype == torch.bfloat16 else value
+        if isinstance(value, dict):
+            return {key: full(one) for key, one in value.items()}
+        return [full(one) for one in value] if isinstance(value, list) else value
+
+    with tempfile.TemporaryDirectory() as whole:
+        (path,) = pack.put_together([folder], Path(whole))
+        return dict(full(torch.load(path, map_location="cpu", weights_only=True)))
+
+
+STEPS: dict[str, Callable[[Asked], Found]] = {
+    "look": look,
+    "same": same,
+    "tests": tests,
+    "render_speed": render_speed,
+    "coherent_speed": coherent_speed,
+    **{name: row("3.2", name) for name in TABLE_32},
+    **{name: row("5.2", name) for name in TABLE_52},
+    "weights": weights,
+}
+"""In the order in which they are done."""
+
+IN_SMALL = {*STEPS} - {*TABLE_32[1:], *TABLE_52[1:]}
+
+
+def install(loads: list[Path], site: Path) -> None:
+    """Put loads together and install their wheels into a folder.
+
+    Raises:
+        SystemExit: nothing to install, a part is missing or damaged.
+    """
+    if not loads:
+        raise SystemExit("nothing to install: give the folders that pack.py made")
+    with tempfile.TemporaryDirectory() as folder:
+        wheels = [str(path) for path in pack.put_together(loads, Path(folder)) if path.suffix == ".whl"]
+        words = ["-q", "--no-index", "--no-deps", "--no-compile", "--upgrade", "--target", str(site)]
+        subprocess.run([sys.executable, "-m", "pip", "install", *words, *wheels], check=True)
+    print(f"{len(wheels)} wheels installed: export PYTHONPATH={site.resolve()}")
+
+
+if __name__ == "__main__":
+    main()
