@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from helpers import Command, Done
+from helpers import Command, Done, tiny_recipe
 
 LONGEST = ("test_readme.py", "04_networks.ipynb", "03_odometry.ipynb", "02_dataset.ipynb")
 """Run first: begun last, one of them would keep one core busy while the other waits."""
@@ -42,6 +42,16 @@ def variant() -> str:
     from mitsonar.simulation.variant import ensure_variant
 
     return ensure_variant()
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
+    """The data set of the tiny recipe, made once for all modules of a worker: to read, and to copy before any harm."""
+    from mitsonar.datasets.generation import make_dataset
+
+    url = tmp_path_factory.mktemp("made") / "tiny.zarr"
+    make_dataset(tiny_recipe(), str(url))
+    return url
 
 
 @pytest.fixture

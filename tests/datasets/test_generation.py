@@ -40,11 +40,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tiny_data: Path) -> Path:
     """The tiny data set, made in one go."""
-    url = tmp_path_factory.mktemp("made") / "tiny.zarr"
-    make_dataset(tiny_recipe(), str(url))
-    return url
+    return tiny_data
 
 
 def copy_of(made: Path, folder: Path) -> Path:
@@ -379,6 +377,7 @@ def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     assert files_of(tmp_path / "tiny.zarr") == files_of(made)
 
 
+@pytest.mark.thorough
 def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(made: Path, tmp_path: Path) -> None:
     """A scheduler by its address; one of its workers is killed while it renders, and nothing is lost."""
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "spawn"}
@@ -390,7 +389,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
     )
     workers: list[subprocess.Popen[bytes]] = []
     try:
-        address = _written(place, 30)["address"]
+        address = _written(place, 90)["address"]
         worker = [
             sys.executable,
             "-m",
@@ -405,7 +404,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
         making = subprocess.Popen(
             [*PROGRAM, *command(tmp_path, "--scheduler", address)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
-        _wait(lambda: any((tmp_path / "tiny.zarr" / "seal" / "c").glob("*/*/*")), 90)
+        _wait(lambda: any((tmp_path / "tiny.zarr" / "seal" / "c").glob("*/*/*")), 150)
         workers[0].kill()
         _, said = making.communicate(timeout=180)
         assert making.returncode == 0, said
@@ -456,6 +455,7 @@ def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pyte
     refused(done, "no dask scheduler", "tcp://127.0.0.1:9")
 
 
+@pytest.mark.thorough
 def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: Path, tmp_path: Path) -> None:
     """kill -9, whatever it is doing; then the same command again, until it gets through."""
     rng = np.random.default_rng(int(os.environ.get("MITSONAR_KILL_SEED", "1")))
@@ -614,6 +614,7 @@ def test_an_unfinished_data_set_is_not_read_by_accident(tmp_path: Path) -> None:
     assert make_dataset(recipe, url).made == store.shards - 1
 
 
+@pytest.mark.thorough
 def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> None:
     """A real file system of 120 kB; after making room, the same command goes on."""
     small = tmp_path / "small"
@@ -709,6 +710,7 @@ def objects_of(url: str) -> dict[str, bytes]:
     return {name: place.read(name) for name in place.sizes()}
 
 
+@pytest.mark.thorough
 def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> None:
     """Against a real S3 server: made, killed, gone on with, checked, read; the bytes are those of the folder."""
     url = f"{bucket}/data/tiny.zarr"
@@ -735,6 +737,18 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
     done = by_itself(*arguments)
     assert done.returncode == 0, done.stderr
     assert objects_of(url) == files_of(made)
+
+
+def test_object_storage_holds_the_bytes_of_a_folder(made: Path, bucket: str) -> None:
+    """Made there with one shard lost and made again; checked and read from there."""
+    url = f"{bucket}/data/tiny.zarr"
+    make_dataset(tiny_recipe(), url)
+    store = DataStore.open(url)
+    Storage(url).remove(store.key("image", 0))
+    assert [fault for fault in check(DataStore.open(url)) if store.key("image", 0) in fault]
+    assert make_dataset(tiny_recipe(), url).made == 1
+    assert objects_of(url) == files_of(made)
+    np.testing.assert_array_equal(store.read("image", slice(4, 9)), DataStore.open(made).read("image", slice(4, 9)))
 
 
 def test_objects_of_others_are_kept(bucket: str) -> None:

@@ -382,7 +382,11 @@ EVERYWHERE = [
 ]
 
 
-@pytest.mark.parametrize("moments", [[IN_TRAINING], pytest.param(EVERYWHERE, marks=pytest.mark.slow)], ids=["once", "again"])
+@pytest.mark.parametrize(
+    "moments",
+    [pytest.param([IN_TRAINING], marks=pytest.mark.thorough), pytest.param(EVERYWHERE, marks=pytest.mark.slow)],
+    ids=["once", "again"],
+)
 def test_killed_and_called_again_it_reaches_the_same_table(
     moments: list[tuple[str, int]], whole: Path, tmp_path: Path
 ) -> None:

@@ -331,6 +331,7 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
+@pytest.mark.thorough
 def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: Path) -> None:
     """Killed while it writes its state, and in the middle of its second epoch: weights, optimiser, log as if unbroken."""
     told = tmp_path / "mine.yaml"
