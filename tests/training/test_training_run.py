@@ -362,6 +362,7 @@ def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     assert made.metrics["none"]["pairs"] == 5
 
 
+@pytest.mark.thorough
 def test_validation_states_and_workers_do_not_touch_the_training(made: Path, whole: Path, tmp_path: Path) -> None:
     """Nor does the global state of torch: it is left as it was."""
     torch.manual_seed(7)
