@@ -11,8 +11,9 @@ demo: $(VENV)/.installed
 	@rm -rf out/demo
 	$(VENV)/bin/python -m mitsonar render sunken_ship --cartesian -o out/demo
 
-# threads of two workers on two cores wait for one another: one each
-PYTEST = OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2
+# Threads of two workers on two cores wait for one another: one each. A file's tests stay together, since they share what is
+# made; files begin in the order of tests/conftest.py, the longest first.
+PYTEST = OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.tested
 	$(PYTEST) -m "not slow and not thorough" tests $(PYTEST_FLAGS)

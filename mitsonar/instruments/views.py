@@ -51,6 +51,7 @@ class View(Protocol):
     name: str
     sonar: Sonar
     bearing_rad: NDArray[np.float64]
+
     @property
     def rays_a_beam(self) -> NDArray[np.int64] | None:
         """Rays that belong to each beam ``(beams,)``; None where that differs from ping to ping."""

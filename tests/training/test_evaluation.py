@@ -482,7 +482,10 @@ def test_data_that_do_not_fit_are_refused(
     refused(mitsonar("evaluate", run, made, "--part", "test"), "no test part")
     refused(mitsonar("evaluate", tmp_path, made), "holds no network.ckpt")
     vectors = tmp_path / "vectors.zarr"
-    make_dataset(tiny_recipe(store="vectors", flight={"pings": 2}, scenes=[{"sequences": 4}], **{**SIZE, "world__a_side": [3, 3]}), str(vectors))
+    make_dataset(
+        tiny_recipe(store="vectors", flight={"pings": 2}, scenes=[{"sequences": 4}], **{**SIZE, "world__a_side": [3, 3]}),
+        str(vectors),
+    )
     refused(mitsonar("evaluate", run, vectors), "holds vectors only")
     broken = tmp_path / "broken.zarr"
     shutil.copytree(made, broken)
