@@ -6,7 +6,9 @@ import importlib.util
 import os
 import sys
 import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers import Command, Done, tiny_recipe
@@ -78,6 +80,19 @@ def tiny_data(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     url = tmp_path_factory.mktemp("made") / "tiny.zarr"
     make_dataset(tiny_recipe(), str(url))
     return url
+
+
+@pytest.fixture(scope="module")
+def bare_curves() -> Iterator[Callable[..., Any]]:
+    """An empty figure in place of a training's curve, which takes half a second at each validation; gives the real one."""
+    from matplotlib.figure import Figure
+
+    from mitsonar.training import training_folder
+
+    real = training_folder.curve_figure
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_folder, "curve_figure", lambda *_: Figure(figsize=(1, 1)))
+        yield real
 
 
 @pytest.fixture

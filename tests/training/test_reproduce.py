@@ -34,7 +34,11 @@ from mitsonar.training.document_tables import (
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")
-pytestmark = [pytest.mark.learn, pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
+pytestmark = [
+    pytest.mark.learn,
+    pytest.mark.usefixtures("bare_curves"),
+    pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
+]
 
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.datasets.torch_pairs import Samples  # noqa: E402

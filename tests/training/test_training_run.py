@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.io.provenance import differences
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
-pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
+pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
 from mitsonar.cli.train_command import train as command  # noqa: E402
 from mitsonar.config.training_recipe import (  # noqa: E402
@@ -387,8 +388,11 @@ def test_the_network_kept_is_that_which_is_better_on_every_axis_alike() -> None:
     assert _score([told], np.zeros(3)) == pytest.approx(told.mean())
 
 
-def test_a_run_keeps_what_it_promises(made: Path, tmp_path: Path) -> None:
+def test_a_run_keeps_what_it_promises(
+    made: Path, tmp_path: Path, bare_curves: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The best network's errors, computed again from its file; the log; the picture; a network that has learnt."""
+    monkeypatch.setattr("mitsonar.training.training_folder.curve_figure", bare_curves)
     reports: list[Report] = []
     labels: dict[str, Any] = {"labels": "quantised", "noise": "none", "optimiser": {"rate": 3e-3}, "steps": 60}
     labels |= {"split": {"train": 0.8, "validation": 0.2}, "validate": {"every_steps": 20, "pairs": None, "noise": ["low"]}}
@@ -412,6 +416,7 @@ def test_a_run_keeps_what_it_promises(made: Path, tmp_path: Path) -> None:
     assert float(row["none sideways (mm)"]) == pytest.approx(rmse[0], rel=1e-4)
     assert float(row["low yaw (deg)"]) == pytest.approx(best.metrics["low"]["rmse"][2], rel=1e-4)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "curve.png").stat().st_size > 10_000
     assert best.recipe == told.plain()
     assert load_training_recipe(out / "recipe.yaml") == told
 
