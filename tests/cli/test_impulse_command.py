@@ -68,8 +68,8 @@ def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Pat
     process = subprocess.Popen(
         [*PROGRAM, *map(str, asked), "-o", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    for _ in range(600):
-        state = out / "run.json"
+    state, deadline = out / "run.json", time.monotonic() + 150
+    while time.monotonic() < deadline and process.poll() is None:
         if state.is_file() and 0 < json.loads(state.read_text())["frames_done"] < 400:
             break
         time.sleep(0.05)

@@ -315,7 +315,7 @@ def test_workers_of_a_data_loader_read_the_same(made: Path, start: str) -> None:
     """Forked too, as torch does unasked on Linux, after the store has been read in the parent."""
     pairs = SonarPairs(made, part="all", noise="high")
     alone = [pairs[index][0] for index in range(0, 24)]
-    loader = DataLoader(pairs, batch_size=8, num_workers=2, multiprocessing_context=start, timeout=60)
+    loader = DataLoader(pairs, batch_size=8, num_workers=2, multiprocessing_context=start, timeout=180)
     batches = [batch for batch, _ in itertools.islice(loader, 3)]
     torch.testing.assert_close(torch.cat(batches), torch.stack(alone), rtol=0, atol=0)
 
@@ -396,7 +396,7 @@ def test_what_cannot_be_rendered_in_training_is_refused() -> None:
     with pytest.raises(MitsonarError, match=r"at most flight\.pings, 5: got 6"):
         RenderedPairs(tiny_recipe(), seed=0, frames=6)
     forked = DataLoader(
-        RenderedPairs(tiny_recipe(), seed=0, gain=1.0), num_workers=1, multiprocessing_context="fork", timeout=60
+        RenderedPairs(tiny_recipe(), seed=0, gain=1.0), num_workers=1, multiprocessing_context="fork", timeout=180
     )
     with pytest.raises(MitsonarError, match="multiprocessing_context"):
         next(iter(forked))

@@ -328,7 +328,7 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
     script = told.with_suffix(".py")
     script.write_text(textwrap.dedent(KILLED))
     call = [sys.executable, str(script), str(told), str(data), str(out), when, "yes" if render else ""]
-    done = subprocess.run(call, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(call, capture_output=True, text=True, timeout=300)
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
