@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 import sys
@@ -32,6 +33,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker("e2e" if _is_end_to_end(item) else "unit")
     _skip_what_is_absent(items)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what all test files have imported out of garbage collections, of which each data set makes several."""
+    gc.collect()
+    gc.freeze()
 
 
 def _turn(item: pytest.Item) -> int:
