@@ -371,6 +371,7 @@ def test_shards_of_a_lost_worker_are_handed_out_again() -> None:
         queue.give_back(1)
 
 
+@pytest.mark.e2e
 def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     done = by_itself(*command(tmp_path, "--workers", 2))
     assert done.returncode == 0, done.stderr
@@ -378,6 +379,7 @@ def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
+@pytest.mark.e2e
 def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(made: Path, tmp_path: Path) -> None:
     """A scheduler by its address; one of its workers is killed while it renders, and nothing is lost."""
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "spawn"}
@@ -456,6 +458,7 @@ def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.thorough
+@pytest.mark.e2e
 def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: Path, tmp_path: Path) -> None:
     """kill -9, whatever it is doing; then the same command again, until it gets through."""
     rng = np.random.default_rng(int(os.environ.get("MITSONAR_KILL_SEED", "1")))
@@ -541,6 +544,7 @@ def test_wrong_labels_are_found(made: Path, tmp_path: Path) -> None:
         assert any(any(word in fault for word in words.split("|")) for fault in faults), faults
 
 
+@pytest.mark.e2e
 def test_a_second_writer_is_told_and_changes_nothing(made: Path, tmp_path: Path) -> None:
     url = tmp_path / "tiny.zarr"
     script = f"""
@@ -615,6 +619,7 @@ def test_an_unfinished_data_set_is_not_read_by_accident(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
+@pytest.mark.e2e
 def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> None:
     """A real file system of 120 kB; after making room, the same command goes on."""
     small = tmp_path / "small"
@@ -638,6 +643,7 @@ def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = f"""
 import os, sys
@@ -711,6 +717,7 @@ def objects_of(url: str) -> dict[str, bytes]:
 
 
 @pytest.mark.thorough
+@pytest.mark.e2e
 def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> None:
     """Against a real S3 server: made, killed, gone on with, checked, read; the bytes are those of the folder."""
     url = f"{bucket}/data/tiny.zarr"
@@ -759,6 +766,7 @@ def test_objects_of_others_are_kept(bucket: str) -> None:
     assert place.read("image/years.jpg") == b"years of work"
 
 
+@pytest.mark.e2e
 def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")

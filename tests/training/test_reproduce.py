@@ -320,6 +320,7 @@ def told(out: Path) -> dict[str, Any]:
     return {row["recipe"]: row for row in rows}
 
 
+@pytest.mark.e2e
 def test_a_table_from_nothing(whole: Path) -> None:
     rows = told(whole)
     assert set(rows) == set(ROWS)
@@ -391,6 +392,7 @@ EVERYWHERE = [
     [pytest.param([IN_TRAINING], marks=pytest.mark.thorough), pytest.param(EVERYWHERE, marks=pytest.mark.slow)],
     ids=["once", "again"],
 )
+@pytest.mark.e2e
 def test_killed_and_called_again_it_reaches_the_same_table(
     moments: list[tuple[str, int]], whole: Path, tmp_path: Path
 ) -> None:

@@ -333,6 +333,7 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
 
 
 @pytest.mark.thorough
+@pytest.mark.e2e
 def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: Path) -> None:
     """Killed while it writes its state, and in the middle of its second epoch: weights, optimiser, log as if unbroken."""
     told = tmp_path / "mine.yaml"
@@ -350,6 +351,7 @@ def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: P
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**TINY, "scenes": [{"count": 1, "sequences": 4}]}))
     told = tmp_path / "mine.yaml"
@@ -597,6 +599,7 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
     """Two processes on this CPU; a batch is one batch, however many share it."""
     told = tmp_path / "mine.yaml"
