@@ -285,7 +285,6 @@ class TestNetworks:
         with pytest.raises(MitsonarError, match="tells motions of 2 frames, not heights"):
             HeightNetwork(motions)
 
-    @pytest.mark.thorough
     def test_the_network_trained_nearest_to_the_height_answers(
         self, heights: Path, tmp_path: Path, mitsonar: Command
     ) -> None:
