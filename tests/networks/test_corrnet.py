@@ -206,7 +206,7 @@ def test_it_learns_after_it_was_asked() -> None:
     from mitsonar.networks.warp_grid import _from_nodes
 
     _from_nodes.cache_clear()
-    network, image, ground = create_network("corrnet", finer=1), seen_pair(Motion(0, 0, 0)), batch()
+    network, image, ground = create_network("corrnet", finer=1), seen_pair(np.array([0.01, 0.0, 0.0])), batch()
     with torch.inference_mode():
         network(image, ground)
     law.likelihood(network(image, ground), torch.zeros(1, 3)).backward()
