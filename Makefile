@@ -1,18 +1,29 @@
-# make demo: a picture of a sunken ship as a sonar sees it. make test: the test suite. Each makes .venv first.
+# make demo: a picture of a sunken ship as a sonar sees it. make test: the essence of every module, in minutes.
+# make test-all: all tests but the slow ones, and the notebooks. Each makes .venv first.
 PYTHON ?= python3
 VENV ?= .venv
 PIP = $(VENV)/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt
 SOURCES = pyproject.toml constraints.txt
 
-.PHONY: demo test lint bench bench-quick clean system
+.PHONY: demo test test-all coverage lint bench bench-quick clean system
 
 demo: $(VENV)/.installed
 	@rm -rf out/demo
 	$(VENV)/bin/python -m mitsonar render sunken_ship --cartesian -o out/demo
 
-# threads of two workers on two cores wait for one another: one each
+# Threads of two workers on two cores wait for one another: one each. A file's tests stay together, since they share what is
+# made; files begin in the order of tests/conftest.py, the longest first.
+PYTEST = OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
 test: $(VENV)/.tested
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -m "not slow" -n 2 --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
+	$(PYTEST) -m "not slow and not thorough" tests $(PYTEST_FLAGS)
+
+test-all: $(VENV)/.tested
+	$(PYTEST) -m "not slow" --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
+
+# how much of mitsonar the essence enters: a table of what it leaves out
+coverage: $(VENV)/.tested
+	$(PYTEST) -m "not slow and not thorough" --cov --cov-report=term tests $(PYTEST_FLAGS)
 
 lint: $(VENV)/.tested
 	$(VENV)/bin/ruff check .

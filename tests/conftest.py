@@ -2,22 +2,57 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 import sys
 import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from helpers import Command, Done
+from helpers import Command, Done, tiny_recipe
 
-LONGEST = ("test_readme.py", "04_networks.ipynb", "03_odometry.ipynb", "02_dataset.ipynb")
-"""Run first: begun last, one of them would keep one core busy while the other waits."""
+LONGEST = (
+    "test_readme.py",
+    "04_networks.ipynb",
+    "03_odometry.ipynb",
+    "02_dataset.ipynb",
+    "test_generation.py",
+    "test_reproduce.py",
+    "test_training_run.py",
+    "test_evaluation.py",
+)
+"""Files in the order in which they begin: begun last, one of them would keep one core busy while the other waits."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what this machine lacks and say so; with MITSONAR_REQUIRE_LEARN=1 an absent torch fails the tests instead."""
-    items.sort(key=lambda item: not item.nodeid.split("::")[0].endswith(LONGEST))
+    """Begin with the longest files, mark what goes through the command line, skip what this machine lacks."""
+    items.sort(key=_turn)
+    for item in items:
+        item.add_marker("e2e" if _is_end_to_end(item) else "unit")
+    _skip_what_is_absent(items)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what all test files have imported out of garbage collections, of which each data set makes several."""
+    gc.collect()
+    gc.freeze()
+
+
+def _turn(item: pytest.Item) -> int:
+    name = item.path.name
+    return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+
+def _is_end_to_end(item: pytest.Item) -> bool:
+    by_hand = item.get_closest_marker("e2e") is not None
+    return by_hand or item.path.parent.name == "cli" or "mitsonar" in getattr(item, "fixturenames", ())
+
+
+def _skip_what_is_absent(items: list[pytest.Item]) -> None:
+    """Skip and say so; with MITSONAR_REQUIRE_LEARN=1 an absent torch fails the tests instead."""
     skips = []
     if importlib.util.find_spec("torch") is None and os.environ.get("MITSONAR_REQUIRE_LEARN") != "1":
         reason = "torch is not installed: install mitsonar[learn]; MITSONAR_REQUIRE_LEARN=1 makes this a failure"
@@ -42,6 +77,29 @@ def variant() -> str:
     from mitsonar.simulation.variant import ensure_variant
 
     return ensure_variant()
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
+    """The data set of the tiny recipe, made once for all modules of a worker: to read, and to copy before any harm."""
+    from mitsonar.datasets.generation import make_dataset
+
+    url = tmp_path_factory.mktemp("made") / "tiny.zarr"
+    make_dataset(tiny_recipe(), str(url))
+    return url
+
+
+@pytest.fixture(scope="module")
+def bare_curves() -> Iterator[Callable[..., Any]]:
+    """An empty figure in place of a training's curve, which takes half a second at each validation; gives the real one."""
+    from matplotlib.figure import Figure
+
+    from mitsonar.training import training_folder
+
+    real = training_folder.curve_figure
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_folder, "curve_figure", lambda *_: Figure(figsize=(1, 1)))
+        yield real
 
 
 @pytest.fixture

@@ -197,7 +197,7 @@ def run_python(script: str, *, block: tuple[str, ...] = (), **environment: str) 
     """What a fresh interpreter, in which ``block`` cannot be imported, prints for a script; its failure is the test's."""
     script = BLOCK.format(names=block) + textwrap.dedent(script)
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, **environment}, timeout=120
+        [sys.executable, "-c", script], capture_output=True, text=True, env={**os.environ, **environment}, timeout=300
     )
     assert done.returncode == 0, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done.stdout

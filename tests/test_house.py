@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers import run_python
+from helpers import Command, run_python
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -301,3 +301,16 @@ def test_package_data_names_every_shipped_file() -> None:
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.recipes"] for path in training.glob(pattern)}
     assert {path for path in training.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")} == named
     assert (ROOT / "mitsonar" / "py.typed").is_file()
+
+
+# ---------------------------------------------------------------- markers
+
+
+def test_what_uses_the_command_line_is_e2e(request: pytest.FixtureRequest, mitsonar: Command) -> None:
+    assert request.node.get_closest_marker("e2e")
+    assert not request.node.get_closest_marker("unit")
+
+
+def test_what_does_not_is_unit(request: pytest.FixtureRequest) -> None:
+    assert request.node.get_closest_marker("unit")
+    assert not request.node.get_closest_marker("e2e")

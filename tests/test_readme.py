@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from helpers import Command
 
 ROOT = Path(__file__).parent.parent
@@ -36,6 +37,7 @@ def run(command: list[str], folder: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.thorough
 def test_commands_and_python_blocks_run_in_order(tmp_path: Path, mitsonar: Command) -> None:
     """In a folder that holds the scenes, as a checkout does; blocks may use what commands have made. Commands share a
     process, which saves twenty starts."""

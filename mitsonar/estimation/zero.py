@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
+from collections.abc import Callable
+from typing import Any
 
-from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.channel.pings import pings_of
+from mitsonar.estimation.estimator import Estimate, two_frames
 from mitsonar.motion.pose import Motion
+from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Zero"]
+
+CHECKS: dict[type, Callable[[Any], object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
+"""What other estimators refuse, this one refuses."""
 
 
 class Zero:
@@ -18,12 +24,11 @@ class Zero:
     inputs = "nothing"
     digest = ""
 
-    def estimate(self, records: Sized, /) -> Estimate:
+    def estimate(self, records: Any, /) -> Estimate:
         """Answer no motion.
 
         Raises:
-            MitsonarError: fewer than two records.
+            MitsonarError: records that no other estimator takes.
         """
-        if len(records) < 2:
-            raise MitsonarError(f"an estimator takes two frames, or two pings or more: got {len(records)}")
+        CHECKS.get(type(records), len)(records)
         return Estimate(Motion(0.0, 0.0, 0.0))

@@ -7,6 +7,7 @@ its elevation across (negative to starboard): a mount of pitch 90 and heading -9
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -45,13 +46,15 @@ class View(Protocol):
         name: of the view.
         sonar: whose range bins, model and gain law the image has.
         bearing_rad: axes of its beams ``(beams,)`` [rad].
-        rays_a_beam: rays that belong to each beam ``(beams,)``; None where that differs from ping to ping.
     """
 
     name: str
     sonar: Sonar
     bearing_rad: NDArray[np.float64]
-    rays_a_beam: NDArray[np.int64] | None
+
+    @property
+    def rays_a_beam(self) -> NDArray[np.int64] | None:
+        """Rays that belong to each beam ``(beams,)``; None where that differs from ping to ping."""
 
 
 class Whole:
@@ -88,14 +91,19 @@ class Segment:
         self.fore, self.up = SEGMENTS[name]
         self.first_beam = sonar.beams // 2 if self.fore == 1 else 0
         beams = slice(self.first_beam, self.first_beam + sonar.beams // (1 if self.fore is None else 2))
-        member = self._member()
-        counts = member.reshape(sonar.rays_per_beam, sonar.beams, sonar.across).sum(axis=(0, 2))
+        self.beams = beams
         self.bearing_rad = sonar.bearing_rad[beams]
-        self.rays_a_beam: NDArray[np.int64] | None = counts[beams].astype(np.int64)
-        self.member = member
 
-    def _member(self) -> NDArray[np.bool_]:
-        """Which pixels of the film belong to it ``(rays_per_beam * columns,)``."""
+    @cached_property
+    def rays_a_beam(self) -> NDArray[np.int64] | None:
+        """How many rays of each beam belong to it ``(beams,)``."""
+        sonar = self.sonar
+        counts = self.member.reshape(sonar.rays_per_beam, sonar.beams, sonar.across).sum(axis=(0, 2))
+        return counts[self.beams].astype(np.int64)
+
+    @cached_property
+    def member(self) -> NDArray[np.bool_]:
+        """Which pixels of the film belong to it ``(rays_per_beam * columns,)``; no recipe asks."""
         sonar = self.sonar
         beam = np.repeat(np.arange(sonar.beams), sonar.across)[None, :]
         row = np.arange(sonar.rays_per_beam)[:, None]

@@ -112,6 +112,7 @@ def _borders(shape: tuple[int, ...], unit: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @lru_cache(maxsize=64)
+@torch.inference_mode(False)  # kept for a training, too, where an evaluation asks first
 def _from_nodes(nodes: int, length: int, every: int, count: int, device: torch.device) -> Tensor:
     """Weights ``(count, nodes)`` of nodes, evenly from the first of ``length`` to the last, at the middles of cells."""
     middle = torch.arange(count, dtype=torch.float64) * every + (every - 1) / 2

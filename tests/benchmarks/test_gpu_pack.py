@@ -72,7 +72,7 @@ def test_versions_are_those_of_the_constraints_or_stated() -> None:
 def test_the_list_holds_all_that_rendering_and_training_need() -> None:
     pytest.importorskip("lightning")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    extras = [one for name in ("data", "odometry", "meshes", "learn", "cuda") for one in project["optional-dependencies"][name]]
+    extras = [one for name in ("data", "odometry", "learn", "cuda") for one in project["optional-dependencies"][name]]
     wanted = [Requirement(one).name for one in project["dependencies"] + extras]
     here = [name for name in wanted if name not in ("cufinufft", "mitsonar")]
     missing = set(needs(here)) - set(needs(list(GIVEN))) - set(listed())

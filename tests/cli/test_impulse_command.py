@@ -59,6 +59,7 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
     refused(mitsonar("impulse", scene, "--frames", 20, "-o", out, "--resume"), "was begun with", "poses_sha256", "velocity")
 
 
+@pytest.mark.thorough
 def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     asked = ["impulse", scene, "--velocity", "1,-0.5,3", "--frames", 400]
     whole = mitsonar(*asked, "-o", tmp_path / "whole")
@@ -67,8 +68,8 @@ def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Pat
     process = subprocess.Popen(
         [*PROGRAM, *map(str, asked), "-o", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    for _ in range(600):
-        state = out / "run.json"
+    state, deadline = out / "run.json", time.monotonic() + 150
+    while time.monotonic() < deadline and process.poll() is None:
         if state.is_file() and 0 < json.loads(state.read_text())["frames_done"] < 400:
             break
         time.sleep(0.05)

@@ -180,6 +180,7 @@ def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_p
 SAME = ("estimated.tum", "true.tum", "motions.csv", "covariances.npz", "table.md", "table.json", "estimates.jsonl")
 
 
+@pytest.mark.thorough
 def test_a_killed_odometry_resumes_to_the_same_files_with_any_workers(mitsonar: Command, tmp_path: Path) -> None:
     over_ground(sway(120)).save(tmp_path / "frames.npz")
     assert mitsonar("odometry", tmp_path, "-o", tmp_path / "whole", "--workers", 1).returncode == 0

@@ -207,6 +207,7 @@ def test_a_seed_changes_the_jitter_and_a_parameter_the_scene(mitsonar: Command, 
     assert not np.array_equal(images[0], images[2])
 
 
+@pytest.mark.thorough
 def test_a_killed_run_leaves_whole_frames_and_resumes_to_the_same_bits(
     mitsonar: Command, scene: Path, tmp_path: Path
 ) -> None:
@@ -295,6 +296,7 @@ def test_shipped_scenes_render_and_have_a_trajectory_to_fly(name: str) -> None:
     assert (lit < 0.98).all(), lit
 
 
+@pytest.mark.thorough
 def test_texture_parameter_of_the_pattern() -> None:
     images = []
     for texture in ("gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock"):

@@ -40,11 +40,9 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tiny_data: Path) -> Path:
     """The tiny data set, made in one go."""
-    url = tmp_path_factory.mktemp("made") / "tiny.zarr"
-    make_dataset(tiny_recipe(), str(url))
-    return url
+    return tiny_data
 
 
 def copy_of(made: Path, folder: Path) -> Path:
@@ -373,12 +371,15 @@ def test_shards_of_a_lost_worker_are_handed_out_again() -> None:
         queue.give_back(1)
 
 
+@pytest.mark.e2e
 def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     done = by_itself(*command(tmp_path, "--workers", 2))
     assert done.returncode == 0, done.stderr
     assert files_of(tmp_path / "tiny.zarr") == files_of(made)
 
 
+@pytest.mark.thorough
+@pytest.mark.e2e
 def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(made: Path, tmp_path: Path) -> None:
     """A scheduler by its address; one of its workers is killed while it renders, and nothing is lost."""
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "spawn"}
@@ -390,7 +391,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
     )
     workers: list[subprocess.Popen[bytes]] = []
     try:
-        address = _written(place, 30)["address"]
+        address = _written(place, 90)["address"]
         worker = [
             sys.executable,
             "-m",
@@ -405,7 +406,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
         making = subprocess.Popen(
             [*PROGRAM, *command(tmp_path, "--scheduler", address)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
-        _wait(lambda: any((tmp_path / "tiny.zarr" / "seal" / "c").glob("*/*/*")), 90)
+        _wait(lambda: any((tmp_path / "tiny.zarr" / "seal" / "c").glob("*/*/*")), 150)
         workers[0].kill()
         _, said = making.communicate(timeout=180)
         assert making.returncode == 0, said
@@ -456,6 +457,8 @@ def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pyte
     refused(done, "no dask scheduler", "tcp://127.0.0.1:9")
 
 
+@pytest.mark.thorough
+@pytest.mark.e2e
 def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: Path, tmp_path: Path) -> None:
     """kill -9, whatever it is doing; then the same command again, until it gets through."""
     rng = np.random.default_rng(int(os.environ.get("MITSONAR_KILL_SEED", "1")))
@@ -541,6 +544,7 @@ def test_wrong_labels_are_found(made: Path, tmp_path: Path) -> None:
         assert any(any(word in fault for word in words.split("|")) for fault in faults), faults
 
 
+@pytest.mark.e2e
 def test_a_second_writer_is_told_and_changes_nothing(made: Path, tmp_path: Path) -> None:
     url = tmp_path / "tiny.zarr"
     script = f"""
@@ -614,6 +618,8 @@ def test_an_unfinished_data_set_is_not_read_by_accident(tmp_path: Path) -> None:
     assert make_dataset(recipe, url).made == store.shards - 1
 
 
+@pytest.mark.thorough
+@pytest.mark.e2e
 def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> None:
     """A real file system of 120 kB; after making room, the same command goes on."""
     small = tmp_path / "small"
@@ -637,6 +643,7 @@ def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = f"""
 import os, sys
@@ -709,6 +716,8 @@ def objects_of(url: str) -> dict[str, bytes]:
     return {name: place.read(name) for name in place.sizes()}
 
 
+@pytest.mark.thorough
+@pytest.mark.e2e
 def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> None:
     """Against a real S3 server: made, killed, gone on with, checked, read; the bytes are those of the folder."""
     url = f"{bucket}/data/tiny.zarr"
@@ -737,6 +746,20 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
     assert objects_of(url) == files_of(made)
 
 
+def test_object_storage_holds_the_bytes_of_a_folder(made: Path, bucket: str) -> None:
+    """Made there; a shard that is cut short is found and made again; read from there."""
+    url = f"{bucket}/data/tiny.zarr"
+    make_dataset(tiny_recipe(), url)
+    store, place = DataStore.open(url), Storage(url)
+    damaged = store.key("image", 0)
+    place.write(damaged, place.read(damaged)[:100])
+    place.fs.invalidate_cache()
+    assert [fault for fault in check(store) if damaged in fault]
+    assert make_dataset(tiny_recipe(), url).made == 1
+    assert objects_of(url) == files_of(made)
+    np.testing.assert_array_equal(store.read("image", slice(4, 9)), DataStore.open(made).read("image", slice(4, 9)))
+
+
 def test_objects_of_others_are_kept(bucket: str) -> None:
     place = Storage(f"{bucket}/mine")
     place.write("image/years.jpg", b"years of work")
@@ -745,6 +768,7 @@ def test_objects_of_others_are_kept(bucket: str) -> None:
     assert place.read("image/years.jpg") == b"years of work"
 
 
+@pytest.mark.e2e
 def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")

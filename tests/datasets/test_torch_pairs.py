@@ -31,11 +31,9 @@ HIGH = NOISE_MODELS["high"]
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tiny_data: Path) -> Path:
     """Three scenes of ten sequences of five pings."""
-    url = tmp_path_factory.mktemp("made") / "tiny.zarr"
-    make_dataset(tiny_recipe(), str(url))
-    return url
+    return tiny_data
 
 
 @pytest.fixture(scope="module")
@@ -312,12 +310,12 @@ def test_the_order_of_an_epoch_is_a_function_of_seed_and_epoch(made: Path) -> No
     assert sum(len(label) for _, label in pairs.loader(16, drop_last=True)) == 112
 
 
-@pytest.mark.parametrize("start", ["fork", "spawn"])
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.thorough)])
 def test_workers_of_a_data_loader_read_the_same(made: Path, start: str) -> None:
     """Forked too, as torch does unasked on Linux, after the store has been read in the parent."""
     pairs = SonarPairs(made, part="all", noise="high")
     alone = [pairs[index][0] for index in range(0, 24)]
-    loader = DataLoader(pairs, batch_size=8, num_workers=2, multiprocessing_context=start, timeout=60)
+    loader = DataLoader(pairs, batch_size=8, num_workers=2, multiprocessing_context=start, timeout=180)
     batches = [batch for batch, _ in itertools.islice(loader, 3)]
     torch.testing.assert_close(torch.cat(batches), torch.stack(alone), rtol=0, atol=0)
 
@@ -380,6 +378,7 @@ def test_rendered_vectors_heights_and_epochs(variant: str) -> None:
     assert not {float(label) for _, label in pairs} & {float(label) for _, label in first}
 
 
+@pytest.mark.thorough
 def test_workers_render_worlds_of_their_own() -> None:
     """Two spawned workers share the epoch's length, and no sample is made twice."""
     pairs = RenderedPairs(tiny_recipe(), seed=2, length=30, sequences_a_world=3, buffer=5, gain=0.02)
@@ -397,7 +396,7 @@ def test_what_cannot_be_rendered_in_training_is_refused() -> None:
     with pytest.raises(MitsonarError, match=r"at most flight\.pings, 5: got 6"):
         RenderedPairs(tiny_recipe(), seed=0, frames=6)
     forked = DataLoader(
-        RenderedPairs(tiny_recipe(), seed=0, gain=1.0), num_workers=1, multiprocessing_context="fork", timeout=60
+        RenderedPairs(tiny_recipe(), seed=0, gain=1.0), num_workers=1, multiprocessing_context="fork", timeout=180
     )
     with pytest.raises(MitsonarError, match="multiprocessing_context"):
         next(iter(forked))

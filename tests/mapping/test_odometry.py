@@ -144,6 +144,7 @@ def test_workers_change_no_bit() -> None:
     assert [e.reason for e in one.estimates] == [e.reason for e in two.estimates]
 
 
+@pytest.mark.thorough
 def test_a_worker_that_is_lost_is_said_to_be() -> None:
     had = os.environ.get("OMP_NUM_THREADS")
     with pytest.raises(MitsonarError, match="worker was lost"):
@@ -513,7 +514,7 @@ def killed_at(number: int) -> Callable[[int], None]:
     return progress
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.thorough)])
 @pytest.mark.usefixtures("no_picture")
 def test_a_killed_odometry_goes_on_to_the_same_files(tmp_path: Path, workers: int) -> None:
     path = sway(40)

@@ -201,6 +201,17 @@ def test_it_learns() -> None:
     assert losses[-1] < losses[0] - 2, losses
 
 
+def test_it_learns_after_it_was_asked() -> None:
+    """In one process: what an evaluation leaves behind for sizes of its own serves a training."""
+    from mitsonar.networks.warp_grid import _from_nodes
+
+    _from_nodes.cache_clear()
+    network, image, ground = create_network("corrnet", finer=1), seen_pair(np.array([0.01, 0.0, 0.0])), batch()
+    with torch.inference_mode():
+        network(image, ground)
+    law.likelihood(network(image, ground), torch.zeros(1, 3)).backward()
+
+
 def test_it_stays_below_a_million_parameters() -> None:
     assert sum(weight.numel() for weight in create_network("corrnet").parameters()) < 1_000_000
 

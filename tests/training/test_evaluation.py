@@ -414,13 +414,13 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Small data sets of other kinds: three frames at several heights with vectors, two sensors, another sonar."""
     folder = tmp_path_factory.mktemp("many")
     two = [{"name": name, "starboard_m": side, "sonar": {"beams": 12}} for name, side in (("left", -0.5), ("right", 0.5))]
-    recipes = {
-        "high": tiny_recipe(flight={"pings": 4, "height_m": [2.2, 3.0]}, store="both"),
-        "two": tiny_recipe(receivers=two, flight={"pings": 2}, sonar__beams=96, sonar__jitter=True),
-        "other": tiny_recipe(sonar__beams=16, sonar__range_max=6.0, flight={"pings": 2}, mount={"pitch_deg": 30.0}),
+    recipes: dict[str, dict[str, Any]] = {
+        "high": {"flight": {"pings": 4, "height_m": [2.2, 3.0]}, "store": "both"},
+        "two": {"receivers": two, "flight": {"pings": 2}, "sonar__beams": 96, "sonar__jitter": True},
+        "other": {"sonar__beams": 16, "sonar__range_max": 6.0, "flight": {"pings": 2}, "mount": {"pitch_deg": 30.0}},
     }
-    for name, recipe in recipes.items():
-        make_dataset(recipe, str(folder / f"{name}.zarr"))
+    for name, words in recipes.items():
+        make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 6}], **words), str(folder / f"{name}.zarr"))
     return {name: folder / f"{name}.zarr" for name in recipes}
 
 
@@ -482,7 +482,10 @@ def test_data_that_do_not_fit_are_refused(
     refused(mitsonar("evaluate", run, made, "--part", "test"), "no test part")
     refused(mitsonar("evaluate", tmp_path, made), "holds no network.ckpt")
     vectors = tmp_path / "vectors.zarr"
-    make_dataset(tiny_recipe(store="vectors", flight={"pings": 2}, **SIZE), str(vectors))
+    make_dataset(
+        tiny_recipe(store="vectors", flight={"pings": 2}, scenes=[{"sequences": 4}], **{**SIZE, "world__a_side": [3, 3]}),
+        str(vectors),
+    )
     refused(mitsonar("evaluate", run, vectors), "holds vectors only")
     broken = tmp_path / "broken.zarr"
     shutil.copytree(made, broken)
@@ -529,6 +532,7 @@ def agrees(content: bytes, checkpoint: Checkpoint, batch: int) -> dict[str, str]
     return about
 
 
+@pytest.mark.thorough
 def test_onnx_says_the_same() -> None:
     checkpoint = trained_like("cnn4b")
     about = agrees(onnx_of(checkpoint, 2), checkpoint, 2)

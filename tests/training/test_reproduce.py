@@ -34,7 +34,11 @@ from mitsonar.training.document_tables import (
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")
-pytestmark = [pytest.mark.learn, pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
+pytestmark = [
+    pytest.mark.learn,
+    pytest.mark.usefixtures("bare_curves"),
+    pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
+]
 
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.datasets.torch_pairs import Samples  # noqa: E402
@@ -316,6 +320,7 @@ def told(out: Path) -> dict[str, Any]:
     return {row["recipe"]: row for row in rows}
 
 
+@pytest.mark.e2e
 def test_a_table_from_nothing(whole: Path) -> None:
     rows = told(whole)
     assert set(rows) == set(ROWS)
@@ -382,7 +387,12 @@ EVERYWHERE = [
 ]
 
 
-@pytest.mark.parametrize("moments", [[IN_TRAINING], pytest.param(EVERYWHERE, marks=pytest.mark.slow)], ids=["once", "again"])
+@pytest.mark.parametrize(
+    "moments",
+    [pytest.param([IN_TRAINING], marks=pytest.mark.thorough), pytest.param(EVERYWHERE, marks=pytest.mark.slow)],
+    ids=["once", "again"],
+)
+@pytest.mark.e2e
 def test_killed_and_called_again_it_reaches_the_same_table(
     moments: list[tuple[str, int]], whole: Path, tmp_path: Path
 ) -> None:

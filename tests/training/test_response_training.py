@@ -14,7 +14,7 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
-pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
+pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
 from mitsonar.config.training_recipe import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.config.training_recipe import training_recipe_from as recipe_of  # noqa: E402

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.io.provenance import differences
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
-pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]
+pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
 from mitsonar.cli.train_command import train as command  # noqa: E402
 from mitsonar.config.training_recipe import (  # noqa: E402
@@ -327,10 +328,12 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
     script = told.with_suffix(".py")
     script.write_text(textwrap.dedent(KILLED))
     call = [sys.executable, str(script), str(told), str(data), str(out), when, "yes" if render else ""]
-    done = subprocess.run(call, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(call, capture_output=True, text=True, timeout=300)
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
+@pytest.mark.thorough
+@pytest.mark.e2e
 def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: Path) -> None:
     """Killed while it writes its state, and in the middle of its second epoch: weights, optimiser, log as if unbroken."""
     told = tmp_path / "mine.yaml"
@@ -348,6 +351,7 @@ def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: P
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump({**TINY, "scenes": [{"count": 1, "sequences": 4}]}))
     told = tmp_path / "mine.yaml"
@@ -361,6 +365,7 @@ def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     assert made.metrics["none"]["pairs"] == 5
 
 
+@pytest.mark.thorough
 def test_validation_states_and_workers_do_not_touch_the_training(made: Path, whole: Path, tmp_path: Path) -> None:
     """Nor does the global state of torch: it is left as it was."""
     torch.manual_seed(7)
@@ -385,8 +390,11 @@ def test_the_network_kept_is_that_which_is_better_on_every_axis_alike() -> None:
     assert _score([told], np.zeros(3)) == pytest.approx(told.mean())
 
 
-def test_a_run_keeps_what_it_promises(made: Path, tmp_path: Path) -> None:
+def test_a_run_keeps_what_it_promises(
+    made: Path, tmp_path: Path, bare_curves: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The best network's errors, computed again from its file; the log; the picture; a network that has learnt."""
+    monkeypatch.setattr("mitsonar.training.training_folder.curve_figure", bare_curves)
     reports: list[Report] = []
     labels: dict[str, Any] = {"labels": "quantised", "noise": "none", "optimiser": {"rate": 3e-3}, "steps": 60}
     labels |= {"split": {"train": 0.8, "validation": 0.2}, "validate": {"every_steps": 20, "pairs": None, "noise": ["low"]}}
@@ -410,6 +418,7 @@ def test_a_run_keeps_what_it_promises(made: Path, tmp_path: Path) -> None:
     assert float(row["none sideways (mm)"]) == pytest.approx(rmse[0], rel=1e-4)
     assert float(row["low yaw (deg)"]) == pytest.approx(best.metrics["low"]["rmse"][2], rel=1e-4)
     assert (out / "curve.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "curve.png").stat().st_size > 10_000
     assert best.recipe == told.plain()
     assert load_training_recipe(out / "recipe.yaml") == told
 
@@ -590,6 +599,7 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_two_devices_share_a_training(made: Path, tmp_path: Path) -> None:
     """Two processes on this CPU; a batch is one batch, however many share it."""
     told = tmp_path / "mine.yaml"

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from helpers import files_of, place_of
+from helpers import Command, files_of, place_of
 from PIL import Image
 from scipy import stats
 
@@ -272,7 +270,7 @@ def test_the_pattern_is_the_shipped_scene() -> None:
 @pytest.mark.parametrize("name", sorted(FAMILIES))
 def test_worlds_render_and_tell_their_objects(name: str, tmp_path: Path) -> None:
     """The scene loads as it is, from the sonar that stands in it; labels name shapes and objects of the file."""
-    world = create_family(name, **({"size_m": 20.0} if name == "rocky-field" else {})).build(4)
+    world = create_family(name, **({"size_m": 20.0, "a_side": (20, 30)} if name == "rocky-field" else {})).build(4)
     scene = load_scene(world.write(tmp_path / "world"))
     found = sonar_in(scene)
     assert found is not None
@@ -480,12 +478,11 @@ def test_colour_factors_of_gltf_are_linear(
     np.testing.assert_allclose(mesh.reflectivity, wanted, atol=1e-6)
 
 
-def test_a_model_in_the_wrong_unit_is_warned_of(tmp_path: Path) -> None:
+def test_a_model_in_the_wrong_unit_is_warned_of(mitsonar: Command, tmp_path: Path) -> None:
     trimesh.creation.box((1000, 2000, 500)).export(tmp_path / "box.stl")
     assert mesh_world(tmp_path / "box.stl").size_m == pytest.approx(2000)
     for scale, warned in ((1, True), (0.001, False)):
-        command = [sys.executable, "-m", "mitsonar", "world", "mesh", str(tmp_path / "box.stl"), "--scale", str(scale)]
-        done = subprocess.run([*command, "-o", str(tmp_path / str(scale))], capture_output=True, text=True, timeout=120)
+        done = mitsonar("world", "mesh", tmp_path / "box.stl", "--scale", scale, "-o", tmp_path / str(scale))
         assert done.returncode == 0, done.stderr
         assert ("0.001 for millimetres" in done.stderr) == warned
 

@@ -549,7 +549,7 @@ def test_the_command_reads_data_sets(tmp_path: Path) -> None:
     from mitsonar.datasets.store import DataStore
 
     url = tmp_path / "tiny.zarr"
-    make_dataset(tiny_recipe(sonar__model="physical", sonar__beams=24, world__a_side=[20, 20]), str(url), sequences=3)
+    make_dataset(tiny_recipe(sonar__model="physical", sonar__beams=24, world__a_side=[12, 12]), str(url), sequences=3)
     code, text = command(url, "--pairs", 3, "--part", "all", "--noise", "low", "--json")
     assert code == 0, text
     rows = json.loads(text[text.index("{") : text.rindex("}") + 1])["rows"]

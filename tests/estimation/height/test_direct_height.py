@@ -229,6 +229,7 @@ def test_portions_as_images_know_their_rays(tmp_path: Path, mitsonar: Command) -
     refused(mitsonar("odometry", url, "--view", "whole", *words), "give one of them")
 
 
+@pytest.mark.usefixtures("bare_curves")
 class TestNetworks:
     """Networks that tell heights, and those that a height chooses."""
 

@@ -24,7 +24,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: install mit
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")
 pytestmark = [
     pytest.mark.learn,
-    pytest.mark.usefixtures("variant"),
+    pytest.mark.usefixtures("variant", "bare_curves"),
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
