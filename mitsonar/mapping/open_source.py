@@ -67,10 +67,10 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
         return _responses_for(where, reading)
     if wanted is ViewFrames:
         return _with_heights(_views_of(where, estimator, reading), reading)
-    source = frames_for(where, reading)
-    _check_consumed(where, there, wanted)
     if reading.height_m is not None and reading.height_by is not None:
         raise MitsonarError("--height gives the height and --height-by measures it: give one of them")
+    source = frames_for(where, reading)
+    _check_consumed(where, there, wanted)
     return _with_heights(source, reading)
 
 

@@ -432,7 +432,7 @@ def wrong(change: str) -> SonarFrames:
     ("change", "options", "message"),
     [
         ("no poses", {}, "no poses"),
-        ("no height", {}, "no height_m"),
+        ("no height", {}, "do not tell their height"),
         ("nan", {}, "finite"),
         ("unsorted", {}, "rise"),
         ("below", {}, "above 0"),
