@@ -5,7 +5,7 @@ VENV ?= .venv
 PIP = $(VENV)/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt
 SOURCES = pyproject.toml constraints.txt
 
-.PHONY: demo test test-all coverage lint bench bench-quick clean system
+.PHONY: demo test test-all docs coverage lint bench bench-quick clean system
 
 demo: $(VENV)/.installed
 	@rm -rf out/demo
@@ -16,14 +16,20 @@ demo: $(VENV)/.installed
 PYTEST = OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.tested
-	$(PYTEST) -m "not slow and not thorough" tests $(PYTEST_FLAGS)
+	$(PYTEST) -m "not slow and not thorough and not docs" tests $(PYTEST_FLAGS)
 
 test-all: $(VENV)/.tested
-	$(PYTEST) -m "not slow" --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
+	$(PYTEST) -m "not slow and not docs" --nbmake tests benchmarks/notebooks $(PYTEST_FLAGS)
 
 # how much of mitsonar the essence enters: a table of what it leaves out
 coverage: $(VENV)/.tested
-	$(PYTEST) -m "not slow and not thorough" --cov --cov-report=term tests $(PYTEST_FLAGS)
+	$(PYTEST) -m "not slow and not thorough and not docs" --cov --cov-report=term tests $(PYTEST_FLAGS)
+
+# the reference follows from the code, the rest is built without network
+docs: $(VENV)/.installed
+	$(PIP) -e '.[docs]'
+	$(VENV)/bin/python docs/make_reference.py
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
 
 lint: $(VENV)/.tested
 	$(VENV)/bin/ruff check .

@@ -57,7 +57,7 @@ def application() -> typer.Typer:
     app.command()(presets_command.scenes)
     app.command()(doctor_command.doctor)
     app.command()(compare_command.compare)
-    app.command()(crlb_command.limit)
+    app.command()(crlb_command.crlb)
     app.command()(height_command.height)
     app.command()(odometry_command.odometry)
     app.command()(mosaic_command.mosaic)

@@ -45,7 +45,7 @@ INSTRUMENT = {"model": "--model", "seed": "--seed"}
 
 OPTIONS: dict[str, dict[str, str]] = {
     "render": INSTRUMENT,
-    "limit": INSTRUMENT,
+    "crlb": INSTRUMENT,
     "impulse": {**INSTRUMENT, "velocity": "--velocity"},
     "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},
     "odometry": {**STANDS, "every": "--every"},

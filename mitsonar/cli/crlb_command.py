@@ -1,4 +1,4 @@
-"""``mitsonar limit``: how well a motion can be known at all, of a scene, sonar and noise, or of a data set."""
+"""``mitsonar crlb``: how well a motion can be known at all, of a scene, sonar and noise, or of a data set."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from mitsonar.estimation.crlb.crlb_report import Table, Value
     from mitsonar.estimation.crlb.crlb_subject import Subject
 
-__all__ = ["limit"]
+__all__ = ["crlb"]
 
 
 @answered
-def limit(
+def crlb(
     source: Annotated[
         str, typer.Argument(metavar="SCENE|DATA.zarr", help="Mitsuba XML file, a shipped scene's name, or a data set.")
     ],

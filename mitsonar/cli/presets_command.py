@@ -38,7 +38,7 @@ def presets(
         say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
     for line in _accuracy(list(PRESETS)):
         say(line)
-    say("`mitsonar presets NAME` prints where each number comes from; docs/sonar.md tells how to write your own.")
+    say("`mitsonar presets NAME` prints where each number comes from; docs/guides/sonars.md tells how to write your own.")
 
 
 def _accuracy(names: list[str]) -> list[str]:

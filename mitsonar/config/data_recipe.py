@@ -151,7 +151,9 @@ class Split(_Part):
 
 
 class Recipe(_Part):
-    """A data set. Angles in degrees and motions in millimetres (the edge of the program), all else SI; docs/dataset.md.
+    """A data set. Angles in degrees and motions in millimetres (the edge of the program), all else SI.
+
+    Keys: docs/guides/data-sets.md.
 
     Raises:
         MitsonarError: through :func:`load_recipe`, for an unknown key or a value outside its limits.
@@ -162,8 +164,8 @@ class Recipe(_Part):
     seed: int = Field(0, ge=0, lt=2**31, description="of worlds, flights and jitter")
     world: dict[str, Any] = Field(description="family of the world, and numbers of it")
     scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
-    sonar: dict[str, Any] | None = Field(None, description="preset and keys of docs/sonar.md")
-    channel: dict[str, Any] | None = Field(None, description="in place of sonar: keys of docs/impulse.md, for responses")
+    sonar: dict[str, Any] | None = Field(None, description="preset and keys of docs/guides/sonars.md")
+    channel: dict[str, Any] | None = Field(None, description="for responses: keys of docs/guides/impulse-responses.md")
     mount: Mount = Field(
         default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; of a channel none"
     )
@@ -402,7 +404,7 @@ def _checked(part: type[_Made], what: str, fields: dict[str, Any]) -> _Made:
     try:
         return part(**fields)
     except ValidationError as error:
-        raise MitsonarError(complaint(error, part, what, " (see docs/dataset.md)")) from None
+        raise MitsonarError(complaint(error, part, what, " (see docs/guides/data-sets.md)")) from None
     except TypeError as error:
         raise MitsonarError(f"{what} keys must be words: {error}") from None
 

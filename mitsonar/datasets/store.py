@@ -1,4 +1,4 @@
-"""A data set on disk or in object storage: one Zarr v3 group, written shard by shard (docs/dataset.md)."""
+"""A data set on disk or in object storage: one Zarr v3 group, written shard by shard (docs/guides/data-sets.md)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mitsonar.records.columns import FEW_ROWS, rows_that_fit
 __all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
 
 FORMAT = 1
-"""Version of what docs/dataset.md describes."""
+"""Version of what docs/guides/data-sets.md describes."""
 
 SHARD_BYTES = 32 * 2**20
 """Of what is recorded in a shard, about: what a worker holds, and what a kill may cost."""

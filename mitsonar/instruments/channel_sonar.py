@@ -17,7 +17,7 @@ __all__ = [
 ]
 
 ChannelModel = Literal["scatterers", "rays"]
-SEE = " (see docs/impulse.md)"
+SEE = " (see docs/guides/impulse-responses.md)"
 
 PADDING = 2
 """The frequency response is taken so many times finer than asked: tails of pulses before t = 0 wrap into what is cropped."""
@@ -145,7 +145,7 @@ class ChannelSonar(Instrument):
     """A transmitter that sends all the time, and receivers whose channels are measured all the time (Almanza-Medina, ch. 5).
 
     All SI but for angles in degrees (the edge of the program). The same names are the XML properties of the sensor
-    ``channel_sonar`` (docs/impulse.md).
+    ``channel_sonar`` (docs/guides/impulse-responses.md).
 
     Raises:
         MitsonarError: through :meth:`create` and :meth:`replace`, for an unknown key or a value outside its limits.

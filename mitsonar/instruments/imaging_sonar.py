@@ -16,7 +16,7 @@ __all__ = ["RAYS", "Bearing", "Instrument", "Model", "Sonar"]
 
 Model = Literal["physical", "thesis"]
 Bearing = Literal["azimuth", "cone"]
-SEE = " (see `mitsonar presets --help` and docs/sonar.md)"
+SEE = " (see `mitsonar presets --help` and docs/guides/sonars.md)"
 RAYS = ("rays_per_beam", "rays_across")
 """Fields that follow from ``quality`` where they are not given."""
 
@@ -75,7 +75,7 @@ class Sonar(Instrument):
     """An imaging sonar. Angles in degrees (the edge of the program), all else SI.
 
     The same names are the XML properties of the sensor ``imaging_sonar`` and the keys of a sonar's YAML file
-    (``docs/sonar.md``).
+    (``docs/guides/sonars.md``).
 
     ``rays_per_beam`` and ``rays_across`` follow from ``quality`` in the physical model, and are ``thesis_rays`` and one in
     the thesis model; numbers that are given win.

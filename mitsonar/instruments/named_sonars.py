@@ -228,10 +228,10 @@ def load_sonar(name_or_file: str | Path) -> Sonar:
     try:
         fields = read_yaml(text, "sonar file")
     except MitsonarError as error:
-        more = "; see docs/sonar.md" if "not YAML" in str(error) else " or a preset's name"
+        more = "; see docs/guides/sonars.md" if "not YAML" in str(error) else " or a preset's name"
         raise MitsonarError(f"{error}{more}") from None
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
-        raise MitsonarError(f"{text} must hold `key: value` lines of a sonar; see docs/sonar.md")
+        raise MitsonarError(f"{text} must hold `key: value` lines of a sonar; see docs/guides/sonars.md")
     fields.setdefault("name", Path(text).stem)
     return sonar_from(fields)
 
@@ -241,5 +241,5 @@ def sonar_from(fields: dict[str, Any]) -> Sonar:
     fields = dict(fields)
     base = fields.pop("preset", None)
     if not all(isinstance(key, str) for key in fields) or not isinstance(base, str | None):
-        raise MitsonarError("the keys of a sonar must be words, and preset the name of one; see docs/sonar.md")
+        raise MitsonarError("the keys of a sonar must be words, and preset the name of one; see docs/guides/sonars.md")
     return Sonar.create(**fields) if base is None else preset(str(base)).replace(**fields)

@@ -105,8 +105,7 @@ class ChannelSimulator:
         Args:
             flown: poses of the transmitter and times.
             velocity: in the vehicle's axes, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`; default:
-            that of the
-                trajectory (:func:`~mitsonar.motion.pose.velocities`).
+                that of the trajectory (:func:`~mitsonar.motion.pose.velocities`).
             progress: called with the number of pings that were added.
 
         Raises:

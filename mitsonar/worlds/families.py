@@ -24,7 +24,7 @@ FAMILIES: dict[str, type[Family]] = {
 }
 
 
-SEE_SCENE = " (see docs/dataset.md, `A scene of your own`)"
+SEE_SCENE = " (see docs/guides/data-sets.md, `A scene of your own`)"
 
 
 def create_family(name: str, **fields: Any) -> Family:

@@ -33,7 +33,7 @@ TREE = dict(commands(typer.main.get_command(application())))
 
 def test_the_help_texts_hold_units_at_all() -> None:
     """Else the test below would test nothing."""
-    assert {("odometry",), ("mosaic",), ("limit",), ("world", "rocky-field")} <= {w for w in TREE if in_brackets(TREE[w])}
+    assert {("odometry",), ("mosaic",), ("crlb",), ("world", "rocky-field")} <= {w for w in TREE if in_brackets(TREE[w])}
     assert sum(in_brackets(one).count("[m]") for one in TREE.values()) >= 10
 
 

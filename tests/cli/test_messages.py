@@ -29,8 +29,8 @@ SLIPS = [
     ("impulse hydrophones --trajectory squar", "did you mean square?"),
     ("impulse hydrophones --model scaterers", "--model: input should be", "did you mean scatterers?"),
     ("impulse hydrophones --set receivers=forwrd", "chooses of the receivers"),
-    ("limit flat_floor --segments stabord", "did you mean starboard?"),
-    ("limit flat_floor --vary hight_m=2", "did you mean height_m?"),
+    ("crlb flat_floor --segments stabord", "did you mean starboard?"),
+    ("crlb flat_floor --vary hight_m=2", "did you mean height_m?"),
     ("dataset recipes rocky-feild", "did you mean rocky-field"),
     ("dataset make rocky-field --set flight.kind=runz", "recipe flight.kind: input", "did you mean runs?"),
     ("dataset make rocky-field --set store=image", "recipe store: input should be", "did you mean images?"),
@@ -46,7 +46,7 @@ SLIPS = [
 @pytest.mark.parametrize(("typed", "words"), [(slip[0], slip[1:]) for slip in SLIPS], ids=[slip[0] for slip in SLIPS])
 def test_the_nearest_name_is_asked_for(mitsonar: Command, tmp_path: Path, typed: str, words: tuple[str, ...]) -> None:
     out = ["-o", tmp_path / "out.png"] if typed.startswith("mosaic") else ["-o", tmp_path / "out"]
-    out = [] if typed.split()[0] in ("limit", "height") or "recipes" in typed else out
+    out = [] if typed.split()[0] in ("crlb", "height") or "recipes" in typed else out
     refused(mitsonar(*shlex.split(typed), *out), *words)
 
 
@@ -84,7 +84,7 @@ def test_commands_and_options_have_neighbours_too(mitsonar: Command, typed: str)
     [
         ("render flat_floor --seed -1", "error: --seed: input should be greater than or equal to 0"),
         ("impulse hydrophones --velocity 400,0", "error: --velocity is in m/s and must stay below"),
-        ("limit flat_floor --height -1", "error: --height must be above 0"),
+        ("crlb flat_floor --height -1", "error: --height must be above 0"),
         ("image nothing --range 5,4", "error: --range takes from,to in m, the near end first: got 5,4"),
         ("mosaic none.npz true -o x.png --cell-mm -10", "error: --cell-mm must be above 0: got -0.01 m"),
         ("mosaic none.npz true -o x.png --centre-beams 1", "error: --centre-beams must be at least 2"),

@@ -112,7 +112,7 @@ def test_standing_still_shows_the_jitter_alone() -> None:
 
 
 def test_any_zarr_reader_and_xarray_open_it(made: Path) -> None:
-    """docs/dataset.md: no code of ours is needed."""
+    """docs/guides/data-sets.md: no code of ours is needed."""
     import xarray
     import zarr
 

@@ -494,10 +494,10 @@ def test_segments_and_their_sums() -> None:
 
 
 def command(*arguments: object) -> tuple[int, str]:
-    from mitsonar.cli.crlb_command import limit
+    from mitsonar.cli.crlb_command import crlb
 
     app = typer.Typer()
-    app.command()(limit)
+    app.command()(crlb)
     done = CliRunner().invoke(app, [str(word) for word in arguments])
     return done.exit_code, done.output
 

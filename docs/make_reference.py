@@ -1,0 +1,115 @@
+"""Write the two reference pages that follow from the code: docs/reference/command-line.md and python.md.
+
+``python docs/make_reference.py``; a test compares the pages with what this gives.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+import mitsonar
+from mitsonar.cli import application
+
+FOLDER = Path(__file__).parent / "reference"
+
+GROUPS = {
+    "Scenes and sonars": ("load_scene", "load_sonar", "PRESETS", "Sonar", "ChannelSonar"),
+    "Poses and paths": ("Pose", "Motion", "Trajectory"),
+    "Simulation": ("Simulator", "ChannelSimulator", "load_noise", "NoiseModel"),
+    "Records": ("SonarFrames", "ImpulseResponses", "load_frames"),
+    "Estimation and mapping": (
+        "create_estimator",
+        "Estimate",
+        "odometry",
+        "build_mosaic",
+        "cramer_rao_bound",
+        "load_checkpoint",
+    ),
+    "Data sets": (
+        "load_recipe",
+        "make_dataset",
+        "DataStore",
+        "SonarPairs",
+        "ImpulsePairs",
+        "ImpulseSamples",
+        "RenderedPairs",
+        "Split",
+    ),
+    "Errors": ("MitsonarError", "MitsonarWarning"),
+}
+"""Public names by subject. Names that mitsonar does not have are left out; those of no group come last."""
+
+
+def python_page() -> str:
+    """Return the page of the public Python names."""
+    known = {name for names in GROUPS.values() for name in names}
+    groups = {**GROUPS, "Others": tuple(name for name in mitsonar.__all__ if name not in known)}
+    parts = [
+        "# Python",
+        "These names stand in `mitsonar` itself. They are loaded when they are first used: `import mitsonar` loads no "
+        "Mitsuba and no torch. Errors that a user can cause are `MitsonarError`, with one sentence.",
+    ]
+    for title, names in groups.items():
+        public = [name for name in names if name in mitsonar.__all__]
+        if public:
+            parts += [f"## {title}", *(f"::: mitsonar.{name}" for name in public)]
+    return "\n\n".join(parts) + "\n"
+
+
+def command_page() -> str:
+    """Return the page of the command line: every command with its arguments and options."""
+    parts = [
+        "# Command line",
+        "`mitsonar COMMAND --help` prints the same. `python -m mitsonar` is the same program. A mistake is answered by one "
+        "sentence and exit code 2.",
+    ]
+    for name, command in commands(typer.main.get_command(application()), "mitsonar"):
+        parts += [f"## `{name}`", inspect.cleandoc(command.help or "").replace("\n\n\n", "\n\n")]
+        context = command.context_class(command, info_name=name)
+        rows = [row(parameter, context) for parameter in command.params if parameter.name != "help"]
+        if rows:
+            parts.append("\n".join(["| argument or option | default | meaning |", "|---|---|---|", *rows]))
+    return "\n\n".join(parts) + "\n"
+
+
+def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """All commands below one, with their full names, in the order of the program."""
+    if not hasattr(command, "list_commands"):
+        yield name, command
+        return
+    context = command.context_class(command, info_name=name)
+    for word in command.list_commands(context):
+        yield from commands(command.get_command(context, word), f"{name} {word}")
+
+
+def row(parameter: Any, context: Any) -> str:
+    """A line of the table of a command."""
+    if parameter.param_type_name == "argument":
+        names = f"`{parameter.metavar or parameter.name.upper()}`"
+    else:
+        value = "" if parameter.is_flag else f" {parameter.metavar or kind(parameter, context)}"
+        names = ", ".join(f"`{name}{value}`" for name in (*parameter.opts, *parameter.secondary_opts))
+    default = "" if callable(parameter.default) or parameter.default in (None, False, ()) else f"`{parameter.default}`"
+    if parameter.required:
+        default = "required"
+    text = " ".join((parameter.help or "").split())
+    text = text.replace("\\[", "[").replace("[", "\\[").replace("<", "&lt;")  # in help texts brackets may be escaped or not
+    return f"| {names} | {default} | {text} |"
+
+
+def kind(parameter: Any, context: Any) -> str:
+    """The type of an option's value as its help shows it: INT, FLOAT, TEXT ..."""
+    words = {"int": "INT", "float": "FLOAT", "path": "PATH"}
+    shown = str(parameter.display_type(context)).strip("<>").split()
+    return words.get(shown[0].lower() if shown else "", "TEXT")
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    (FOLDER / "command-line.md").write_text(command_page(), encoding="utf-8")
+    (FOLDER / "python.md").write_text(python_page(), encoding="utf-8")
