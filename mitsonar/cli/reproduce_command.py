@@ -16,7 +16,7 @@ from mitsonar.cli.train_command import TrainingBar, asked_to_stop
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
-    from mitsonar.training.training_run import Report
+    from mitsonar.training.training_run import TrainingReport
 
 __all__ = ["reproduce"]
 
@@ -101,7 +101,7 @@ class _Console:
         return self.bar.enter_context(progress_bar(what, total, unit))
 
     @contextmanager
-    def training(self, what: str) -> Iterator[tuple[Callable[[Report], None], Callable[[], bool]]]:
+    def training(self, what: str) -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[], bool]]]:
         """The bar of a training, which Ctrl-C ends after its step."""
         self.bar.close()
         typer.echo(f"training {what}", err=True)

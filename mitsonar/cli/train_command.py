@@ -16,7 +16,7 @@ import typer
 from mitsonar.cli.console import answered, changes_of, say
 
 if TYPE_CHECKING:
-    from mitsonar.training.training_run import Report
+    from mitsonar.training.training_run import TrainingReport
 
 __all__ = ["TrainingBar", "asked_to_stop", "train"]
 
@@ -113,14 +113,14 @@ class TrainingBar:
         if self.inner is not None:
             self.inner.stop()
 
-    def __call__(self, report: Report) -> None:
+    def __call__(self, report: TrainingReport) -> None:
         if sys.stderr.isatty():
             self._draw(report)
         elif report.validated or time.monotonic() - self.said >= self.every_s:
             typer.echo(progress_line(report) + (validation_text(report) if report.validated else ""), err=True)
             self.said = time.monotonic()
 
-    def _draw(self, report: Report) -> None:
+    def _draw(self, report: TrainingReport) -> None:
         if self.inner is None:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn
@@ -134,7 +134,7 @@ class TrainingBar:
             self.inner.console.print(f"{report.minutes:.1f} min, {report.pairs:,} samples{validation_text(report)}")
 
 
-def progress_line(report: Report) -> str:
+def progress_line(report: TrainingReport) -> str:
     """How far a training is: ``epoch 1.26 at 18/s, 0.5 min, loss 15.3, RMSE 10.9/11.9 mm 0.232 deg``."""
     return (
         f"epoch {report.epoch:.2f} at {report.per_second:.3g}/s, {report.minutes:.1f} min, loss {report.loss:.3g}, "
@@ -142,12 +142,12 @@ def progress_line(report: Report) -> str:
     )
 
 
-def validation_text(report: Report) -> str:
+def validation_text(report: TrainingReport) -> str:
     """What the last validation found: ``; noise none 2.84/1.00 mm 0.052 deg``."""
     return "".join(f"; noise {level} {_rmse(values, report)}" for level, values in report.validation.items())
 
 
-def _rmse(values: list[float], report: Report) -> str:
+def _rmse(values: list[float], report: TrainingReport) -> str:
     """Numbers with the same unit share it."""
     texts: dict[str, list[str]] = {}
     for value, axis in zip(values, report.axes, strict=True):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise
 from mitsonar.config.data_recipe import Recipe, array_names
-from mitsonar.datasets.modality import Axis, Read, Stored, ground_reach
+from mitsonar.datasets.modality import Read, StoredArray, StoredAxis, ground_reach
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
@@ -33,9 +33,11 @@ TEXTS = {
 }
 
 PER_FRAME = {
-    "height_m": Stored(np.dtype(np.float64), "height of the sonar over what is straight below it [m]; nan where nothing is"),
-    "dropped": Stored(np.dtype(np.uint32), "returns of the frame that lie outside the window and were dropped"),
-    "saturated": Stored(np.dtype(np.uint32), "pixels of the frame at the maximum"),
+    "height_m": StoredArray(
+        np.dtype(np.float64), "height of the sonar over what is straight below it [m]; nan where nothing is"
+    ),
+    "dropped": StoredArray(np.dtype(np.uint32), "returns of the frame that lie outside the window and were dropped"),
+    "saturated": StoredArray(np.dtype(np.uint32), "pixels of the frame at the maximum"),
 }
 
 
@@ -55,7 +57,7 @@ class ImageModality:
         self.recipe, self.sonar = recipe, recipe.instrument
 
     @property
-    def stored(self) -> dict[str, Stored]:
+    def stored(self) -> dict[str, StoredArray]:
         """Pixels, and what rendering tells of each frame."""
         views = {view.name: view for view in self.recipe.views}
         table = {}
@@ -63,18 +65,18 @@ class ImageModality:
             view, sums = views[view_name], kind in ("vector", "nonzero")
             shape: tuple[int, ...] = (view.sonar.range_bins, *(() if sums else (len(view.bearing_rad),)))
             dims = ("range", *(() if sums else (f"beam{self.recipe.suffix(view_name)}",)))
-            table[name] = Stored(self._type(kind), TEXTS[kind].format(view_name), shape, dims)
+            table[name] = StoredArray(self._type(kind), TEXTS[kind].format(view_name), shape, dims)
         return table | PER_FRAME
 
     @property
-    def axes(self) -> dict[str, Axis]:
+    def axes(self) -> dict[str, StoredAxis]:
         """Bearings of each view, and ranges."""
         table = {}
         for view in self.recipe.views:
             suffix = self.recipe.suffix(view.name)
             about = "bearing of each beam's axis [rad], starboard positive"
-            table[f"bearing_rad{suffix}"] = Axis(view.bearing_rad, f"beam{suffix}", about)
-        return table | {"range_m": Axis(self.recipe.views[0].sonar.range_m, "range", "centre of each range bin [m]")}
+            table[f"bearing_rad{suffix}"] = StoredAxis(view.bearing_rad, f"beam{suffix}", about)
+        return table | {"range_m": StoredAxis(self.recipe.views[0].sonar.range_m, "range", "centre of each range bin [m]")}
 
     @property
     def attributes(self) -> dict[str, Any]:

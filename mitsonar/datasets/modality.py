@@ -21,7 +21,17 @@ if TYPE_CHECKING:
     from mitsonar.datasets.plan import Scene
     from mitsonar.instruments.imaging_sonar import Instrument
 
-__all__ = ["Axis", "Modality", "Read", "Renderer", "Stored", "empty_sentence", "ground_reach", "renderer_of", "samples_of"]
+__all__ = [
+    "Modality",
+    "Read",
+    "Renderer",
+    "StoredArray",
+    "StoredAxis",
+    "empty_sentence",
+    "ground_reach",
+    "renderer_of",
+    "samples_of",
+]
 
 Array = NDArray[np.float64]
 Read = Callable[..., NDArray[Any]]
@@ -29,7 +39,7 @@ Read = Callable[..., NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredArray:
     """An array that is filled ping by ping.
 
     Attributes:
@@ -46,7 +56,7 @@ class Stored:
 
 
 @dataclass(frozen=True)
-class Axis:
+class StoredAxis:
     """Values along a dimension, known from the start."""
 
     values: Array
@@ -109,9 +119,9 @@ class Modality(Protocol):
     @property
     def sonar(self) -> Instrument: ...
     @property
-    def stored(self) -> dict[str, Stored]: ...
+    def stored(self) -> dict[str, StoredArray]: ...
     @property
-    def axes(self) -> dict[str, Axis]: ...
+    def axes(self) -> dict[str, StoredAxis]: ...
     @property
     def attributes(self) -> dict[str, Any]: ...
     @property

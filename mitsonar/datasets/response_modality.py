@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.signal_to_noise import snr_of
 from mitsonar.config.data_recipe import Recipe
-from mitsonar.datasets.modality import Axis, Read, Stored, ground_reach
+from mitsonar.datasets.modality import Read, StoredArray, StoredAxis, ground_reach
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 
 __all__ = ["ResponseModality"]
@@ -36,23 +36,23 @@ class ResponseModality:
         self.recipe, self.sonar = recipe, recipe.channel_sonar
 
     @property
-    def stored(self) -> dict[str, Stored]:
+    def stored(self) -> dict[str, StoredArray]:
         """Responses, and what the simulation tells of each ping."""
         count = len(self.sonar.receivers)
         response = "complex baseband responses; receivers in the order of the attribute sonar"
         return {
-            "response": Stored(np.dtype(np.complex64), response, (count, self.sonar.taps), ("receiver", "tap")),
-            "height_m": Stored(
+            "response": StoredArray(np.dtype(np.complex64), response, (count, self.sonar.taps), ("receiver", "tap")),
+            "height_m": StoredArray(
                 np.dtype(np.float64), "height of the transmitter over what is straight below it [m]; nan where nothing is"
             ),
-            "echoes": Stored(np.dtype(np.int64), "echoes that count", (count,), ("receiver",)),
-            "dropped": Stored(np.dtype(np.int64), "echoes from beyond range_max, dropped", (count,), ("receiver",)),
+            "echoes": StoredArray(np.dtype(np.int64), "echoes that count", (count,), ("receiver",)),
+            "dropped": StoredArray(np.dtype(np.int64), "echoes from beyond range_max, dropped", (count,), ("receiver",)),
         }
 
     @property
-    def axes(self) -> dict[str, Axis]:
+    def axes(self) -> dict[str, StoredAxis]:
         """Delays."""
-        return {"delay_s": Axis(self.sonar.delay_s, "tap", "delay of each tap [s]")}
+        return {"delay_s": StoredAxis(self.sonar.delay_s, "tap", "delay of each tap [s]")}
 
     @property
     def attributes(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
-from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, constant_gain
+from mitsonar.simulation.imaging import CALIBRATION_FRAMES, RenderedPings, Simulator, constant_gain
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import release_memory
 
@@ -45,7 +45,7 @@ class SceneRenderer:
         gain = calibrate(recipe)
         return {"gain": gain, "level_scale": 1 / gain}
 
-    def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[Pings]]:
+    def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
         """Levels of frames ``first``, ``first + 1`` ... of the scene, in batches, a part for each view."""
         return self.simulator.render_views(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)
 
@@ -72,7 +72,7 @@ class SceneRenderer:
         stored = ImageModality(self.recipe).stored
         return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
 
-    def _fill(self, values: dict[str, NDArray[Any]], looks: list[Pings], gain: float) -> None:
+    def _fill(self, values: dict[str, NDArray[Any]], looks: list[RenderedPings], gain: float) -> None:
         """What is stored of one batch."""
         values["height_m"][:] = looks[0].height_m
         for view, pings in zip(self.simulator.views, looks, strict=True):
@@ -148,10 +148,10 @@ def calibrate(recipe: Recipe) -> float:
     return constant_gain([_joined(batches)])[0]
 
 
-def _joined(batches: list[list[Pings]]) -> Pings:
+def _joined(batches: list[list[RenderedPings]]) -> RenderedPings:
     """All views of all frames, as if they were frames of one column: the gain is one constant for all."""
     first = batches[0][0]
     frames = []
     for looks in batches:
         frames += [np.concatenate([pings.levels[k].ravel() for pings in looks]) for k in range(len(looks[0]))]
-    return Pings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)
+    return RenderedPings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)

@@ -18,7 +18,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mitsonar.config.data_recipe import Recipe, recipe_from
 from mitsonar.datasets.modalities import modality_of
-from mitsonar.datasets.modality import Axis, Modality, Stored
+from mitsonar.datasets.modality import Modality, StoredArray, StoredAxis
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.errors import MitsonarError
 from mitsonar.io.plain_data import check_plain, whole_number
@@ -396,11 +396,11 @@ class DataStore:
         )
         seal.attrs.put({"about": TEXTS[SEAL], "arrays": self.rendered})
 
-    def _axis(self, name: str, axis: Axis) -> None:
+    def _axis(self, name: str, axis: StoredAxis) -> None:
         """An array along a dimension."""
         self._known(name, axis.values, (axis.dim,), axis.about)
 
-    def _array(self, name: str, frames: int, stored: Stored, layout: Layout) -> None:
+    def _array(self, name: str, frames: int, stored: StoredArray, layout: Layout) -> None:
         """An array that is rendered: shards of compressed chunks with checksums (or plain chunks where a shard is 0)."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # checksums of v3 are not in every reader

@@ -24,7 +24,17 @@ from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
 
-__all__ = ["VARIATIONS", "Answers", "Row", "answers_of", "bounds_of_pairs", "chosen", "frames_of", "rows_of", "with_prior"]
+__all__ = [
+    "VARIATIONS",
+    "Answers",
+    "BenchmarkRow",
+    "answers_of",
+    "bounds_of_pairs",
+    "chosen",
+    "frames_of",
+    "rows_of",
+    "with_prior",
+]
 
 Array = NDArray[np.float64]
 
@@ -236,7 +246,7 @@ def bounds_of_pairs(
 
 
 @dataclass(frozen=True)
-class Row:
+class BenchmarkRow:
     """One method in a table.
 
     Attributes:
@@ -281,7 +291,7 @@ def rows_of(
     *,
     limit: Array | None = None,
     reference: str | None = None,
-) -> list[Row]:
+) -> list[BenchmarkRow]:
     """A table of methods on the same pairs; see section 7 of the reference.
 
     Args:
@@ -309,5 +319,5 @@ def rows_of(
             ratio = np.where((bound > 0) & np.isfinite(bound), errors.rmse / bound, np.nan)
         difference = errors.rmse - np.sqrt(against.mean(axis=0))
         ms = float(np.median(one.ms[one.valid] if one.valid.any() else one.ms))
-        rows.append(Row(name, inputs[name], errors, ms, ratio, difference, low, high))
+        rows.append(BenchmarkRow(name, inputs[name], errors, ms, ratio, difference, low, high))
     return rows

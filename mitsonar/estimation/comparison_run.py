@@ -101,7 +101,7 @@ def compare(
 
     Returns:
         What ``table.json`` holds: what was asked; ``notes``, sentences that the reader needs; ``tables``, one a level of
-        noise and variation, with ``rows``: what :class:`~mitsonar.estimation.benchmark.Row` holds.
+        noise and variation, with ``rows``: what :class:`~mitsonar.estimation.benchmark.BenchmarkRow` holds.
 
     Raises:
         MitsonarError: unknown names, too few pairs, or another comparison in the folder.

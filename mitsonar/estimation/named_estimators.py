@@ -109,10 +109,10 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
         MitsonarError: no torch, no such checkpoint or one that cannot be used.
     """
     checkpoint = load_checkpoint(path)
-    from mitsonar.estimation.learned.image_network import Network
+    from mitsonar.estimation.learned.image_network import ImageNetwork
     from mitsonar.estimation.learned.view_network import ViewNetwork, reads_views
 
-    return partial(ViewNetwork if reads_views(checkpoint) else Network, checkpoint)
+    return partial(ViewNetwork if reads_views(checkpoint) else ImageNetwork, checkpoint)
 
 
 def names_checkpoint(name: str) -> bool:

@@ -35,7 +35,7 @@ STEEPEST_RAD = math.radians(75)
 MOST_ACROSS = 4096
 
 
-class Rays(NamedTuple):
+class RayCounts(NamedTuple):
     """What a quality asks of the rays.
 
     Attributes:
@@ -49,10 +49,10 @@ class Rays(NamedTuple):
     across: int
 
 
-QUALITIES: dict[str, Rays] = {
-    "draft": Rays(0.03, math.inf, 1),
-    "standard": Rays(0.01, 0.0075, 4),
-    "fine": Rays(0.0025, 0.00375, 8),
+QUALITIES: dict[str, RayCounts] = {
+    "draft": RayCounts(0.03, math.inf, 1),
+    "standard": RayCounts(0.01, 0.0075, 4),
+    "fine": RayCounts(0.0025, 0.00375, 8),
 }
 """What each quality asks, coarsest first."""
 

@@ -20,7 +20,7 @@ from torch.nn import functional
 from mitsonar.networks.matching import Pair, channels_last, quiet
 from mitsonar.networks.warp_grid import WarpGrid
 
-__all__ = ["STEP", "Judged", "Slopes"]
+__all__ = ["STEP", "SlopeStep", "Slopes"]
 
 STEP = 2
 """Bins of a cell; a cell is one beam wide."""
@@ -38,7 +38,7 @@ LEAST_TRUE = 0.2
 """Of the square of slopes that is not noise: a step is lengthened by five times at most."""
 
 
-class Judged(NamedTuple):
+class SlopeStep(NamedTuple):
     """What a look has found out that the next one may keep.
 
     Attributes:
@@ -90,8 +90,8 @@ class Slopes(nn.Module):
         return first, finer, _slope(first, 2), _slope(first, 3)
 
     def forward(
-        self, frames: Pair, warp_grid: WarpGrid, motion: Tensor, judged: Judged | None = None
-    ) -> tuple[Tensor, Tensor, Judged]:
+        self, frames: Pair, warp_grid: WarpGrid, motion: Tensor, judged: SlopeStep | None = None
+    ) -> tuple[Tensor, Tensor, SlopeStep]:
         """A better motion ``(batch, 3)`` in units, the normal matrix ``(batch, 3, 3)`` behind it, and what was judged.
 
         Args:
@@ -110,7 +110,7 @@ class Slopes(nn.Module):
         step = (step / judged.true).clamp(-LONGEST, LONGEST)
         return motion + step, normal * judged.true[..., None] * torch.exp(self.scale), judged
 
-    def _judged(self, frames: Pair, second: Tensor, residual: Tensor, inside: Tensor) -> Judged:
+    def _judged(self, frames: Pair, second: Tensor, residual: Tensor, inside: Tensor) -> SlopeStep:
         """Slopes and weights, from what both frames show where they are now."""
         first, own = frames[0], frames[2:]
         others = _slope(second, 2), _slope(second, 3)
@@ -121,7 +121,7 @@ class Slopes(nn.Module):
         common = (weight * (own[0] * others[0] + own[1] * others[1])).sum(dim=(1, 2, 3))
         true = common / (along + across).sum(dim=(1, 2)).clamp(min=1e-12)
         information = torch.stack([along, across, (by_down * aside).sum(dim=1)], dim=1)
-        return Judged(by_down, by_aside, information, true.clamp(LEAST_TRUE, 1.0)[:, None])
+        return SlopeStep(by_down, by_aside, information, true.clamp(LEAST_TRUE, 1.0)[:, None])
 
     def _weight(self, first: Tensor, second: Tensor, residual: Tensor) -> Tensor:
         """Of each cell and filter, from what both frames have in common there."""

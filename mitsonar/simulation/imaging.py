@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from mitsonar.instruments.views import View
     from mitsonar.simulation.binning import Counts
 
-__all__ = ["Pings", "Simulator", "Tally", "constant_gain"]
+__all__ = ["RenderedPings", "Simulator", "Tally", "constant_gain"]
 
 CALIBRATION_FRAMES = 20
 """Frames whose brightest pixels set the gain of a run."""
 
 
 @dataclass
-class Pings:
+class RenderedPings:
     """A batch of consecutive pings.
 
     Attributes:
@@ -103,12 +103,12 @@ class Simulator:
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
 
-    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
+    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[RenderedPings]:
         """Levels of consecutive pings in the first view; see :meth:`looks`."""
         for looks in self.render_views(poses, first=first, labels=labels):
             yield looks[0]
 
-    def render_views(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[list[Pings]]:
+    def render_views(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[list[RenderedPings]]:
         """Levels of consecutive pings, in batches, one of each view.
 
         Ping ``first + k`` draws its own jitter whatever the batches are.
@@ -124,7 +124,7 @@ class Simulator:
         for start in range(0, len(table), self.pings_per_launch):
             yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
 
-    def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[Pings]:
+    def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[RenderedPings]:
         from mitsonar.simulation import binning
 
         key = (len(poses), labels)
@@ -137,7 +137,7 @@ class Simulator:
         height_m = np.array(height, dtype=float)
         looks = []
         for view, (image, counters, truth) in zip(self.views, made, strict=True):
-            pings = Pings(first, *binning.fetch(image, counters, len(poses), view), height_m)
+            pings = RenderedPings(first, *binning.fetch(image, counters, len(poses), view), height_m)
             if labels:
                 pings.labels = labels_of(pings, truth, self.sonar.rays)
             looks.append(pings)
@@ -310,7 +310,7 @@ class Simulator:
         self._gain_from, self.gain = "", None
         self._told.clear()
 
-    def _warn_once(self, pings: Pings, image: NDArray[np.float32], pose: NDArray[np.float64]) -> None:
+    def _warn_once(self, pings: RenderedPings, image: NDArray[np.float32], pose: NDArray[np.float64]) -> None:
         """Warn of what a step shows, each kind once in a loop."""
         tally = Tally(self.sonar, self._gain_from)
         tally.add(pings, image)
@@ -320,13 +320,13 @@ class Simulator:
             warnings.warn(found[kind], MitsonarWarning, stacklevel=3)
 
 
-def constant_gain(batches: Iterable[Pings]) -> tuple[float, Iterator[Pings]]:
+def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[RenderedPings]]:
     """The gain that lifts the 99.9th percentile of all pixels of the first 20 frames to 0.9, and all the batches again.
 
     Where that percentile is empty the largest pixel takes its place; where all pixels are, the gain is 1.
     """
     batches = iter(batches)
-    head: list[Pings] = []
+    head: list[RenderedPings] = []
     while sum(map(len, head)) < CALIBRATION_FRAMES and (pings := next(batches, None)) is not None:
         head.append(pings)
     levels = np.concatenate([pings.levels for pings in head])[:CALIBRATION_FRAMES]
@@ -334,12 +334,12 @@ def constant_gain(batches: Iterable[Pings]) -> tuple[float, Iterator[Pings]]:
     return (0.9 / bright if bright > 0 else 1.0), chain(head, batches)
 
 
-def to_image(pings: Pings, gain: float) -> NDArray[np.float32]:
+def to_image(pings: RenderedPings, gain: float) -> NDArray[np.float32]:
     """Levels times gain, clipped to 0..1."""
     return np.clip(pings.levels * np.float32(gain), 0, 1)
 
 
-def labels_of(pings: Pings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
+def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
     """Label maps of a batch (see :class:`mitsonar.records.sonar_frames.SonarFrames`), from the strongest ray of each cell.
 
     ``rays`` is how many a ping has.
@@ -358,7 +358,7 @@ def labels_of(pings: Pings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
     }
 
 
-def shadow(pings: Pings) -> NDArray[np.uint8]:
+def shadow(pings: RenderedPings) -> NDArray[np.uint8]:
     """0 lit or not yet intercepted; 1 dark between what intercepts and what still travels; 2 dark beyond all echoes."""
     echo = pings.levels > 0
     nearer = np.logical_or.accumulate(echo, axis=1) | (pings.counts.nearer > 0)[:, None]
@@ -383,7 +383,7 @@ class Tally:
     first_empty: tuple[int, ...] = ()
     """Number of the first empty frame, then of its rays those inside the window, nearer, farther, missed."""
 
-    def add(self, pings: Pings, image: NDArray[np.float32]) -> None:
+    def add(self, pings: RenderedPings, image: NDArray[np.float32]) -> None:
         """Count a batch; ``image`` before noise."""
         self.frames += len(pings)
         filled = np.count_nonzero(image, axis=(1, 2))

@@ -24,7 +24,7 @@ from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.render_run import SIMULATORS
 
-__all__ = ["SOUNDING", "Report", "Spread", "iteration_error", "run_impulse", "spread_of"]
+__all__ = ["SOUNDING", "ImpulseReport", "Spread", "iteration_error", "run_impulse", "spread_of"]
 
 SOUNDING = RunKind(
     "channel measurement",
@@ -55,7 +55,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Report:
+class ImpulseReport:
     """What a run did."""
 
     folder: Path
@@ -74,7 +74,7 @@ def run_impulse(
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[int], None] = lambda pings: None,
-) -> Report:
+) -> ImpulseReport:
     """Make a run's folder, or go on with one: ``responses.zarr`` and ``.npz``, two figures, ``run.json``.
 
     Args:
@@ -110,7 +110,7 @@ def run_impulse(
         made.save(run.path / "responses.npz")
     if not run.finished:
         run.finish()
-    return Report(run.path, len(flown), spread, run.notes.get("warnings") or [])
+    return ImpulseReport(run.path, len(flown), spread, run.notes.get("warnings") or [])
 
 
 def _make(

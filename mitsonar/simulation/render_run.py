@@ -24,10 +24,10 @@ from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
-from mitsonar.simulation.imaging import Pings, Tally, constant_gain, to_image
+from mitsonar.simulation.imaging import RenderedPings, Tally, constant_gain, to_image
 from mitsonar.simulation.variant import ensure_variant
 
-__all__ = ["RENDERING", "SIMULATORS", "Outputs", "Report", "Source", "StoredEchoes", "run"]
+__all__ = ["RENDERING", "SIMULATORS", "Outputs", "RenderReport", "Source", "StoredEchoes", "run"]
 
 SIMULATORS = ("mitsonar", "mitsuba", "drjit", "numpy")
 """Packages that decide what is simulated, to the last bit."""
@@ -48,7 +48,7 @@ class Source(Protocol):
     notes: list[str]
     variant: str
 
-    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
+    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[RenderedPings]:
         """Levels of consecutive pings, in batches."""
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
@@ -71,7 +71,7 @@ class Outputs:
 
 
 @dataclass(frozen=True)
-class Report:
+class RenderReport:
     """What a run did."""
 
     folder: Path
@@ -90,7 +90,7 @@ def run(
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[int], None] = lambda frames: None,
-) -> Report:
+) -> RenderReport:
     """Make a run's folder, or go on with one.
 
     Args:
@@ -125,7 +125,7 @@ def run(
         made.finish()
     pictures = "cartesian" if outputs.cartesian else "images"
     found = sorted((made.path / pictures).glob("*.png"))
-    return Report(made.path, len(trajectory), found, made.notes.get("warnings") or [])
+    return RenderReport(made.path, len(trajectory), found, made.notes.get("warnings") or [])
 
 
 def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dict[str, Any]) -> dict[str, Any]:
@@ -212,7 +212,7 @@ class StoredEchoes:
         self.sonar = frames.sonar.replace(**change)
         self.notes: list[str] = []
 
-    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[Pings]:
+    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[RenderedPings]:
         """Levels of the stored frames, one at a time; ``poses`` only tells how many."""
         import drjit as dr
         import mitsuba as mi
@@ -231,7 +231,7 @@ class StoredEchoes:
             echoes = Echoes(**{name: mi.Float(value) for name, value in vars(stored).items()})
             sums = accumulate(ViewEchoes(echoes, beam, True, None), mi.UInt32(0), 1, tracer)
             levels, counts = fetch(*develop(sums, 1, tracer), 1, tracer.view)
-            yield Pings(number, levels, counts, self.height_m[number : number + 1])
+            yield RenderedPings(number, levels, counts, self.height_m[number : number + 1])
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """The echoes of one frame's EXR."""
@@ -243,7 +243,7 @@ class StoredEchoes:
 
 
 def _frames_of(
-    pings: Pings, sonar: Sonar, trajectory: Trajectory, noise: NoiseModel, gain: float
+    pings: RenderedPings, sonar: Sonar, trajectory: Trajectory, noise: NoiseModel, gain: float
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
     """A batch as frames, and its images before noise."""
     image = to_image(pings, gain)

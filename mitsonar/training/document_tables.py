@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "NOISES",
+    "DocumentTable",
     "Found",
     "Reached",
-    "Row",
-    "Score",
-    "Table",
+    "RowScore",
+    "TableRow",
     "errors_said",
     "load_tables",
     "plain_table",
@@ -57,7 +57,7 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Row(_Part):
+class TableRow(_Part):
     """One network of a table.
 
     Attributes:
@@ -104,7 +104,7 @@ class Row(_Part):
         return f"{errors[0] / 10:.2f} cm ({errors[0] / 10 / self.interval:.2f} %)"
 
 
-class Table(_Part):
+class DocumentTable(_Part):
     """One table of the thesis.
 
     Attributes:
@@ -134,7 +134,7 @@ class Table(_Part):
     set: dict[str, Any] = Field(default_factory=dict)
     noises: list[Literal["none", "high"]] = ["none", "high"]
     unseen: int | None = Field(None, ge=1)
-    rows: list[Row] = Field(min_length=1)
+    rows: list[TableRow] = Field(min_length=1)
 
     @property
     def axes(self) -> tuple[Axis, ...]:
@@ -143,8 +143,8 @@ class Table(_Part):
 
     @property
     def kind(self) -> str:
-        """``Table``, or ``Figure``."""
-        return "Figure" if self.figure else "Table"
+        """``DocumentTable``, or ``Figure``."""
+        return "Figure" if self.figure else "DocumentTable"
 
     @property
     def no_motion(self) -> tuple[float, ...]:
@@ -153,14 +153,14 @@ class Table(_Part):
 
 
 @cache
-def load_tables() -> dict[str, Table]:
+def load_tables() -> dict[str, DocumentTable]:
     """All tables by their number."""
     folder = files("mitsonar.recipes") / "tables"
     texts = [(folder / f"{chapter}.yaml").read_text(encoding="utf-8") for chapter in CHAPTERS]
-    return {name: Table(name=name, **fields) for text in texts for name, fields in yaml.safe_load(text).items()}
+    return {name: DocumentTable(name=name, **fields) for text in texts for name, fields in yaml.safe_load(text).items()}
 
 
-def table_named(name: str) -> Table:
+def table_named(name: str) -> DocumentTable:
     """The table of that number.
 
     Raises:
@@ -172,7 +172,7 @@ def table_named(name: str) -> Table:
     return tables[name]
 
 
-def rows_named(table: Table, names: list[str] | None = None) -> list[Row]:
+def rows_named(table: DocumentTable, names: list[str] | None = None) -> list[TableRow]:
     """Rows of a table by their names, in the table's order; all where none is named.
 
     Raises:
@@ -193,7 +193,7 @@ def tables_with(name: str) -> list[str]:
 # ---------------------------------------------------------------- what was reached here
 
 
-class Score(_Part):
+class RowScore(_Part):
     """Errors on some samples, each sideways [mm], forward [mm], and yaw [deg] where the network estimates it.
 
     Attributes:
@@ -264,11 +264,11 @@ class Found(_Part):
     """
 
     recipe: str
-    validation: dict[str, Score]
-    unseen: dict[str, Score]
+    validation: dict[str, RowScore]
+    unseen: dict[str, RowScore]
     reached: Reached
 
-    def score(self, part: Part, noise: str) -> Score:
+    def score(self, part: Part, noise: str) -> RowScore:
         """Errors on one part with one noise."""
         return (self.validation if part == "validation" else self.unseen)[noise]
 
@@ -302,7 +302,7 @@ REACHED: dict[str, Callable[[Found], str]] = {
 """Columns that say with what a row was reached."""
 
 
-def table_lines(table: Table, found: Mapping[str, Found]) -> list[str]:
+def table_lines(table: DocumentTable, found: Mapping[str, Found]) -> list[str]:
     """A table as Markdown; rows that are not in ``found`` stay visible."""
     first = next((found[row.name] for row in table.rows if row.name in found), None)
     split = first.reached.split if first else "sequence"
@@ -322,7 +322,7 @@ def table_lines(table: Table, found: Mapping[str, Found]) -> list[str]:
     ]
 
 
-def _error_cells(table: Table, found: Mapping[str, Found], first: Found | None) -> list[list[str]]:
+def _error_cells(table: DocumentTable, found: Mapping[str, Found], first: Found | None) -> list[list[str]]:
     """Errors, the thesis's beside ours, and times where it has some."""
     units = " / ".join(f"{axis.unit} {axis.name}" for axis in table.axes)
     heights, timed = table.axes == (HEIGHT,), any(row.ms for row in table.rows)
@@ -347,7 +347,7 @@ def _error_cells(table: Table, found: Mapping[str, Found], first: Found | None) 
     return cells
 
 
-def _reached_cells(table: Table, found: Mapping[str, Found]) -> list[list[str]]:
+def _reached_cells(table: DocumentTable, found: Mapping[str, Found]) -> list[list[str]]:
     """With what each row was reached."""
     cells = [["row", "recipe", "also in", *REACHED]]
     for row in table.rows:
@@ -363,7 +363,7 @@ def _short(value: Any) -> str:
     return json.dumps(value).replace('"', "")
 
 
-def plain_table(table: Table, found: Mapping[str, Found]) -> dict[str, Any]:
+def plain_table(table: DocumentTable, found: Mapping[str, Found]) -> dict[str, Any]:
     """A table for programs."""
     rows = []
     for row in table.rows:
@@ -399,7 +399,7 @@ def _framed(rows: list[list[str]]) -> list[str]:
     return [lines[0], "|" + "|".join("-" * (size + 2) for size in width) + "|", *lines[1:]]
 
 
-def table_figure(table: Table, found: Mapping[str, Found], *, title: str = "") -> Figure:
+def table_figure(table: DocumentTable, found: Mapping[str, Found], *, title: str = "") -> Figure:
     """Bars: the thesis, validation, unseen scenes; whiskers are 95 % intervals, the line is always answering no motion."""
     from matplotlib.figure import Figure
 
@@ -428,7 +428,7 @@ def table_figure(table: Table, found: Mapping[str, Found], *, title: str = "") -
     return figure
 
 
-def _label(row: Row, ours: Found | None) -> str:
+def _label(row: TableRow, ours: Found | None) -> str:
     """A row, and the scale at which it was reached."""
     if ours is None:
         return f"{row.approach}\n{NOT_YET}"

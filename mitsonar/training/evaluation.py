@@ -23,7 +23,7 @@ from mitsonar.estimation.benchmark import Answers, chosen, rows_of
 from mitsonar.estimation.learned.trained_network import (
     ANGLE_OFF_DEG,
     HEIGHT_OFF,
-    Instrument,
+    TrainedInstrument,
     answer_of,
     inputs_of,
     one_thread,
@@ -113,7 +113,8 @@ def evaluate(
 
     Returns:
         Numbers and texts: what was asked for; ``notes``, sentences that the reader of the tables needs; ``tables``, one a
-        level, each with ``rows``: for the network and ``zero`` what :class:`~mitsonar.estimation.benchmark.Row` holds, in
+        level, each with ``rows``: for the network and ``zero`` what :class:`~mitsonar.estimation.benchmark.BenchmarkRow`
+        holds, in
         mm, mm, deg (heights: mm), with ``thesis``, the RMSE in mm, mm, 1/100 deg; and ``beyond``: shares of true motions and
         of answers beyond those of training.
 
@@ -285,7 +286,7 @@ def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
         trained = checkpoint.sonars.get(view.name)
         if trained is None:
             continue
-        unlike = Instrument.of(trained).unlike(Instrument.of(view.sonar))
+        unlike = TrainedInstrument.of(trained).unlike(TrainedInstrument.of(view.sonar))
         if unlike:
             found.append(
                 f"the {checkpoint.network} was trained on the sonar {trained.name}, the data set {recipe.name} is of "

@@ -28,7 +28,7 @@ from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.document_tables import (
     Found,
     Reached,
-    Score,
+    RowScore,
     load_tables,
     plain_table,
     rows_named,
@@ -39,7 +39,7 @@ from mitsonar.training.document_tables import (
 )
 from mitsonar.training.evaluation import evaluate
 from mitsonar.training.training_folder import TRAINING
-from mitsonar.training.training_run import Report, train
+from mitsonar.training.training_run import TrainingReport, train
 
 __all__ = ["Effort", "Watch", "reproduce", "unseen_recipe"]
 
@@ -118,7 +118,7 @@ class Watch(Protocol):
     def begin(self, what: str, total: int, unit: str) -> Told:
         """Something begins that has so many parts."""
 
-    def training(self, what: str) -> AbstractContextManager[tuple[Callable[[Report], None], Callable[[], bool]]]:
+    def training(self, what: str) -> AbstractContextManager[tuple[Callable[[TrainingReport], None], Callable[[], bool]]]:
         """While a network is trained; yields what is called after each step, and what is asked then: whether to stop."""
 
 
@@ -130,7 +130,7 @@ class SilentWatch:
         return lambda done: None
 
     @contextmanager
-    def training(self, what: str) -> Iterator[tuple[Callable[[Report], None], Callable[[], bool]]]:
+    def training(self, what: str) -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[], bool]]]:
         """Nothing is told, and training goes on."""
         yield lambda report: None, lambda: False
 
@@ -335,12 +335,12 @@ def _teller(watch: Watch, what: str) -> Callable[[int], Told]:
     return lambda total: watch.begin(f"evaluating {what}", total, "pairs")
 
 
-def _scores(report: dict[str, Any]) -> dict[str, Score]:
+def _scores(report: dict[str, Any]) -> dict[str, RowScore]:
     """What an evaluation found, by noise."""
     scores = {}
     for table in report["tables"]:
         row = next(row for row in table["rows"] if row["method"] == report["network"])
-        scores[table["noise"]] = Score(
+        scores[table["noise"]] = RowScore(
             pairs=report["pairs"],
             scenes=report["scenes"],
             low=row["rmse_low"],

@@ -29,7 +29,7 @@ from mitsonar.training.training_data import Material, material_of
 from mitsonar.training.training_folder import RunFolder, StateFile, column
 from mitsonar.training.training_step import NetworkTraining, axes_of, network_for, rmse_by_level
 
-__all__ = ["Report", "leads", "train"]
+__all__ = ["TrainingReport", "leads", "train"]
 
 STATE_MINUTES = 5.0
 """Between two states on disk: what a kill may cost."""
@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Report:
+class TrainingReport:
     """How far a training is; after each step.
 
     Attributes:
@@ -91,7 +91,7 @@ def train(
     threads: int | None = None,
     workers: int | None = None,
     state_minutes: float = STATE_MINUTES,
-    progress: Callable[[Report], None] | None = None,
+    progress: Callable[[TrainingReport], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Checkpoint:
     """Train a network; the best one by validation at the noise of training.
@@ -188,7 +188,7 @@ class Journal(Callback):
         material: Material,
         minutes: float | None,
         state_minutes: float,
-        progress: Callable[[Report], None] | None,
+        progress: Callable[[TrainingReport], None] | None,
         stop: Callable[[], bool] | None,
     ) -> None:
         self.folder, self.module, self.material = folder, module, material
@@ -303,9 +303,9 @@ class Journal(Callback):
         """Whether the network is worth keeping."""
         return all(bool(torch.isfinite(values).all()) for values in self.module.network.state_dict().values())
 
-    def _report(self, step: int, validated: bool) -> Report:
+    def _report(self, step: int, validated: bool) -> TrainingReport:
         seconds = time.monotonic() - self.begun
-        return Report(
+        return TrainingReport(
             step=step,
             steps=self.module.steps,
             epoch=step / self.module.epoch_steps,

@@ -31,7 +31,7 @@ pytestmark = [
 ]
 
 from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
-from mitsonar.estimation.learned.image_network import Network  # noqa: E402
+from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator, estimator_from  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
@@ -86,7 +86,7 @@ def pairs(made: Path) -> SonarPairs:
 
 
 def test_it_answers_what_the_network_says(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
-    estimator = Network(checkpoint)
+    estimator = ImageNetwork(checkpoint)
     for number in range(3):
         found = estimator.estimate(pairs.sonar_frames(number))
         assert found.valid, found.reason
@@ -113,13 +113,13 @@ def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
                     layer.weight.mul_(2)
         trained = Checkpoint.of(network, own)
         wanted, _ = predictions(trained, own, numbers=[2, 5])
-        found = [Network(trained).estimate(pairs.sonar_frames(number)).motion for number in (2, 5)]
+        found = [ImageNetwork(trained).estimate(pairs.sonar_frames(number)).motion for number in (2, 5)]
         assert np.allclose(found, wanted, rtol=1e-4, atol=1e-7)
         assert not np.allclose(found[0], found[1], rtol=1e-3), "it looks at the frames"
 
 
 def test_another_process_gets_the_same(checkpoint: Checkpoint, pairs: SonarPairs) -> None:
-    estimator = Network(checkpoint, force=True)
+    estimator = ImageNetwork(checkpoint, force=True)
     copied = pickle.loads(pickle.dumps(estimator))
     assert (copied.digest, copied.force, copied.inputs) == (estimator.digest, True, estimator.inputs)
     assert copied.estimate(pairs.sonar_frames(1)).motion == estimator.estimate(pairs.sonar_frames(1)).motion
@@ -151,7 +151,7 @@ def posed(frames: SonarFrames, column: int, value: float, **fields: Any) -> Sona
 def test_it_doubts(
     checkpoint: Checkpoint, pairs: SonarPairs, change: Callable[[SonarFrames], SonarFrames], words: str
 ) -> None:
-    found = Network(checkpoint).estimate(change(pairs.sonar_frames(2)))
+    found = ImageNetwork(checkpoint).estimate(change(pairs.sonar_frames(2)))
     assert not found.valid
     assert words in found.reason
 
@@ -168,7 +168,7 @@ def test_what_it_does_not_doubt(checkpoint: Checkpoint, pairs: SonarPairs) -> No
         posed(frames, 3, np.radians(36.5)),
         changed(frames, image=np.stack([frames.image[0], frames.image[0]])),
     ):
-        assert Network(checkpoint).estimate(fine).valid
+        assert ImageNetwork(checkpoint).estimate(fine).valid
 
 
 def test_answers_beyond_the_box_are_not_believed(made: Path, pairs: SonarPairs) -> None:
@@ -177,11 +177,11 @@ def test_answers_beyond_the_box_are_not_believed(made: Path, pairs: SonarPairs) 
         trained = constant(own, [0.0, -size, 0.0])
         if np.isnan(size):
             trained = replace(constant(own), weights={k: v * float("inf") for k, v in constant(own).weights.items()})
-        found = Network(trained).estimate(pairs.sonar_frames(2))
+        found = ImageNetwork(trained).estimate(pairs.sonar_frames(2))
         assert found.valid == believed, found
     assert "not finite" in found.reason
     assert "forward -24.5 mm is beyond the motions of training, -20..20 mm" in (
-        Network(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
+        ImageNetwork(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
     )
 
 
@@ -189,7 +189,7 @@ def test_another_sonar_is_refused_unless_forced(checkpoint: Checkpoint, pairs: S
     frames = pairs.sonar_frames(2)
     other = frames.sonar.replace(name="mine", elevation_fov_deg=20, bearing="cone")
     with pytest.raises(MitsonarError) as error:
-        Network(checkpoint).estimate(changed(frames, sonar=other, range_m=frames.range_m + 0.5))
+        ImageNetwork(checkpoint).estimate(changed(frames, sonar=other, range_m=frames.range_m + 0.5))
     for words in (
         "DIDSON",
         "mine",
@@ -198,22 +198,22 @@ def test_another_sonar_is_refused_unless_forced(checkpoint: Checkpoint, pairs: S
         "window 3.7..6.1 m, not 3.2..5.6 m",
     ):
         assert words.lower() in str(error.value).lower()
-    assert Network(checkpoint, force=True).estimate(changed(frames, sonar=other)).valid
-    assert Network(checkpoint).estimate(changed(frames, range_m=frames.range_m * 1.01)).valid, "sound speed errs"
+    assert ImageNetwork(checkpoint, force=True).estimate(changed(frames, sonar=other)).valid
+    assert ImageNetwork(checkpoint).estimate(changed(frames, range_m=frames.range_m * 1.01)).valid, "sound speed errs"
     coarse = changed(frames, image=frames.image[:, ::2], range_m=frames.range_m[::2])
     with pytest.raises(MitsonarError, match="bins 128, not 256"):
-        Network(checkpoint).estimate(coarse)
+        ImageNetwork(checkpoint).estimate(coarse)
     with pytest.raises(MitsonarError, match=r"\(1, 1, 128, 96\)"):
-        Network(checkpoint, force=True).estimate(coarse)
+        ImageNetwork(checkpoint, force=True).estimate(coarse)
 
 
 def test_checkpoints_that_two_frames_cannot_serve(checkpoint: Checkpoint) -> None:
     words = checkpoint.arrangement
     for change in ({"frames": 3}, {"views": ["left", "right"]}, {"kind": "vector", "views": ["q1", "q2"]}):
         with pytest.raises(MitsonarError, match=r"two frames of one view.*evaluate"):
-            Network(replace(checkpoint, arrangement={**words, **change}))
+            ImageNetwork(replace(checkpoint, arrangement={**words, **change}))
     with pytest.raises(MitsonarError, match=r"given no geometry: height 2\.5 m, pitch 35 deg are fixed by training"):
-        Network(checkpoint, height_m=2.0)
+        ImageNetwork(checkpoint, height_m=2.0)
 
 
 # ---------------------------------------------------------------- with the geometry of the ground
@@ -231,7 +231,7 @@ def test_networks_that_know_the_geometry_are_given_it(
     geometric: Checkpoint, made: Path, pairs: SonarPairs, tmp_path: Path
 ) -> None:
     """As an estimator it says what it says of the data set's own samples; another sonar and height are welcome."""
-    estimator = Network(geometric)
+    estimator = ImageNetwork(geometric)
     wanted, laws = predictions(geometric, samples_for(geometric, made, part="all"), numbers=[2, 5])
     assert laws is not None
     for place, number in enumerate((2, 5)):
@@ -343,7 +343,7 @@ def test_odometry_and_compare_take_checkpoints(
     assert done.returncode == 0, done.stderr
     _, row = json.loads(done.stdout)["tables"][0]["rows"]
     truth = SonarPairs(made, part="all", one_a_sequence=True)
-    believed = [Network(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
+    believed = [ImageNetwork(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
     answers = np.where(np.array(believed)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
     errors = in_units(answers - np.array([motions(truth.pose[truth.frame_numbers(k)])[0] for k in range(len(truth))]))
     assert row["failures"] == believed.count(False) <= 2

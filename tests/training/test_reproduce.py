@@ -23,7 +23,7 @@ from mitsonar.training.document_tables import (
     NOISES,
     Found,
     Reached,
-    Score,
+    RowScore,
     load_tables,
     rows_named,
     table_figure,
@@ -172,10 +172,10 @@ def test_network_of_a_recipe_reads_what_its_data_set_gives(name: str) -> None:
 # ---------------------------------------------------------------- tables
 
 
-def score(value: float) -> Score:
+def score(value: float) -> RowScore:
     errors = (value, value / 2, value / 50)
     bounds = {"low": tuple(0.8 * e for e in errors), "high": tuple(1.3 * e for e in errors)}
-    return Score(pairs=40, scenes=30, rmse=errors, slope=(0.9, 1.0, None), zero=(11.0, 12.0, 0.25), **bounds)
+    return RowScore(pairs=40, scenes=30, rmse=errors, slope=(0.9, 1.0, None), zero=(11.0, 12.0, 0.25), **bounds)
 
 
 REACHED = Reached(
@@ -227,9 +227,9 @@ def test_a_table_shows_all_rows_and_the_scale_of_each() -> None:
 
 
 def test_a_table_of_heights_says_them_in_cm_and_of_their_interval() -> None:
-    def errors(value: float) -> Score:
+    def errors(value: float) -> RowScore:
         ends = {"low": (value,), "high": (value,), "zero": (2600.0,)}
-        return Score(pairs=63, scenes=17, rmse=(value,), slope=(1.0,), ms=3.21, **ends)
+        return RowScore(pairs=63, scenes=17, rmse=(value,), slope=(1.0,), ms=3.21, **ends)
 
     halves = {"none": errors(90.0), "high": errors(180.0)}
     name = "height-rocky-vector"

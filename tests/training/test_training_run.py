@@ -46,7 +46,7 @@ from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
 from mitsonar.training.training_data import Order, _Together, finished, material_of  # noqa: E402
-from mitsonar.training.training_run import Report, _score, train  # noqa: E402
+from mitsonar.training.training_run import TrainingReport, _score, train  # noqa: E402
 
 FIELDS: dict[str, Any] = {
     "network": {"name": "posenet", "width": 0.03},
@@ -395,7 +395,7 @@ def test_a_run_keeps_what_it_promises(
 ) -> None:
     """The best network's errors, computed again from its file; the log; the picture; a network that has learnt."""
     monkeypatch.setattr("mitsonar.training.training_folder.curve_figure", bare_curves)
-    reports: list[Report] = []
+    reports: list[TrainingReport] = []
     labels: dict[str, Any] = {"labels": "quantised", "noise": "none", "optimiser": {"rate": 3e-3}, "steps": 60}
     labels |= {"split": {"train": 0.8, "validation": 0.2}, "validate": {"every_steps": 20, "pairs": None, "noise": ["low"]}}
     told = recipe(**labels, network={"name": "posenet", "width": 0.06, "dropout": 0.0}, part_of_data=0.4)
@@ -585,7 +585,7 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
     told, out = tmp_path / "mine.yaml", tmp_path / "run"
     told.write_text(yaml.safe_dump(FIELDS))
 
-    def interrupt(report: Report) -> None:
+    def interrupt(report: TrainingReport) -> None:
         if report.step == 9:
             os.kill(os.getpid(), signal.SIGINT)
 

@@ -79,7 +79,7 @@ LEAST_GAIN = 12.0
 """By which the logarithm of the likelihood must exceed that of pings with nothing in common."""
 
 
-class Judged(NamedTuple):
+class MotionScore(NamedTuple):
     """What a receiver says of a motion.
 
     Attributes:
@@ -300,7 +300,7 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
     """The most likely motion near a given one."""
     columns = list(free)
 
-    def judge(where: Array) -> list[Judged]:
+    def judge(where: Array) -> list[MotionScore]:
         return [judged(receiver_band, z, where, free, depth) for receiver_band, z in zip(receiver_bands, data, strict=True)]
 
     said = judge(motion)
@@ -331,7 +331,7 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
     )
 
 
-def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: Sequence[int], depth: int) -> Judged:
+def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: Sequence[int], depth: int) -> MotionScore:
     """What a receiver's pings ``(pings, taps)`` say of a motion from ping to ping, each judged by ``depth`` before it.
 
     The level of the ground's strength and the variance of noise are those that fit best.
@@ -359,7 +359,7 @@ def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: 
         ]
         one, two = part.score(slopes, noise[best], float(level[best]))
         gradient, information = gradient + part.sign * one, information + part.sign * two
-    return Judged(float(likelihood[best]), turn.T @ gradient, turn.T @ information @ turn, float(NOISE[best]))
+    return MotionScore(float(likelihood[best]), turn.T @ gradient, turn.T @ information @ turn, float(NOISE[best]))
 
 
 @dataclass(frozen=True)

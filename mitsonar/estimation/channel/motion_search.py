@@ -90,7 +90,7 @@ def receiver_bands_of(sonar: ChannelSonar, height_m: float, interval_s: float, r
 
 
 @dataclass(frozen=True)
-class Table:
+class CovarianceTable:
     """What two pings share, for motions on a grid.
 
     Attributes:
@@ -139,8 +139,8 @@ def _grid(reach: float, step: float) -> Array:
 
 
 @lru_cache(maxsize=32)
-def _table_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> Table:
-    return Table.of(response_covariance_of(alone, height_m, interval_s, reach_m))
+def _table_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> CovarianceTable:
+    return CovarianceTable.of(response_covariance_of(alone, height_m, interval_s, reach_m))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_subject import Subject
 from mitsonar.estimation.crlb.image_crlb import LAWS, Bound, bounds_at, overall, varied
-from mitsonar.simulation.imaging import CALIBRATION_FRAMES, Pings, Simulator, constant_gain
+from mitsonar.simulation.imaging import CALIBRATION_FRAMES, RenderedPings, Simulator, constant_gain
 
 __all__ = ["Table", "Value", "bounds_of_subject", "report_lines", "report_of"]
 
@@ -65,7 +65,7 @@ def _gain(simulator: Any, poses: NDArray[np.float64]) -> float:
     batches = []
     for looks in simulator.render_views(poses[:CALIBRATION_FRAMES]):
         flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in looks], axis=1)
-        batches.append(Pings(looks[0].first, flat[:, :, None], looks[0].counts, looks[0].height_m))
+        batches.append(RenderedPings(looks[0].first, flat[:, :, None], looks[0].counts, looks[0].height_m))
     if not any(pings.levels.any() for pings in batches):
         raise MitsonarError("no ray met anything within the window: check the pose (pitch > 0 looks down) and the window")
     return constant_gain(batches)[0]

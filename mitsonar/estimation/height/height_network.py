@@ -10,7 +10,7 @@ import torch
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.height.direct_height import Above, HeightEstimate, profile_of, rejection_of_profile
-from mitsonar.estimation.learned.trained_network import Instrument, Trained, answer_of, one_thread
+from mitsonar.estimation.learned.trained_network import Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.instruments.views import Whole
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.view_frames import ViewFrames
@@ -83,6 +83,6 @@ class HeightNetwork(Trained):
             raise MitsonarError(
                 f"this {self._checkpoint.network} is given {', '.join(names)}: use a data set that holds them"
             )
-        self._check_instrument(names[0], Instrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
+        self._check_instrument(names[0], TrainedInstrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
         values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
         return self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})(values, torch.arange(1)[None], 0)

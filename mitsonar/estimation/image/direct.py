@@ -40,7 +40,7 @@ __all__ = ["Direct"]
 Floats = NDArray[np.float32]
 
 
-class Level(NamedTuple):
+class DirectLevel(NamedTuple):
     """One step from coarse to fine.
 
     Attributes:
@@ -57,9 +57,9 @@ class Level(NamedTuple):
 
 
 LEVELS = (
-    Level(8, (16.0, 4.0), (0.0, 0.0), 10),
-    Level(4, (6.0, 1.5), (0.0, 0.0), 8),
-    Level(1, (0.7, 0.5), (0.6, 0.4), 24),
+    DirectLevel(8, (16.0, 4.0), (0.0, 0.0), 10),
+    DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 8),
+    DirectLevel(1, (0.7, 0.5), (0.6, 0.4), 24),
 )
 
 STILL = np.array([3e-5, 3e-5, 6e-6])
@@ -140,7 +140,7 @@ class Direct:
     pitch_rad: float | None = None
     relief_m: float | None = None
     heave_std_m: float = 0.0
-    levels: tuple[Level, ...] = LEVELS
+    levels: tuple[DirectLevel, ...] = LEVELS
 
     consumes = SonarFrames
     inputs = INPUTS
@@ -179,7 +179,7 @@ class Direct:
         return Estimate(Motion(*(float(x) for x in v[:3])), covariance, not reason, reason, about)
 
     def _register(
-        self, first: Floats, second: Floats, cells: _Cells, start: NDArray[np.float64], level: Level, *, last: bool
+        self, first: Floats, second: Floats, cells: _Cells, start: NDArray[np.float64], level: DirectLevel, *, last: bool
     ) -> tuple[NDArray[np.float64], _Fit | None] | None:
         """Gauss-Newton from a start; None where there is nothing to match."""
         v, hasten, converged = start.copy(), _Hasten(), False
@@ -235,7 +235,9 @@ class _Look(NamedTuple):
     pull: NDArray[np.float64]
 
 
-def _look(first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], level: Level, *, last: bool) -> _Look | None:
+def _look(
+    first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
+) -> _Look | None:
     """The second frame drawn at the first's cells, at last also the other way; None where too little remains to compare."""
     pairs = []
     for back in (False, True) if last else (False,):
@@ -263,7 +265,7 @@ def _look(first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], 
 
 
 def _fit(
-    look: _Look, cells: _Cells, v: NDArray[np.float64], level: Level, held: NDArray[np.float64], converged: bool
+    look: _Look, cells: _Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
 ) -> _Fit:
     """How good the motion is: from the pulls of blocks, and from slopes of one frame times those of the other."""
     true = np.sum([_cross(side, cells, level) for side in look.sides], axis=0)
@@ -290,7 +292,7 @@ def _fit(
 class _Cells:
     """The cells of one level: where they are, and how they move with the sonar, in bins and beams."""
 
-    def __init__(self, frames: SonarFrames, attitude: Attitude, level: Level, *, heave: bool) -> None:
+    def __init__(self, frames: SonarFrames, attitude: Attitude, level: DirectLevel, *, heave: bool) -> None:
         step = level.step
         reach = tuple(2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing[::-1], (1, step), strict=True))
         self.bearing, self.attitude, self.heave = frames.sonar.bearing, attitude, heave
@@ -416,7 +418,7 @@ def _blurred(image: Floats, bins: float, beams: float) -> Floats:
     return np.asarray(cv2.GaussianBlur(image, size, sigmaX=beams, sigmaY=bins, borderType=cv2.BORDER_REPLICATE))
 
 
-def _smoothed(image: Floats, level: Level) -> Floats:
+def _smoothed(image: Floats, level: DirectLevel) -> Floats:
     """Every so many bins of the smoothed image."""
     smooth = _blurred(image, *level.smoothing)
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
@@ -427,7 +429,7 @@ def _drawn(image: Floats, row: Floats, column: Floats) -> Floats:
     return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _slopes(image: Floats, level: Level, scale: float) -> tuple[Floats, Floats]:
+def _slopes(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, Floats]:
     """Central differences over bins and beams of the image as far as it rises over the noise.
 
     ``scale`` is the standard deviation of a difference of two frames; their mean has half of it.
@@ -494,7 +496,7 @@ def _singular(normal: NDArray[np.float64]) -> bool:
     return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
 
 
-def _cross(side: _Side, cells: _Cells, level: Level) -> NDArray[np.float64]:
+def _cross(side: _Side, cells: _Cells, level: DirectLevel) -> NDArray[np.float64]:
     """The normal matrix from slopes of one frame times slopes of the other, whose noise is not the same."""
     frames = (side.before, side.after)
     one, other = (cells.along(_differences(_blurred(image, *level.slopes)), side.inner) for image in frames)

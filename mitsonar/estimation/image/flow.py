@@ -44,7 +44,7 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 
-class Level(NamedTuple):
+class FlowLevel(NamedTuple):
     """One step from coarse to fine: every so many bins of frames smoothed over bins and beams (standard deviations); windows
     of so many bins and beams; at most so many rounds of flow and match."""
 
@@ -56,9 +56,9 @@ class Level(NamedTuple):
 
 
 LEVELS = (
-    Level(8, 16.0, 3.0, (136, 33), 6),
-    Level(4, 6.0, 1.5, (68, 17), 6),
-    Level(1, 1.0, 0.6, (33, 9), 25),
+    FlowLevel(8, 16.0, 3.0, (136, 33), 6),
+    FlowLevel(4, 6.0, 1.5, (68, 17), 6),
+    FlowLevel(1, 1.0, 0.6, (33, 9), 25),
 )
 
 STILL = np.array([1e-4, 1e-4, 3e-5])
@@ -139,7 +139,7 @@ class Flow:
     relief_m: float | None = None
     match: Literal["map", "vector"] = "map"
     height_std: float | None = None
-    levels: tuple[Level, ...] = LEVELS
+    levels: tuple[FlowLevel, ...] = LEVELS
 
     consumes = SonarFrames
     inputs = INPUTS
@@ -200,7 +200,7 @@ class _Grid:
     """The cells of a level's frames over the ground, and the windows over them."""
 
     ground: GroundGeometry
-    level: Level
+    level: FlowLevel
 
     @cached_property
     def cells(self) -> Floats:
@@ -268,13 +268,13 @@ def _grid(
     height: float,
     pitch: float,
     roll: float,
-    level: Level,
+    level: FlowLevel,
 ) -> _Grid:
     ranges = np.array(range_m)[level.step // 2 :: level.step]
     return _Grid(GroundGeometry(ranges, np.array(bearing_rad), bearing, height, pitch, roll), level)
 
 
-def _smoothed(image: Floats, level: Level) -> Floats:
+def _smoothed(image: Floats, level: FlowLevel) -> Floats:
     """Every so many bins of the smoothed image."""
     smooth = cv2.GaussianBlur(image, (0, 0), sigmaX=level.beams, sigmaY=level.bins)
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])

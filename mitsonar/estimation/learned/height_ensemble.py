@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.learned.image_network import Network
+from mitsonar.estimation.learned.image_network import ImageNetwork
 from mitsonar.estimation.learned.view_network import ViewNetwork
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
@@ -38,7 +38,7 @@ class HeightEnsemble:
 
     def __post_init__(self) -> None:
         reads = {(type(one), getattr(one, "views", None), one.kind) for one in self.networks}
-        if len(reads) != 1 or not all(isinstance(one, Network | ViewNetwork) for one in self.networks):
+        if len(reads) != 1 or not all(isinstance(one, ImageNetwork | ViewNetwork) for one in self.networks):
             said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
             raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
         ((_, self.views, self.kind),) = reads

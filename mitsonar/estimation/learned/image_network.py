@@ -15,14 +15,14 @@ from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.datasets.ground_nodes import ground_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, rejected, two_frames
-from mitsonar.estimation.learned.trained_network import BEYOND, Instrument, Trained, answer_of, one_thread
+from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.pose import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.warp_grid import Ground, WarpGrid
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["Network"]
+__all__ = ["ImageNetwork"]
 
 Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
 
@@ -37,7 +37,7 @@ BLOCK = 16
 
 
 @dataclass(init=False, eq=False)
-class Network(Trained):
+class ImageNetwork(Trained):
     """A trained network.
 
     Args:
@@ -94,7 +94,7 @@ class Network(Trained):
         """
         images = two_frames(frames)
         for view in self._trained:
-            self._check_instrument(view, Instrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad))
+            self._check_instrument(view, TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad))
         if any(blank(image) for image in images):
             return rejected("nothing in the frames to match")
         attitude = self._standing(frames)

@@ -23,7 +23,7 @@ from mitsonar.errors import MitsonarError, nearest_names
 if TYPE_CHECKING:
     from mitsonar.datasets.response_samples import ImpulseSamples
 
-__all__ = ["NORMAL_IQR", "REGRESSORS", "Regression", "Score", "flattened", "score_all"]
+__all__ = ["NORMAL_IQR", "REGRESSORS", "Regression", "RegressionScore", "flattened", "score_all"]
 
 Array = NDArray[np.float64]
 
@@ -138,7 +138,7 @@ REGRESSORS: dict[str, Callable[[Array], Regression]] = {
 
 
 @dataclass(frozen=True)
-class Score:
+class RegressionScore:
     """How one regressor did.
 
     Attributes:
@@ -176,8 +176,8 @@ def score_all(
     axis: int = 1,
     names: Sequence[str] | None = None,
     components: int | None = None,
-    progress: Callable[[Score], object] = lambda score: None,
-) -> list[Score]:
+    progress: Callable[[RegressionScore], object] = lambda score: None,
+) -> list[RegressionScore]:
     """Fit regressors and score them, in one direction: the thesis's forward unless told otherwise.
 
     Args:
@@ -214,7 +214,7 @@ def score_all(
     return scores
 
 
-def _score(name: str, features: Array, learnt: Array, others: Array, truth: Array, zero: float) -> Score:
+def _score(name: str, features: Array, learnt: Array, others: Array, truth: Array, zero: float) -> RegressionScore:
     """One regressor."""
     try:
         regressor = REGRESSORS[name](learnt)
@@ -228,7 +228,7 @@ def _score(name: str, features: Array, learnt: Array, others: Array, truth: Arra
     error = regressor.predict(others) - truth
     answered = time.perf_counter()
     rmse = float(np.sqrt((error**2).mean()))
-    return Score(name, rmse, zero, fitted - begun, answered - fitted, features.shape[1])
+    return RegressionScore(name, rmse, zero, fitted - begun, answered - fitted, features.shape[1])
 
 
 def _fewer(features: Array, others: Array, components: int | None) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from mitsonar.networks.create import called
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
-__all__ = ["ANGLE_OFF_DEG", "BEYOND", "HEIGHT_OFF", "Instrument", "Trained", "answer_of", "inputs_of", "one_thread"]
+__all__ = ["ANGLE_OFF_DEG", "BEYOND", "HEIGHT_OFF", "Trained", "TrainedInstrument", "answer_of", "inputs_of", "one_thread"]
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Ranges of the bins and bearings of the beams."""
@@ -41,7 +41,7 @@ WINDOW_OFF = 0.02
 """How far window and field of view may be from those of training, as part of them."""
 
 
-class Instrument(NamedTuple):
+class TrainedInstrument(NamedTuple):
     """The numbers of a sonar that a network knows from training."""
 
     name: str
@@ -53,12 +53,12 @@ class Instrument(NamedTuple):
     bearing: str
 
     @classmethod
-    def of(cls, sonar: Sonar) -> Instrument:
+    def of(cls, sonar: Sonar) -> TrainedInstrument:
         """As the sonar says."""
         return cls.in_frames(sonar, sonar.range_m, sonar.bearing_rad)
 
     @classmethod
-    def in_frames(cls, sonar: Sonar, range_m: NDArray[np.float64], bearing_rad: NDArray[np.float64]) -> Instrument:
+    def in_frames(cls, sonar: Sonar, range_m: NDArray[np.float64], bearing_rad: NDArray[np.float64]) -> TrainedInstrument:
         """Of a sonar whose frames have these bins and beams."""
         half = (range_m[-1] - range_m[0]) / max(1, len(range_m) - 1) / 2
         span = (bearing_rad[-1] - bearing_rad[0]) * len(bearing_rad) / max(1, len(bearing_rad) - 1)
@@ -66,7 +66,7 @@ class Instrument(NamedTuple):
         size = (len(range_m), len(bearing_rad))
         return cls(sonar.name, *size, window, math.degrees(span), sonar.elevation_fov_deg, sonar.bearing)
 
-    def unlike(self, other: Instrument) -> str:
+    def unlike(self, other: TrainedInstrument) -> str:
         """The numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
         found = []
         for what in ("bins", "beams", "bearing"):
@@ -108,7 +108,7 @@ class Trained:
         """What computes is no field: files and comparisons of options need the digest only."""
         self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
         self._checkpoint, self._network = checkpoint, checkpoint.build()
-        self._trained = {view: Instrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
+        self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
         self._last: tuple[bytes, Arrangement] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -139,14 +139,14 @@ class Trained:
                 "from a data set that holds them"
             )
         for view in names:
-            self._check_instrument(view, Instrument.of(frames.sonars[view]))
+            self._check_instrument(view, TrainedInstrument.of(frames.sonars[view]))
         values = {view: torch.from_numpy(np.asarray(frames.values[view])[None]) for view in names}
         if frames.kind == "vector":  # noise has been drawn before
             values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
         axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
         return self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
 
-    def _check_instrument(self, view: str, has: Instrument) -> None:
+    def _check_instrument(self, view: str, has: TrainedInstrument) -> None:
         """Refuse another sonar than that of training, unless it is forced."""
         unlike = self._trained[view].unlike(has) if view in self._trained and not self.force else ""
         if unlike:

@@ -30,7 +30,7 @@ pytestmark = [
 
 from mitsonar.config.training_recipe import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
-from mitsonar.estimation.learned.image_network import Network  # noqa: E402
+from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.learned.view_network import ViewNetwork, _rejection_of_profiles  # noqa: E402
 from mitsonar.mapping.view_source import open_views  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
@@ -253,7 +253,7 @@ def test_a_network_of_vectors_learns_and_is_evaluated(portions: Path, tmp_path: 
     assert done.returncode == 0, done.stderr
     assert "posenetvec" in done.stdout
     with pytest.raises(MitsonarError, match="two frames of one view"):
-        Network(kept)
+        ImageNetwork(kept)
 
 
 def test_a_network_of_halves_estimates_from_any_frames(ahead: Path, tmp_path: Path) -> None:
@@ -265,7 +265,7 @@ def test_a_network_of_halves_estimates_from_any_frames(ahead: Path, tmp_path: Pa
     samples = SonarPairs(ahead, part="all", **kept.arrangement, labels=kept.labels["kind"])
     with torch.inference_mode():
         wanted = samples.labels.decode(kept.build()(samples[7][0][None]))[0]
-    np.testing.assert_allclose(Network(kept).estimate(frames).motion, wanted, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(ImageNetwork(kept).estimate(frames).motion, wanted, rtol=1e-4, atol=1e-7)
 
 
 def test_heights_of_vectors(portions: Path, tmp_path: Path) -> None:
