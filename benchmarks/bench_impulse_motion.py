@@ -42,9 +42,11 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.response_source import ResponseSource
 from mitsonar.mapping.trajectory_smoothing import path_of
+from mitsonar.motion.composition import motions
 from mitsonar.motion.courses import COURSES, course
 from mitsonar.motion.motion_errors import in_units
-from mitsonar.motion.pose import Pose, Trajectory, motions, velocities
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory, velocities
 
 SEED, SCENES = 4201, 5
 

@@ -291,7 +291,7 @@ def memory(frames: int) -> dict[str, Any]:
 def render_for_memory(frames: int, rays: int) -> None:
     """Render frames over the seabed into a folder and print the peak memory of this process."""
     from mitsonar.acoustics.noise import NoiseModel
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.render_run import Outputs, run
 
     ensure_variant()

@@ -46,8 +46,10 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.io.whole_files import write_whole
 from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
 from mitsonar.mapping.trajectory_smoothing import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
+from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import motion_errors
-from mitsonar.motion.pose import Pose, Trajectory, motions, mounted
+from mitsonar.motion.pose import Pose, mounted
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import assess
 from mitsonar.plotting.fan_figure import GAMMA
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from mitsonar.mapping.frame_source import load_frames
     from mitsonar.mapping.mosaic import build_mosaic
     from mitsonar.mapping.odometry import odometry
-    from mitsonar.motion.pose import Motion, Pose, Trajectory
+    from mitsonar.motion.composition import Motion
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
     from mitsonar.records.impulse_responses import ImpulseResponses
     from mitsonar.records.sonar_frames import SonarFrames
     from mitsonar.simulation.channel import ChannelSimulator
@@ -81,14 +83,14 @@ _MODULES = {
     "ImpulseResponses": "records.impulse_responses",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
-    "Motion": "motion.pose",
+    "Motion": "motion.composition",
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered_pairs",
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.imaging_sonar",
     "SonarFrames": "records.sonar_frames",
     "SonarPairs": "datasets.torch_pairs",
-    "Trajectory": "motion.pose",
+    "Trajectory": "motion.trajectory",
     "build_mosaic": "mapping.mosaic",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",

@@ -260,7 +260,7 @@ def read_run(folder: Path) -> None:
 def make_odometry(folder: Path) -> None:
     from mitsonar.estimation.estimator import Estimate
     from mitsonar.mapping.odometry_run import _line_of
-    from mitsonar.motion.pose import Motion
+    from mitsonar.motion.composition import Motion
 
     state = {"kind": "mitsonar odometry", "finished": False, "title": "t", "recipe": {"a": 1}}
     (folder / "run.json").write_text(json.dumps(state))
@@ -391,7 +391,7 @@ def make_tum(folder: Path) -> None:
 
 
 def read_tum(folder: Path) -> None:
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
 
     found = Trajectory.load_tum(folder / "path.tum")
     assert np.isfinite(found.poses).all()

@@ -10,7 +10,8 @@ from helpers import axes
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.motion.pose import Motion, Pose, compose
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 Array = NDArray[np.float64]

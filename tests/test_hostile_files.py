@@ -135,7 +135,7 @@ def test_any_text_as_yaml_and_json(content: str) -> None:
 @given(content=some.binary(max_size=200))
 def test_any_bytes_as_files(content: bytes, tmp_path: Path) -> None:
     from mitsonar.io.whole_files import read_json
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
     from mitsonar.worlds.mesh_check import check_mesh
 
     path = tmp_path / "any"
@@ -776,14 +776,14 @@ def test_echoes_that_promise_more_than_is_there(tmp_path: Path) -> None:
     ],
 )
 def test_lines_of_a_trajectory_that_cannot_be(line: str, tmp_path: Path) -> None:
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
 
     (tmp_path / "p.tum").write_text(line + "\n")
     assert "line 1" in refusal(lambda: Trajectory.load_tum(tmp_path / "p.tum"))
 
 
 def test_times_of_a_trajectory_do_not_go_back(tmp_path: Path) -> None:
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
 
     (tmp_path / "p.tum").write_text("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n")
     assert "time must increase" in refusal(lambda: Trajectory.load_tum(tmp_path / "p.tum"))

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mitsonar.instruments.channel_sonar import ChannelSonar
-    from mitsonar.motion.pose import Pose, Trajectory
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["impulse"]
 
@@ -126,9 +127,11 @@ def _path(
     """Poses and velocities that the options say."""
     import numpy as np
 
+    from mitsonar.motion.composition import steady
     from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.courses import COURSES, course
-    from mitsonar.motion.pose import Pose, Trajectory, steady, velocities
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory, velocities
 
     convention_named(frame)
     if frames is not None and frames < 1:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from mitsonar.mapping.frame_source import FrameSource
     from mitsonar.mapping.mosaic import Mosaic
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
     from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["mosaic"]
@@ -123,7 +123,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
     """Paths by name, the one to lay frames along first, and the height that an odometry was told."""
     from mitsonar.mapping.odometry_run import OdometryFolder
     from mitsonar.motion.conventions import convention_named
-    from mitsonar.motion.pose import Trajectory
+    from mitsonar.motion.trajectory import Trajectory
 
     convention_named(frame)
     height = None

@@ -12,7 +12,8 @@ from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
-    from mitsonar.motion.pose import Pose, Trajectory
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["SIX", "Frame", "render", "scene_parameters"]
 
@@ -132,7 +133,8 @@ def _path(
     frame: str,
 ) -> Trajectory:
     """The poses that the options say."""
-    from mitsonar.motion.pose import Pose, Trajectory
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import shipped_trajectory
 
     if frames is not None and frames < 1:

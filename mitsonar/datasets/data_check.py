@@ -11,7 +11,7 @@ from mitsonar.datasets.modality import empty_sentence
 from mitsonar.datasets.plan import Plan, footprints_at
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import motions
+from mitsonar.motion.composition import motions
 
 __all__ = ["check"]
 

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from mitsonar.config.data_recipe import Flight, Recipe
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import Motion, Pose, Trajectory, compose, motions, mounted, velocities
+from mitsonar.motion.composition import Motion, compose, motions
+from mitsonar.motion.pose import Pose, mounted
+from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.worlds.world import Family, stream
 
 __all__ = ["Plan", "Scene", "Sequence", "footprints_at", "scenes_of", "sequences_of"]
@@ -64,7 +66,7 @@ class Plan:
         vehicle: poses of the vehicle ``(frames, 6)``.
         poses: of the sonar ``(frames, 6)``.
         motion: sideways, forward [m], yaw [rad] to the next frame of the sequence ``(frames, 3)``; nan for its last.
-        velocity: of the vehicle in its own axes; see :func:`~mitsonar.motion.pose.velocities` ``(frames, 4)``.
+        velocity: of the vehicle in its own axes; see :func:`~mitsonar.motion.trajectory.velocities` ``(frames, 4)``.
     """
 
     scenes: list[Scene]

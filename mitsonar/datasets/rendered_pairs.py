@@ -18,7 +18,8 @@ from mitsonar.datasets.plan import Scene, sequences_of, world_seed
 from mitsonar.datasets.scene_rendering import SceneRenderer, calibrate
 from mitsonar.datasets.torch_pairs import Samples
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import motions, mounted
+from mitsonar.motion.composition import motions
+from mitsonar.motion.pose import mounted
 from mitsonar.simulation.variant import ensure_variant, release_memory, use_threads
 
 __all__ = ["RawStream", "RenderedPairs"]

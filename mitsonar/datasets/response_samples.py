@@ -17,7 +17,7 @@ from mitsonar.datasets.response_packing import Packing, packed
 from mitsonar.datasets.sample_index import Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import motions
+from mitsonar.motion.composition import motions
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["ImpulseSamples", "Leak", "displacement_labels"]

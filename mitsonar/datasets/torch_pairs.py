@@ -21,7 +21,7 @@ from mitsonar.datasets.sample_index import Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.attitude import attitude_of
-from mitsonar.motion.pose import motions
+from mitsonar.motion.composition import motions
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Samples", "SonarPairs"]

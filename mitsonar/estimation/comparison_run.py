@@ -23,8 +23,8 @@ from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
 from mitsonar.estimation.named_estimators import estimator_from
 from mitsonar.io.provenance import digest, versions
+from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import cluster_resamples, in_units
-from mitsonar.motion.pose import motions
 
 __all__ = ["Asked", "compare"]
 

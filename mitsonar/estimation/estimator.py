@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = [

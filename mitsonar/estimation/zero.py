@@ -7,7 +7,7 @@ from typing import Any
 
 from mitsonar.estimation.channel.pings import pings_of
 from mitsonar.estimation.estimator import Estimate, two_frames
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.mapping.measured_heights import measured
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import associated
 from mitsonar.records.columns import check_column, open_group
 from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames

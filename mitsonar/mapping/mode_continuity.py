@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 
 __all__ = ["continued"]
 

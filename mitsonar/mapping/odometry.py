@@ -35,8 +35,10 @@ from mitsonar.mapping.trajectory_smoothing import (
     scaled,
     spline_smoothed,
 )
+from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import AXES, in_units, motion_errors
-from mitsonar.motion.pose import Pose, Trajectory, motions
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import assess, path_length
 from mitsonar.records.sonar_frames import SonarFrames
 

@@ -22,9 +22,11 @@ from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
 from mitsonar.io.whole_files import write_json, write_whole
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source
+from mitsonar.motion.composition import Motion
 from mitsonar.motion.conventions import convention_named
 from mitsonar.motion.motion_errors import AXES, in_units
-from mitsonar.motion.pose import Motion, Pose, Trajectory
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.map_figure import path_figure, save_figure
 
 __all__ = ["OdometryFolder", "run_odometry", "table_lines"]

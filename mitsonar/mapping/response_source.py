@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.signal_to_noise import snr_of, snr_said
 from mitsonar.datasets.response_packing import with_noise
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["ResponseSource", "holds_responses", "open_responses"]

@@ -20,7 +20,8 @@ from scipy.stats import chi2
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.motion.motion_errors import AXES
-from mitsonar.motion.pose import Pose, Trajectory
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
     "Ellipse",
@@ -140,9 +141,10 @@ class MotionSeries:
 
 
 def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
-    """The path that motions drive from ``start``: :func:`mitsonar.motion.pose.compose` from frame to frame (Almanza-Medina,
+    """The path that motions drive from ``start``: :func:`mitsonar.motion.composition.compose` from frame to frame
+    (Almanza-Medina,
     eq.
-    3.4), the inverse of :func:`mitsonar.motion.pose.motions`. Height, pitch and roll stay those of ``start``.
+    3.4), the inverse of :func:`mitsonar.motion.composition.motions`. Height, pitch and roll stay those of ``start``.
 
     Args:
         motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)``.

@@ -14,7 +14,7 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.mapping.frame_source import sequence_in
 from mitsonar.mapping.measured_heights import measured
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.view_frames import ViewFrames
 
 if TYPE_CHECKING:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.motion.pose import Pose, Trajectory, vehicle_rotation
+from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["COURSES", "LEGS", "course"]
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import Trajectory, poses_from, vehicle_rotation
+from mitsonar.motion.pose import poses_from, vehicle_rotation
+from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
     "Alignment",

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.whole_files import write_whole
+from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import AXES
-from mitsonar.motion.pose import Trajectory, motions
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import GAMMA
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
-from mitsonar.motion.pose import Trajectory, velocities
+from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.simulation.nonuniform_fft import phasor_sums
 from mitsonar.simulation.variant import thread_count
@@ -105,7 +105,7 @@ class ChannelSimulator:
         Args:
             flown: poses of the transmitter and times.
             velocity: in the vehicle's axes, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`; default:
-                that of the trajectory (:func:`~mitsonar.motion.pose.velocities`).
+                that of the trajectory (:func:`~mitsonar.motion.trajectory.velocities`).
             progress: called with the number of pings that were added.
 
         Raises:

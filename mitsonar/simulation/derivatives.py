@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Motion, Pose, compose
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
 from mitsonar.simulation.imaging import Simulator
 
 __all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "jittered", "step_for"]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames

@@ -16,7 +16,7 @@ from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.response_figure import response_png, waterfall_png
 from mitsonar.records.columns import check_column
 from mitsonar.records.impulse_responses import COLUMNS, ImpulseResponses

@@ -19,7 +19,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore

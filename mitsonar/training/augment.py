@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mitsonar.motion.pose import inverse
+from mitsonar.motion.composition import inverse
 
 __all__ = ["AUGMENTATIONS", "augmented"]
 

@@ -22,7 +22,9 @@ from PIL import Image
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.odometry_run import OdometryFolder
 from mitsonar.mapping.trajectory_smoothing import path_of
-from mitsonar.motion.pose import Pose, Trajectory, motions
+from mitsonar.motion.composition import motions
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 
 DRIVEN = np.tile([0.012, 0.009, np.radians(0.3)], (11, 1))

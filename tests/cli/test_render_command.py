@@ -18,7 +18,7 @@ from PIL import Image
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.render_run import Outputs, StoredEchoes, run

@@ -13,7 +13,8 @@ from mitsonar.config.data_recipe import Recipe, load_recipe
 from mitsonar.datasets.image_modality import footprint
 from mitsonar.datasets.plan import Plan, run_poses, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import Motion, Pose, compose, mounted
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose, mounted
 
 P = 1e-5
 

@@ -24,7 +24,9 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.learned.regressors import REGRESSORS, Turned, flattened, score_all
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.motion.pose import Motion, Pose, Trajectory, compose, motions, steady, velocities
+from mitsonar.motion.composition import Motion, compose, motions, steady
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.plotting.data_sheet import info
 from mitsonar.simulation.scene import load_scene
 

@@ -35,7 +35,7 @@ from mitsonar.estimation.benchmark import (  # noqa: E402
 from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
 from mitsonar.estimation.zero import Zero  # noqa: E402
-from mitsonar.motion.pose import Motion  # noqa: E402
+from mitsonar.motion.composition import Motion  # noqa: E402
 from mitsonar.records.sonar_frames import SonarFrames  # noqa: E402
 
 

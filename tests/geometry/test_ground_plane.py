@@ -9,7 +9,8 @@ from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.geometry.scan_conversion import cartesian_map, to_cartesian
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Motion, Pose, compose, vehicle_rotation
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose, vehicle_rotation
 
 
 def pixel_centres(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

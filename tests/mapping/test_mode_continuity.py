@@ -7,7 +7,7 @@ import pytest
 
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.mapping.mode_continuity import continued
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 
 
 def sure(forward: float) -> Estimate:

@@ -18,7 +18,8 @@ from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
-from mitsonar.motion.pose import Pose, Trajectory, vehicle_rotation
+from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.map_figure import mosaic_figure, path_figure, quality_figure, save_figure
 from mitsonar.records.sonar_frames import SonarFrames
 

@@ -27,7 +27,9 @@ from mitsonar.mapping.frame_source import FrameSource, open_frames
 from mitsonar.mapping.odometry import PAIRS_A_BATCH, bridged, estimate_motions, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
 from mitsonar.mapping.trajectory_smoothing import MotionSeries, path_of
-from mitsonar.motion.pose import Motion, Pose, Trajectory, motions
+from mitsonar.motion.composition import Motion, motions
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 
 Array = NDArray[np.float64]

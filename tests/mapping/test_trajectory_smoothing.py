@@ -28,7 +28,9 @@ from mitsonar.mapping.trajectory_smoothing import (
     spline_period,
     spline_smoothed,
 )
-from mitsonar.motion.pose import Motion, Pose, Trajectory, compose, motions
+from mitsonar.motion.composition import Motion, compose, motions
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Smoother = Callable[[MotionSeries], MotionSeries]

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.motion.conventions import CONVENTIONS, convention_named, sideways_or_up
-from mitsonar.motion.pose import Pose, Trajectory, to_world_matrices
+from mitsonar.motion.pose import Pose, to_world_matrices
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.scene import shipped_scenes, shipped_trajectory
 
 FRAMES = ("mitsonar", "ros-enu", "ned")

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
+from mitsonar.motion.composition import steady
 from mitsonar.motion.courses import COURSES, course
-from mitsonar.motion.pose import Pose, steady, velocities
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import velocities
 
 POSITIONS = {"square": 400, "stairs": 400, "zigzag": 340, "circle": 400, "sinusoid": 400, "diagonal": 200}
 SPEEDS = {

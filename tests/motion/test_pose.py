@@ -9,16 +9,9 @@ import pytest
 from helpers import axes
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import (
-    Motion,
-    Pose,
-    Trajectory,
-    compose,
-    motions,
-    mounted,
-    pose_from_to_world,
-    to_world_matrices,
-)
+from mitsonar.motion.composition import Motion, compose, motions
+from mitsonar.motion.pose import Pose, mounted, pose_from_to_world, to_world_matrices
+from mitsonar.motion.trajectory import Trajectory
 
 RIGHT_ANGLE = np.pi / 2
 

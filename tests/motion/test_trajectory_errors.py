@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.trajectory_smoothing import path_of
-from mitsonar.motion.pose import Pose, Trajectory, poses_from, vehicle_rotation
+from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import (
     Alignment,
     absolute_errors,

@@ -8,7 +8,8 @@ import pytest
 from mitsonar.datasets.ground_nodes import NODES, ground_at
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.motion.pose import Motion, Pose, compose, inverse
+from mitsonar.motion.composition import Motion, compose, inverse
+from mitsonar.motion.pose import Pose
 from mitsonar.networks import create_network
 
 torch = pytest.importorskip("torch")

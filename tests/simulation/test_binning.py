@@ -14,7 +14,8 @@ from helpers import box, diffuse, floor, run_python, scene, sphere
 
 from mitsonar.acoustics.echo_level import largest_level
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Pose, Trajectory
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.simulation.imaging import Simulator
 

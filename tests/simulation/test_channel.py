@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone, four_receivers
-from mitsonar.motion.pose import Pose, Trajectory, steady
+from mitsonar.motion.composition import steady
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, Paths, frequency_response, impulse_response
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated, delay_static

@@ -14,7 +14,8 @@ from helpers import assert_image_close, box, diffuse, floor, floor_levels, place
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Pose, Trajectory
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -9,7 +9,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Trajectory
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.scene import find_scene, load_scene, shipped_scenes, shipped_trajectory, sonar_in
 
 pytestmark = pytest.mark.usefixtures("variant")

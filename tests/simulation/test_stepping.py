@@ -13,7 +13,8 @@ from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Pose, Trajectory, velocities
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.imaging import Simulator

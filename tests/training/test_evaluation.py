@@ -19,8 +19,8 @@ from helpers import Command, refused, run_python, tiny_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import in_units
-from mitsonar.motion.pose import motions
 from mitsonar.records.sonar_frames import SonarFrames
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")

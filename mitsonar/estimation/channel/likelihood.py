@@ -28,7 +28,7 @@ from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.response_covariance import block_toeplitz
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.estimator import Estimate, rejected
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["Likelihood", "judged"]

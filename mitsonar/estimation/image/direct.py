@@ -32,7 +32,7 @@ from mitsonar.estimation.estimator import (
 )
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
-from mitsonar.motion.pose import Motion, inverse
+from mitsonar.motion.composition import Motion, inverse
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Direct"]

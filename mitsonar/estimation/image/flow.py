@@ -35,7 +35,7 @@ from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.instruments.imaging_sonar import Bearing
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Flow"]

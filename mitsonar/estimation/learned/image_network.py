@@ -17,7 +17,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, rejected, two_frames
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.geometry.attitude import Attitude, attitude_of
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.warp_grid import Ground, WarpGrid
 from mitsonar.records.sonar_frames import SonarFrames

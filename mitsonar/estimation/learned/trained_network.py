@@ -19,8 +19,8 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS
 from mitsonar.geometry.scan_conversion import cartesian_map
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_errors import AXES, in_units
-from mitsonar.motion.pose import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
 from mitsonar.records.sonar_frames import SonarFrames

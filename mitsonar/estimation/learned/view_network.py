@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.estimation.learned.trained_network import Trained, answer_of, one_thread
 from mitsonar.instruments.views import SEGMENTS
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.view_frames import ViewFrames
 

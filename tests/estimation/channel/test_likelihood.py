@@ -17,7 +17,7 @@ from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb, impulse_information
 from mitsonar.estimation.named_estimators import create_estimator, estimator_from
 from mitsonar.instruments.channel_sonar import ChannelSonar, four_receivers
-from mitsonar.motion.pose import Motion
+from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.simulation.channel import impulse_response
 

@@ -29,7 +29,8 @@ from mitsonar.estimation.crlb.image_crlb import (
 )
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Motion, Pose, compose
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import to_uint8
 
 if TYPE_CHECKING:

@@ -12,7 +12,9 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.flow import Flow
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Motion, Pose, Trajectory, compose
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene

@@ -18,7 +18,9 @@ from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.pose import Motion, Pose, Trajectory, compose
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.networks.shipped import SHIPPED
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator

@@ -18,7 +18,7 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.pose import motions
+from mitsonar.motion.composition import motions
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")

@@ -1,0 +1,69 @@
+"""Motions between pings: composition (Almanza-Medina, eq. 3.4), inverse, constant rates."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from array_api_compat import array_namespace
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
+
+__all__ = ["Motion", "compose", "inverse", "motions", "steady"]
+
+
+class Motion(NamedTuple):
+    """Between two pings: sideways [m], forward [m], yaw [rad], in the frame of the second heading (eq. 3.4)."""
+
+    sideways: float
+    forward: float
+    yaw: float
+
+
+def compose(pose: Pose, motion: Motion) -> Pose:
+    """The pose after a motion (Almanza-Medina, eq. 3.4): along the *new* heading."""
+    heading = pose.heading + motion.yaw
+    sin, cos = np.sin(heading), np.cos(heading)
+    x = pose.x + motion.forward * sin + motion.sideways * cos
+    y = pose.y + motion.forward * cos - motion.sideways * sin
+    return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
+
+
+def inverse(motion: Any) -> Any:
+    """The motions that undo motions ``(..., 3)`` (sideways, forward, yaw; eq. 3.4), NumPy or torch."""
+    xp = array_namespace(motion)
+    sideways, forward, yaw = (motion[..., k] for k in range(3))
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    return xp.stack([-(sideways * cos + forward * sin), -(forward * cos - sideways * sin), -yaw], axis=-1)
+
+
+def motions(poses: ArrayLike) -> NDArray[np.float64]:
+    """What :func:`compose` needs from each pose ``(frames, 6)`` to the next: ``(frames - 1, 3)`` sideways, forward [m], yaw
+    [rad] within -pi..pi (Almanza-Medina, eq. 3.4)."""
+    table = np.atleast_2d(np.asarray(poses, dtype=float))
+    (x, y), heading = np.diff(table[:, :2], axis=0).T, table[1:, 5]
+    sin, cos = np.sin(heading), np.cos(heading)
+    turn = np.diff(table[:, 5])
+    yaw = turn - 2 * np.pi * np.rint(turn / (2 * np.pi))
+    return np.column_stack([x * cos - y * sin, x * sin + y * cos, yaw])
+
+
+def steady(
+    start: Pose, velocity: tuple[float, float, float], frames: int, rate_hz: float
+) -> tuple[Trajectory, NDArray[np.float64]]:
+    """``frames`` poses of a level vehicle that keeps its velocity, starboard and forward [m/s] and turn [rad/s] in its own
+    axes, along an arc; and that velocity as :func:`velocities` has it ``(frames, 4)``."""
+    sideways, forward, turn = velocity
+    time = np.arange(frames) / rate_hz
+    angle = turn * time
+    # integral of the velocity turned by the heading: sin(a)/a and (1 - cos a)/a along the arc
+    along, beside = time * np.sinc(angle / np.pi), time * np.sin(angle / 2) * np.sinc(angle / (2 * np.pi))
+    sin, cos = np.sin(start.heading), np.cos(start.heading)
+    right, ahead = sideways * along + forward * beside, forward * along - sideways * beside
+    poses = np.tile(np.array(start, dtype=float), (frames, 1))
+    poses[:, 0] += right * cos + ahead * sin
+    poses[:, 1] += ahead * cos - right * sin
+    poses[:, 5] += angle
+    return Trajectory(poses, time), np.tile([sideways, forward, 0.0, turn], (frames, 1))
