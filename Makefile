@@ -34,7 +34,11 @@ docs: $(VENV)/.installed
 lint: $(VENV)/.tested
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/mypy
+	@mkdir -p build/typed/mitsonar
+	@for one in mitsonar/* plugins scenes; do ln -sfn ../../../$$one build/typed/mitsonar/; done
+	@ln -sfn ../../../benchmarks/recipes build/typed/mitsonar/recipes
+	$(VENV)/bin/mypy -p mitsonar
+	$(VENV)/bin/mypy tests benchmarks docs scenes
 
 bench: $(VENV)/.tested
 	$(PIP) -e '.[bench]'
