@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import inspect
 from collections.abc import Iterator
 from pathlib import Path
@@ -109,7 +110,18 @@ def kind(parameter: Any, context: Any) -> str:
     return words.get(shown[0].lower() if shown else "", "TEXT")
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write both pages, or with ``--quick`` only say whether they are what the code gives."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="write nothing: compare, and fail where a page is stale")
+    pages = {"command-line.md": command_page(), "python.md": python_page()}
+    if parser.parse_args().quick:
+        stale = [name for name, text in pages.items() if (FOLDER / name).read_text(encoding="utf-8") != text]
+        raise SystemExit(f"stale: {', '.join(stale)}; run docs/make_reference.py" if stale else 0)
     FOLDER.mkdir(exist_ok=True)
-    (FOLDER / "command-line.md").write_text(command_page(), encoding="utf-8")
-    (FOLDER / "python.md").write_text(python_page(), encoding="utf-8")
+    for name, text in pages.items():
+        (FOLDER / name).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -352,10 +352,10 @@ def test_odometry_and_compare_take_checkpoints(
     assert json.loads(again.stdout)["tables"][0]["rows"][1] == row
     constant(truth, SAYS / 2).save(run / "network.ckpt")
     try:
-        refused(mitsonar(*table, "-o", tmp_path / "table"), "other networks", "choose another -o")
+        refused(mitsonar(*table, "-o", tmp_path / "table"), "was begun with networks", "choose another -o")
         refused(
             mitsonar("odometry", tmp_path / "frames.npz", "--estimator", run, "-o", tmp_path / "out1", "--resume"),
-            "differs in options",
+            "was begun with options.digest",
         )
     finally:
         checkpoint.save(run / "network.ckpt")
