@@ -244,8 +244,8 @@ def make_run(folder: Path) -> None:
 
 
 def read_run(folder: Path) -> None:
-    from mitsonar.simulation.imaging import Tally
     from mitsonar.simulation.render_run import begin
+    from mitsonar.simulation.tally import Tally
 
     state = begin(folder, RECIPE, "frames", overwrite=False, resume=True)
     if state["finished"]:

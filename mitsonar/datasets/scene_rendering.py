@@ -16,7 +16,8 @@ from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
-from mitsonar.simulation.imaging import CALIBRATION_FRAMES, RenderedPings, Simulator, constant_gain
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import release_memory
 

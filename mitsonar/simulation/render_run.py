@@ -24,7 +24,8 @@ from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
-from mitsonar.simulation.imaging import RenderedPings, Tally, constant_gain, to_image
+from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
+from mitsonar.simulation.tally import Tally
 from mitsonar.simulation.variant import ensure_variant
 
 __all__ = ["RENDERING", "SIMULATORS", "Outputs", "RenderReport", "Source", "StoredEchoes", "run"]

@@ -1,0 +1,40 @@
+"""Per-pixel truth of frames: elevation, shape, object and shadow, from the strongest ray of each cell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.simulation.rendered_pings import RenderedPings
+
+__all__ = ["labels_of", "shadow"]
+
+
+def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
+    """Label maps of a batch (see :class:`mitsonar.records.sonar_frames.SonarFrames`), from the strongest ray of each cell.
+
+    ``rays`` is how many a ping has.
+    """
+    best, elevation, shape_id, object_id = truth
+    frames, bins, beams = pings.levels.shape
+    winner = np.array(best).reshape(frames, beams, bins).transpose(0, 2, 1)
+    filled = (winner > 0) & (pings.levels > 0)
+    ray = (winner & 0xFFFFFFFF).astype(np.int64) + np.arange(frames)[:, None, None] * rays
+    ray = np.where(filled, ray, 0)
+    return {
+        "elevation_rad": np.where(filled, np.array(elevation)[ray], np.float32(np.nan)),
+        "shape_id": np.where(filled, np.array(shape_id)[ray], -1).astype(np.int32),
+        "object_id": np.where(filled, np.array(object_id)[ray], -1).astype(np.int32),
+        "shadow": shadow(pings),
+    }
+
+
+def shadow(pings: RenderedPings) -> NDArray[np.uint8]:
+    """0 lit or not yet intercepted; 1 dark between what intercepts and what still travels; 2 dark beyond all echoes."""
+    echo = pings.levels > 0
+    nearer = np.logical_or.accumulate(echo, axis=1) | (pings.counts.nearer > 0)[:, None]
+    still = np.logical_or.accumulate(echo[:, ::-1], axis=1)[:, ::-1]
+    still = still | ((pings.counts.farther > 0) | (pings.counts.missed > 0))[:, None]
+    return np.where(nearer & ~echo, np.where(still, 1, 2), 0).astype(np.uint8)

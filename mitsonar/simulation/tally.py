@@ -1,0 +1,123 @@
+"""The tally of a run: what its frames add up to warn of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames
+from mitsonar.simulation.rendered_pings import RenderedPings
+
+__all__ = ["Tally"]
+
+
+@dataclass
+class Tally:
+    """What a run adds up to warn of."""
+
+    sonar: Sonar
+    gain_from: str = "set on the first 20 frames"
+    frames: int = 0
+    rays: dict[str, int] = field(default_factory=lambda: dict.fromkeys(("inside", "nearer", "farther", "missed"), 0))
+    pixels: int = 0
+    filled: int = 0
+    saturated: int = 0
+    worst: tuple[int, int] = (0, 0)
+    empty: int = 0
+    first_empty: tuple[int, ...] = ()
+    """Number of the first empty frame, then of its rays those inside the window, nearer, farther, missed."""
+
+    def add(self, pings: RenderedPings, image: NDArray[np.float32]) -> None:
+        """Count a batch; ``image`` before noise."""
+        self.frames += len(pings)
+        filled = np.count_nonzero(image, axis=(1, 2))
+        empty = np.flatnonzero(filled < NEARLY_EMPTY * image[0].size)
+        if len(empty) and not self.empty:
+            rays = (int(getattr(pings.counts, name)[empty[0]].sum()) for name in self.rays)
+            self.first_empty = (pings.first + int(empty[0]), *rays)
+        self.empty += len(empty)
+        for name in self.rays:
+            self.rays[name] += int(getattr(pings.counts, name).sum())
+        self.pixels += image.size
+        self.filled += int(filled.sum())
+        self.saturated += int(np.count_nonzero(image >= 1))
+        outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1)
+        if outside.max() > self.worst[0]:
+            self.worst = int(outside.max()), pings.first + int(outside.argmax())
+
+    def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
+        """A sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
+        return list(self.findings(source, poses).values())
+
+    def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0) -> dict[str, str]:
+        """The sentences of :meth:`warnings`, each by the name of what it is about.
+
+        Args:
+            source: finds the ranges of the worst frame.
+            poses: of the frames ``(frames, 6)``.
+            first: number of the first of them.
+        """
+        sonar, rays = self.sonar, self.rays
+        outside = rays["nearer"] + rays["farther"]
+        hits = rays["inside"] + outside
+        found = {}
+        if self.empty:
+            number, *its_rays = self.first_empty
+            pose = poses[number - first]
+            window = (sonar.range_min, sonar.range_max)
+            beside = source.window_range(pose, number)
+            found["empty"] = empty_frames(self.empty, self.frames, (number, pose), its_rays, window, beside)
+        if outside > 0:
+            frame = self.worst[1]
+            ends = source.window_range(poses[frame - first], frame)
+            where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""
+            found["window"] = (
+                f"{outside:,} of {hits:,} returns ({100 * outside / hits:.2g} %) lie outside the window "
+                f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen the window if they matter"
+            )
+        if self.saturated > 0.01 * self.pixels:
+            found["saturated"] = (
+                f"{100 * self.saturated / self.pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, "
+                f"{self.gain_from}, is too high for the rest"
+            )
+        if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:
+            found["rays"] = (
+                f"{rays['inside'] / self.filled:.1f} rays a bin on average, below 10: point deposits make the levels "
+                "noisy; raise rays_per_beam, lower range_bins, or use the model physical"
+            )
+        return found
+
+    def state(self) -> dict[str, Any]:
+        """As JSON can hold it; :meth:`restore` reads it back."""
+        names = ("frames", "rays", "pixels", "filled", "saturated", "worst", "empty", "first_empty")
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def restore(cls, sonar: Sonar, state: Any) -> Tally:
+        """The tally of a run that was broken off.
+
+        Raises:
+            MitsonarError: the state is damaged.
+        """
+        kept = cls(sonar)
+        try:
+            single = (state[name] for name in kept.state() if name not in ("rays", "worst", "first_empty"))
+            counts = [*state["worst"], *state["first_empty"], *state["rays"].values(), *single]
+            if (
+                len(state["worst"]) != 2
+                or len(state["first_empty"]) not in (0, 5)
+                or set(state["rays"]) != set(kept.rays)
+                or set(state) != set(kept.state())
+            ):
+                raise ValueError("other counts")
+            if not all(type(count) is int and 0 <= count < 2**63 for count in counts):
+                raise ValueError("counts are whole and not negative")
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise MitsonarError(f"the tally of the run is damaged ({error}): begin anew with --overwrite") from None
+        tuples = {name: tuple(state[name]) for name in ("worst", "first_empty")}
+        return cls(sonar, **{**state, "rays": dict(state["rays"]), **tuples})
