@@ -43,6 +43,12 @@ def render(
     noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
     labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
+    label_floor: Annotated[
+        float, typer.Option(min=0, max=1, help="Label only pixels above this part of full scale, before noise.")
+    ] = 0.0,
+    fan: Annotated[
+        bool, typer.Option("--fan", help="A plain fan picture of each frame, in fan/; with --labels of these as well.")
+    ] = False,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
     rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
@@ -58,7 +64,10 @@ def render(
     from mitsonar.simulation.render_run import Outputs, run
     from mitsonar.simulation.scene import find_scene, load_scene
 
-    outputs = Outputs(load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=convention_named(frame).name)
+    named = convention_named(frame).name
+    outputs = Outputs(
+        load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=named, fan=fan, label_floor=label_floor
+    )
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     instrument, attitude = _instrument(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["CartesianImage", "CartesianMap", "cartesian_map", "to_cartesian"]
+__all__ = ["CartesianImage", "CartesianMap", "cartesian_map", "nearest_cells", "to_cartesian"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,22 @@ class CartesianMap:
             part = xp.take(flat, xp.reshape(index[corner], (-1,)), axis=1) * xp.reshape(weight[corner], (-1,))
             fan = part if fan is None else fan + part
         return xp.reshape(fan, (*image.shape[:-2], *self.index.shape[1:]))
+
+
+def nearest_cells(fan: CartesianMap, image: NDArray[Any], outside: Any) -> NDArray[Any]:
+    """Return the value of the nearest cell in each pixel of a fan, for labels, which must not be mixed.
+
+    Args:
+        fan: of the image's ranges and bearings.
+        image: ``(bins, beams)`` of any type.
+        outside: value of the pixels outside the fan.
+
+    Returns:
+        ``(rows, columns)`` of the image's type.
+    """
+    corner = fan.weight.argmax(axis=0)[None]
+    cell = np.take_along_axis(fan.index, corner, axis=0)[0]
+    return np.where(fan.weight.any(axis=0), image.ravel()[cell], np.asarray(outside, dtype=image.dtype))
 
 
 def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianMap:

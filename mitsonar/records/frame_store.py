@@ -27,8 +27,8 @@ LONGEST_NPZ = 1000
 class FrameStore:
     """The frames of one run, on disk as ``frames.zarr`` (Zarr v3, one chunk a frame).
 
-    The group holds what ``frames.npz`` holds, by the same names; ``sonar``, ``level``, ``level_scale`` and ``about`` are
-    attributes, and so is ``frames_done``: frames from there on are not written yet.
+    The group holds what ``frames.npz`` holds, by the same names. ``sonar``, ``level``, ``level_scale``, ``about`` and
+    ``names`` are attributes, and so is ``frames_done``: frames from there on are not written yet.
     """
 
     def __init__(self, group: zarr.Group, path: Path) -> None:
@@ -39,8 +39,9 @@ class FrameStore:
         """An empty store for ``frames`` frames that look like the ones in ``like``."""
         group = zarr.open_group(path, mode="w", zarr_format=3)
         table = like.arrays()
-        for name in ("level", "level_scale", "sonar", "about"):
-            group.attrs[name] = table.pop(name).item()
+        for name in ("level", "level_scale", "sonar", "about", "names"):
+            if name in table:
+                group.attrs[name] = table.pop(name).item()
         for name, values in table.items():
             each = name in PER_FRAME or name == "pitch_rad"
             shape = (frames, *values.shape[1:]) if each else values.shape

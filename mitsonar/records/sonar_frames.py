@@ -58,6 +58,9 @@ class SonarFrames:
         elevation_rad: elevation of the strongest echo of each pixel, like ``image``, float32.
         shape_id: the shape of that echo (its place in the scene), int32.
         object_id: the object of that echo, as its mesh numbers them (attribute ``face_id``; 0 without it), int32.
+        shape_names: name of each shape by its ``shape_id``; empty where they are not known.
+        object_names: name of each object by its ``object_id``, the shape that it is part of and its number: ``cubes 12``;
+            empty where they are not known.
         shadow: 0 not in shadow; 1 no echo here, but echoes before and sound or echoes beyond; 2 no echo here and all
             sound of the beam was intercepted before (an object's shadow that nothing ends, or past the lit floor).
     """
@@ -75,6 +78,8 @@ class SonarFrames:
     shape_id: NDArray[np.int32] | None = None
     object_id: NDArray[np.int32] | None = None
     shadow: NDArray[np.uint8] | None = None
+    shape_names: tuple[str, ...] = ()
+    object_names: tuple[str, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,7 +111,7 @@ class SonarFrames:
         return SonarFrames(**picked, **rest)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What ``frames.npz`` holds, by name; ``sonar`` and ``about`` are JSON texts."""
+        """Return what ``frames.npz`` holds, by name; ``sonar``, ``about`` and ``names`` are JSON texts."""
         table = {
             "image": self.image,
             "range_m": self.range_m,
@@ -119,6 +124,8 @@ class SonarFrames:
         }
         optional = ("poses", "height_m", *LABELS)
         table |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
+        if self.shape_names or self.object_names:
+            table["names"] = np.array(json.dumps({"shapes": self.shape_names, "objects": self.object_names}))
         return table | ({} if self.poses is None else {"pitch_rad": self.poses[:, 3]})
 
     @classmethod
@@ -130,13 +137,23 @@ class SonarFrames:
             raise MitsonarError(f"{source} lacks {', '.join(missing)}: it is not a frames file of mitsonar")
         sonar = Sonar.create(**table_in(table, "sonar", source))
         about = table_in(table, "about", source, "{}")
+        names = table_in(table, "names", source, "{}")
         try:
             level, scale = text_of(table, "level", "linear"), number_of(table, "level_scale", 1.0)
         except MitsonarError as error:
             raise MitsonarError(f"{source}: {error}") from None
         values = {name: table[name] for name in COLUMNS if name in table}
         _check_values(values, source)
-        return cls(**values, sonar=sonar, level=level, level_scale=scale, about=about)
+        shapes, objects = (_texts(names, key, source) for key in ("shapes", "objects"))
+        return cls(
+            **values,
+            sonar=sonar,
+            level=level,
+            level_scale=scale,
+            about=about,
+            shape_names=shapes,
+            object_names=objects,
+        )
 
     def save(self, path: str | Path) -> None:
         """Write ``frames.npz``."""
@@ -168,6 +185,18 @@ class SonarFrames:
             reason = " ".join(str(error).split())[:300] or type(error).__name__
             raise MitsonarError(f"cannot read frames {path}: {reason}; give frames.npz or a run's folder") from None
         return cls.from_arrays(table, str(path))
+
+
+def _texts(names: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
+    """Return the texts of a list in the field ``names``.
+
+    Raises:
+        MitsonarError: it is no list of texts.
+    """
+    found = names.get(key, [])
+    if not (isinstance(found, list) and all(isinstance(one, str) for one in found)):
+        raise MitsonarError(f"{source}: {key} of the field names must be a list of texts; the file is damaged")
+    return tuple(found)
 
 
 def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:

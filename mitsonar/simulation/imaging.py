@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
-from mitsonar.simulation.labels import labels_of
+from mitsonar.simulation.labels import labels_above, labels_of
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
 
@@ -174,8 +174,9 @@ class Simulator:
         seed: int = 0,
         labels: bool = False,
         gain: float | None = None,
+        label_floor: float = 0.0,
     ) -> SonarFrames:
-        """All frames in memory.
+        """Render all frames into memory.
 
         Args:
             trajectory: poses with times, or poses ``(frames, 6)`` [m, rad], one every ``1 / frame_rate_hz``.
@@ -183,6 +184,7 @@ class Simulator:
             seed: of the noise; the jitter's is the sonar's.
             labels: per-pixel truth as well.
             gain: the constant that levels are multiplied by; default: from the first 20 frames.
+            label_floor: part of full scale above which a pixel is labelled; 0: every echo.
 
         Warns:
             MitsonarWarning: nothing hit, returns outside the window, saturated pixels, too few rays a bin, BSDFs
@@ -203,7 +205,8 @@ class Simulator:
             frames = np.arange(pings.first, pings.first + len(pings))
             images.append(image if noise is None else noise.apply(image, seed=seed, frames=frames))
             heights.append(pings.height_m)
-            truth.append(pings.labels)
+            truth.append(labels_above(pings, image, label_floor))
+        names = self.label_names(labels)
         labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
         for sentence in [*self.notes, *tally.warnings(self, trajectory.poses)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
@@ -217,7 +220,16 @@ class Simulator:
             height_m=np.concatenate(heights),
             level_scale=1 / gain,
             **labelled,
+            shape_names=names[0],
+            object_names=names[1],
         )
+
+    def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names that labels refer to, of shapes and of objects; none without labels."""
+        from mitsonar.simulation.scene import object_names_in, shape_names_in
+
+        scene = self.tracer.scene
+        return (shape_names_in(scene), object_names_in(scene)) if labels else ((), ())
 
     def step(
         self,
@@ -228,6 +240,7 @@ class Simulator:
         seed: int = 0,
         labels: bool = False,
         gain: float | None = None,
+        label_floor: float = 0.0,
     ) -> SonarFrames:
         """Render the next ping of a closed loop, in which each pose follows from the frame before it.
 
@@ -243,6 +256,7 @@ class Simulator:
             seed: of the noise; the jitter's is the sonar's.
             labels: per-pixel truth as well.
             gain: the constant that levels are multiplied by; default: set on the first frame with echoes.
+            label_floor: part of full scale above which a pixel is labelled; 0: every echo.
 
         Returns:
             One frame.
@@ -264,6 +278,7 @@ class Simulator:
             self.gain = constant_gain([pings])[0] if gain is None else gain
         kept = 1.0 if self.gain is None else self.gain
         self._stepped = number + 1
+        names = self.label_names(labels)
         image = to_image(pings, kept)
         self._warn_once(pings, image, table)
         return SonarFrames(
@@ -275,7 +290,9 @@ class Simulator:
             poses=table,
             height_m=pings.height_m,
             level_scale=1 / kept,
-            **pings.labels,
+            **labels_above(pings, image, label_floor),
+            shape_names=names[0],
+            object_names=names[1],
         )
 
     def reset(self) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mitsonar.simulation.rendered_pings import RenderedPings
 
-__all__ = ["labels_of", "shadow"]
+__all__ = ["labels_above", "labels_of", "shadow"]
 
 
 def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
@@ -31,9 +31,32 @@ def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[
     }
 
 
-def shadow(pings: RenderedPings) -> NDArray[np.uint8]:
-    """0 lit or not yet intercepted; 1 dark between what intercepts and what still travels; 2 dark beyond all echoes."""
-    echo = pings.levels > 0
+def labels_above(pings: RenderedPings, image: NDArray[np.float32], floor: float) -> dict[str, Any]:
+    """Return the label maps of a batch without the pixels whose level is at most ``floor``.
+
+    Args:
+        pings: with labels, or without.
+        image: their levels times the gain, before noise ``(frames, bins, beams)``, 0..1.
+        floor: part of full scale; 0: every echo is labelled, however faint.
+    """
+    if floor <= 0 or not pings.labels:
+        return pings.labels
+    bright = image > floor
+    empty = {"elevation_rad": np.float32(np.nan), "shape_id": np.int32(-1), "object_id": np.int32(-1)}
+    kept = {name: np.where(bright, pings.labels[name], nothing) for name, nothing in empty.items()}
+    return {**kept, "shadow": shadow(pings, bright)}
+
+
+def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
+    """Return where no echo came from ``(frames, bins, beams)``.
+
+    0: lit, or not yet intercepted. 1: dark between what intercepts and what still travels. 2: dark beyond all echoes.
+
+    Args:
+        pings: of a batch.
+        echo: which pixels count as echoes; default: all that are not 0.
+    """
+    echo = pings.levels > 0 if echo is None else echo
     nearer = np.logical_or.accumulate(echo, axis=1) | (pings.counts.nearer > 0)[:, None]
     still = np.logical_or.accumulate(echo[:, ::-1], axis=1)[:, ::-1]
     still = still | ((pings.counts.farther > 0) | (pings.counts.missed > 0))[:, None]

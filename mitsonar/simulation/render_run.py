@@ -21,9 +21,11 @@ from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import save_fan
+from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.simulation.labels import labels_above
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
 from mitsonar.simulation.variant import ensure_variant
@@ -35,8 +37,11 @@ SIMULATORS = ("mitsonar", "mitsuba", "drjit", "numpy")
 
 RENDERING = RunKind(
     "rendering",
-    outputs=("frames.npz", "frames.zarr", "images", "cartesian", "echoes", "poses.tum"),
-    notes={"frames_done": int, "gain": float, "tally": dict, "warnings": list},
+    outputs=("frames.npz", "frames.zarr", "images", "cartesian", "fan", "echoes", "poses.tum"),
+    notes={
+        **{"frames_done": int, "gain": float, "tally": dict, "warnings": list},
+        **{"shape_names": list, "object_names": list},
+    },
     packages=SIMULATORS,
     deciding=SIMULATORS[:3],
 )
@@ -58,17 +63,31 @@ class Source(Protocol):
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window [m]."""
 
+    def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names that labels refer to, of shapes and of objects; none without labels."""
+
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a run writes beside its frames."""
+    """What a run writes beside its frames.
+
+    Attributes:
+        noise: that is added.
+        labels: per-pixel truth.
+        cartesian: a figure with axes for each frame.
+        exr: the echoes of each ray.
+        frame: the convention of ``poses.tum``.
+        fan: a plain fan picture for each frame, and of its labels.
+        label_floor: part of full scale above which a pixel is labelled.
+    """
 
     noise: NoiseModel
     labels: bool = False
     cartesian: bool = False
     exr: bool = False
     frame: str = "mitsonar"
-    """The convention of ``poses.tum``."""
+    fan: bool = False
+    label_floor: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,8 +143,8 @@ def run(
             store.pack(made.path / "frames.npz")
     if not made.finished:
         made.finish()
-    pictures = "cartesian" if outputs.cartesian else "images"
-    found = sorted((made.path / pictures).glob("*.png"))
+    pictures = "cartesian" if outputs.cartesian else "fan" if outputs.fan else "images"
+    found = sorted((made.path / pictures).glob("[0-9]*[0-9].png"))
     return RenderReport(made.path, len(trajectory), found, made.notes.get("warnings") or [])
 
 
@@ -142,6 +161,8 @@ def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dic
         "cartesian": outputs.cartesian,
         "exr": outputs.exr,
         "frame": outputs.frame,
+        "fan": outputs.fan,
+        "label_floor": outputs.label_floor,
     }
 
 
@@ -157,10 +178,13 @@ def _make_frames(
     if store is not None and done == len(trajectory):
         return store
     batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
+    names = source.label_names(outputs.labels)
+    if outputs.labels:
+        made.notes |= {"shape_names": list(names[0]), "object_names": list(names[1])}
     if done == 0:
         made.notes["gain"], batches = constant_gain(batches)
     for pings in batches:
-        frames, image = _frames_of(pings, source.sonar, trajectory, outputs.noise, _gain(made))
+        frames, image = _frames_of(pings, source.sonar, trajectory, outputs, _gain(made), names)
         store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
         _write_pictures(folder, pings.first, frames, outputs)
         if outputs.exr:
@@ -242,15 +266,24 @@ class StoredEchoes:
         """Nearest and farthest return outside the window [m]."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 
+    def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return none: stored echoes have no labels."""
+        return (), ()
+
 
 def _frames_of(
-    pings: RenderedPings, sonar: Sonar, trajectory: Trajectory, noise: NoiseModel, gain: float
+    pings: RenderedPings,
+    sonar: Sonar,
+    trajectory: Trajectory,
+    outputs: Outputs,
+    gain: float,
+    names: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
     """A batch as frames, and its images before noise."""
     image = to_image(pings, gain)
     numbers = np.arange(pings.first, pings.first + len(pings))
     frames = SonarFrames(
-        image=np.ascontiguousarray(noise.apply(image, seed=sonar.seed, frames=numbers)),
+        image=np.ascontiguousarray(outputs.noise.apply(image, seed=sonar.seed, frames=numbers)),
         range_m=sonar.range_m,
         bearing_rad=sonar.bearing_rad,
         time_s=trajectory.time_s[numbers],
@@ -258,7 +291,9 @@ def _frames_of(
         poses=trajectory.poses[numbers],
         height_m=pings.height_m,
         level_scale=1 / gain,
-        **pings.labels,
+        **labels_above(pings, image, outputs.label_floor),
+        shape_names=names[0],
+        object_names=names[1],
     )
     return frames, image
 
@@ -269,6 +304,11 @@ def _write_pictures(folder: Path, first: int, frames: SonarFrames, outputs: Outp
         buffer = io.BytesIO()
         Image.fromarray(picture).save(buffer, format="PNG", compress_level=3)
         write_whole(folder / "images" / f"{first + index:06d}.png", buffer.getvalue())
+    if outputs.fan:
+        (folder / "fan").mkdir(exist_ok=True)
+        pictures = FanPictures(frames)
+        for index in range(len(frames)):
+            pictures.save(folder / "fan", frames, index, first + index)
     if outputs.cartesian:
         (folder / "cartesian").mkdir(exist_ok=True)
         for index in range(len(frames)):

@@ -7,6 +7,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -18,7 +20,19 @@ from mitsonar.worlds.scene_text import check_nesting
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["channel_sonar_in", "find_scene", "load_scene", "shipped_scenes", "shipped_trajectory", "sonar_in"]
+__all__ = [
+    "channel_sonar_in",
+    "find_scene",
+    "load_scene",
+    "object_names_in",
+    "shape_names_in",
+    "shipped_scenes",
+    "shipped_trajectory",
+    "sonar_in",
+]
+
+MOST_OBJECTS = 1_000_000
+"""Objects that are named; beyond, their numbers have to do."""
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -74,6 +88,25 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
     if not isinstance(scene, mi.Scene):
         raise MitsonarError(f"{path} holds a {type(scene).__name__.lower()}, not a scene: wrap it in <scene>")
     return scene
+
+
+def shape_names_in(scene: mi.Scene) -> tuple[str, ...]:
+    """Return the name of each shape of a scene, by the place in it that ``shape_id`` tells."""
+    return tuple(shape.id() for shape in scene.shapes())
+
+
+def object_names_in(scene: mi.Scene) -> tuple[str, ...]:
+    """Return the name of each object of a scene's meshes, by the number that ``object_id`` tells: ``cubes 12``.
+
+    An object is what a mesh numbers by its attribute ``face_id``. Number 0 is what no mesh numbers; its name is empty.
+    """
+    names: dict[int, str] = {}
+    for shape in scene.shapes():
+        if shape.is_mesh() and shape.has_attribute("face_id")[0]:
+            for number in np.unique(np.array(shape.attribute_buffer("face_id"))).astype(int):
+                names.setdefault(int(number), f"{shape.id()} {number}" if number else "")
+    last = max(names, default=-1)
+    return tuple(names.get(number, "") for number in range(last + 1)) if 0 < last < MOST_OBJECTS else ()
 
 
 def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
