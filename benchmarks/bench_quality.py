@@ -25,7 +25,7 @@ from bench_render import machine
 from numpy.typing import NDArray
 
 import mitsonar
-from mitsonar.instruments.named_sonars import PRESETS, preset
+from mitsonar.instruments.named_sonars import named_sonars, preset
 from mitsonar.instruments.quality import FAR_GRAZING_RAD, QUALITIES
 from mitsonar.io.whole_files import write_whole
 from mitsonar.simulation.variant import ensure_variant
@@ -58,7 +58,7 @@ def main() -> None:
     if args.law:
         shown = ("didson300", "oculus-m1200d-1200khz", "oculus-m1200d-2100khz")
         return law(shown[:1] if args.quick else shown, 1 if args.quick else PINGS)
-    names = ("didson300", "aris3000") if args.quick else tuple(PRESETS)
+    names = ("didson300", "aris3000") if args.quick else tuple(named_sonars())
     rows = {name: qualities(name, *((1, 2, 3) if args.quick else (PINGS, REFERENCE_PINGS, 15))) for name in names}
     if args.write:
         write(rows)

@@ -19,7 +19,7 @@ from mitsonar.cli import application
 FOLDER = Path(__file__).parent / "reference"
 
 GROUPS = {
-    "Scenes and sonars": ("load_scene", "load_sonar", "PRESETS", "Sonar", "ChannelSonar"),
+    "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar"),
     "Poses and paths": ("Pose", "Motion", "Trajectory"),
     "Simulation": ("Simulator", "ChannelSimulator", "load_noise", "NoiseModel"),
     "Records": ("SonarFrames", "ImpulseResponses", "load_frames"),

@@ -17,11 +17,11 @@ def presets(
 ) -> None:
     """Print the sonars that can be named, or one of them with the document behind each number."""
     from mitsonar.instruments.imaging_sonar import RAYS
-    from mitsonar.instruments.named_sonars import PRESETS, preset, preset_sources
+    from mitsonar.instruments.named_sonars import named_sonars, preset
 
     if name is not None:
-        sonar, sources = preset(name), preset_sources(name)
-        say(f"{name}: {PRESETS[name][0]}")
+        sonar, sources = preset(name), named_sonars()[name].sources
+        say(f"{name}: {named_sonars()[name].about}")
         for key, value in sonar.model_dump(exclude={"name"}).items():
             shown = f"{value:g}" if isinstance(value, float) else str(value)
             source = sources.get(key, "from quality" if key in RAYS else "default")
@@ -30,13 +30,13 @@ def presets(
             say(line)
         return
     say(f"{'preset':22} {'az x el (deg)':14} {'beams':>5} {'width':>6}  {'window (m)':12} {'bins':>5}  instrument")
-    for key, (title, _) in PRESETS.items():
+    for key, (title, *_) in named_sonars().items():
         sonar = preset(key)
         width = "-" if sonar.beam_width_deg is None else f"{sonar.beam_width_deg:g}"
         field = f"{sonar.azimuth_fov_deg:g} x {sonar.elevation_fov_deg:g}"
         window = f"{sonar.range_min:g}..{sonar.range_max:g}"
         say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
-    for line in _accuracy(list(PRESETS)):
+    for line in _accuracy(list(named_sonars())):
         say(line)
     say("`mitsonar presets NAME` prints where each number comes from; docs/guides/sonars.md tells how to write your own.")
 

@@ -8,24 +8,24 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import RAYS, Sonar
-from mitsonar.instruments.named_sonars import PRESETS, load_sonar, preset, preset_sources, sonar_from
+from mitsonar.instruments.named_sonars import load_sonar, named_sonars, preset, sonar_from
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", named_sonars())
 def test_preset_is_valid_and_every_number_has_a_source(name: str) -> None:
-    sonar, sources = preset(name), preset_sources(name)
+    sonar, sources = preset(name), named_sonars()[name].sources
     assert sonar.name == name
-    assert PRESETS[name][0].strip()
+    assert named_sonars()[name].about.strip()
     assert all(isinstance(source, str) and len(source.strip()) >= 4 for source in sources.values())
     given = {key for key, value in sonar.model_dump().items() if value != getattr(Sonar(), key)} - {"name", *RAYS}
     assert not set(RAYS) & sonar.model_fields_set  # they follow from quality
     assert given <= set(sources)  # nothing differs from the defaults without a source
     assert {"azimuth_fov_deg", "elevation_fov_deg", "beams", "range_min", "range_max", "range_bins"} <= set(sources)
-    assert {key: getattr(sonar, key) for key in sources} == {key: value for key, (value, _) in PRESETS[name][1].items()}
+    assert {key: getattr(sonar, key) for key in sources} == named_sonars()[name].values
 
 
 def test_numbers_of_the_reference() -> None:
-    """SPEC.md, section 2: DIDSON 300 has 29 x 14 deg, 96 beams, 512 bins, 21 frames/s; the thesis's looking-down sonar."""
+    """DIDSON 300 has 29 x 14 deg, 96 beams, 512 bins, 21 frames/s; Almanza-Medina's chapter 4 looks down over 100 x 100 deg."""
     didson, down = preset("didson300"), preset("lookdown100")
     assert (didson.azimuth_fov_deg, didson.elevation_fov_deg, didson.beams, didson.range_bins) == (29, 14, 96, 512)
     assert didson.frame_rate_hz == 21
@@ -42,7 +42,7 @@ def test_unknown_preset_names_the_nearest(wrong: str, near: str) -> None:
         load_sonar(wrong)
     assert all(name in str(caught.value) for name in PRESETS)
     with pytest.raises(MitsonarError, match=f"did you mean {near}"):
-        preset_sources(wrong)
+        load_sonar(wrong)
 
 
 def test_yaml_file(tmp_path: Path) -> None:

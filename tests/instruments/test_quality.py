@@ -13,7 +13,7 @@ from helpers import diffuse, floor, floor_levels, scene, slope
 from mitsonar.config.data_recipe import load_recipe
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import RAYS, Sonar
-from mitsonar.instruments.named_sonars import PRESETS, load_sonar, preset, sonar_from
+from mitsonar.instruments.named_sonars import load_sonar, named_sonars, preset, sonar_from
 from mitsonar.instruments.quality import (
     FAR_GRAZING_RAD,
     QUALITIES,
@@ -72,7 +72,7 @@ def test_the_table_is_of_these_presets_and_these_rays() -> None:
     """Change the law or a preset, and `python benchmarks/bench_quality.py --write` is to be run again."""
     about, measured = measured_errors()
     assert about.strip()
-    assert list(measured) == list(PRESETS)
+    assert list(measured) == list(named_sonars())
     for name, rows in measured.items():
         assert list(rows) == list(QUALITIES)
         for quality, row in rows.items():
@@ -197,7 +197,7 @@ def test_an_unknown_quality_in_xml_names_the_nearest(variant: str) -> None:
 
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_the_thesis_model_keeps_its_own_numbers(quality: str) -> None:
-    for name in PRESETS:
+    for name in named_sonars():
         rays = 1000 if name == "lookdown100" else 700
         thesis = preset(name).replace(quality=quality).replace(model="thesis")
         assert (thesis.rays_per_beam, thesis.across, thesis.columns) == (rays, 1, thesis.beams)
