@@ -18,9 +18,8 @@ import pytest
 import yaml
 from helpers import TINY, Command, by_itself, refused
 from hostile_readers import (
+    ASKED,
     READERS,
-    RECIPE,
-    STATE,
     TALLY,
     attack,
     frames,
@@ -28,9 +27,13 @@ from hostile_readers import (
     make_exr,
     make_frames_zarr,
     make_meshes,
+    make_odometry,
+    make_run,
     make_store,
     read_exr,
     read_meshes,
+    read_odometry,
+    read_run,
     responses,
     serialized,
 )
@@ -664,38 +667,63 @@ def test_a_device_that_never_ends() -> None:
 
 
 BAD_STATES: dict[str, dict[str, Any]] = {
-    **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12)},
+    **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12, 9)},
     **{f"gain {value}": {"gain": value} for value in ("2", 0, -1.0, float("nan"), None)},
     **{f"tally {value}": {"tally": value} for value in (None, [], {}, {**TALLY, "worst": 3}, {**TALLY, "rays": {"a": 1}})},
     "tally of texts": {"tally": {**TALLY, "pixels": "9"}},
     "worst frame": {"tally": {**TALLY, "worst": [1, 99]}},
+    "an empty frame that is not told": {"tally": {**TALLY, "first_empty": []}},
+    "an empty frame beyond": {"tally": {**TALLY, "first_empty": [10, 0, 0, 0, 2]}},
+    "more saturated pixels than pixels": {"tally": {**TALLY, "pixels": 0, "filled": 0, "saturated": 1}},
     "warnings": {"warnings": "none"},
     "finished": {"finished": "no"},
-    "recipe": {"recipe": [1]},
+    "asked": {"asked": [1]},
+    "versions": {"versions": "none"},
+    "another key": {"more": 1},
 }
+
+
+def changed_run(folder: Path, **changes: Any) -> None:
+    changed_metadata(folder / "run.json", lambda value: value.update(changes))
 
 
 @pytest.mark.parametrize("name", BAD_STATES)
 def test_a_run_that_cannot_go_on(name: str, tmp_path: Path) -> None:
     """Counts of another type were tracebacks on --resume."""
-    from mitsonar.simulation.render_run import begin
-
-    (tmp_path / "run.json").write_text(json.dumps(STATE | BAD_STATES[name]))
-    said = refusal(lambda: begin(tmp_path, RECIPE, "frames", overwrite=False, resume=True))
+    make_run(tmp_path)
+    read_run(tmp_path)
+    changed_run(tmp_path, **BAD_STATES[name])
+    said = refusal(lambda: read_run(tmp_path))
     assert "damaged" in said
     assert "--overwrite" in said
 
 
-def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
-    from mitsonar.mapping.odometry_run import OdometryFolder
+def test_a_run_that_tells_no_gain_cannot_go_on(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    for name, words in (("gain", "tells no gain"), ("tally", "tally must hold")):
+        before = (tmp_path / "run.json").read_bytes()
+        changed_metadata(tmp_path / "run.json", lambda value, name=name: value.pop(name))  # type: ignore[misc]
+        assert words in refusal(lambda: read_run(tmp_path))
+        (tmp_path / "run.json").write_bytes(before)
 
-    state = {"kind": "mitsonar odometry", "finished": False, "recipe": {"a": 1}}
+
+def test_what_differs_is_said_in_one_short_line(tmp_path: Path) -> None:
+    """Keys and values are a stranger's: of any length, with ends of lines."""
+    make_run(tmp_path)
+    changed_run(tmp_path, asked={**ASKED, "k" * 9000: 1, "line\nline": "a\nb"})
+    said = refusal(lambda: read_run(tmp_path))
+    assert "line line a b, not None" in said
+    assert len(said) < 1000
+
+
+def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
+    make_odometry(tmp_path)
+    before = (tmp_path / "run.json").read_bytes()
+    for change in ({"asked": [1]}, {"asked": 5}, {"factors": [None]}, {"seconds": "1"}, {"workers": 1.5}):
+        changed_run(tmp_path, **change)
+        assert "damaged" in refusal(lambda: read_odometry(tmp_path))
+        (tmp_path / "run.json").write_bytes(before)
     good = {"pair": 0, "motion": [0, 0, 0], "covariance": None, "valid": True, "reason": ""}
-    for change in ({"recipe": [1]}, {"recipe": 5}):
-        (tmp_path / "run.json").write_text(json.dumps(state | change))
-        assert "damaged" in refusal(
-            lambda: OdometryFolder.begin(tmp_path, {"recipe": {"a": 1}}, overwrite=False, resume=True)
-        )
     lines = [
         {"pair": "1"},
         {"pair": -1},
@@ -707,7 +735,18 @@ def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
     lines += [{"valid": 1}, {"reason": None}, {"covariance": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}]
     for line in lines:
         (tmp_path / "estimates.jsonl").write_text(json.dumps(good | line) + "\n")
-        assert "line 1 is damaged" in refusal(lambda: OdometryFolder(tmp_path, state).kept())
+        assert "line 1 is damaged" in refusal(lambda: read_odometry(tmp_path))
+
+
+@pytest.mark.parametrize("height", ["3", 0, -1.0, 1e9, float("nan"), [3.0], True])
+def test_a_height_of_an_odometry_that_cannot_be(height: Any, tmp_path: Path) -> None:
+    from mitsonar.mapping.odometry_run import OdometryFolder
+
+    make_odometry(tmp_path)
+    changed_run(tmp_path, finished=True, asked={"height_m": height})
+    assert "height_m must be a finite number" in refusal(lambda: OdometryFolder.open(tmp_path).height_m)
+    changed_run(tmp_path, asked={"height_m": 3})
+    assert OdometryFolder.open(tmp_path).height_m == 3.0
 
 
 # ---------------------------------------------------------------- checkpoints, echoes, trajectories
