@@ -48,6 +48,9 @@ from mitsonar.records.sonar_frames import SonarFrames
 SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
 """Readers that take 20 ms and more a mutant."""
 
+USUAL, FEWER = 200, 30
+"""Mutants in the tests that are run always, of the others and of those."""
+
 learn = pytest.mark.learn
 
 
@@ -68,8 +71,7 @@ def refusal(read: Callable[[], Any]) -> str:
 
 @pytest.mark.parametrize("name", cases())
 def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    """300 of each kind, 30 where reading one takes tens of milliseconds."""
-    count = 30 if name in SLOW else 300
+    count = FEWER if name in SLOW else USUAL
     found = attack(name, tmp_path, count)
     assert found["read"] + found["refused"] == count
     assert found["refused"] > 0
@@ -78,7 +80,7 @@ def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases())
 def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
-    found = attack(name, tmp_path, 10_000, first=300)
+    found = attack(name, tmp_path, 10_000, first=USUAL)
     print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
     assert min(found.values()) > 0
 
@@ -663,6 +665,39 @@ def test_a_device_that_never_ends() -> None:
     assert "larger than" in refusal(lambda: read_yaml("/dev/zero", "recipe"))
 
 
+@pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1])
+def test_what_is_no_count_is_refused(value: Any) -> None:
+    from mitsonar.io.plain_data import whole_number
+
+    assert refusal(lambda: whole_number(value, "beams")).startswith("beams must be a whole number in 0..2^63: got ")
+    assert whole_number(2**63 - 1, "beams") == 2**63 - 1
+
+
+@pytest.mark.parametrize("value", ["3", True, None, [3.0], float("nan"), float("inf"), -float("inf"), 10**400, -(10**5000)])
+def test_what_is_no_finite_number_is_refused(value: Any) -> None:
+    from mitsonar.io.plain_data import finite_number
+
+    assert refusal(lambda: finite_number(value, "gain")).startswith("gain must be a finite number: got ")
+    for number in (0, 2.0):
+        said = refusal(lambda number=number: finite_number(number, "gain", above=0, below=2))  # type: ignore[misc]
+        assert said == f"gain must be a finite number above 0 below 2: got {number}"
+    assert finite_number(1, "gain", above=0, below=2) == 1.0
+
+
+@pytest.mark.parametrize(
+    "content", ["[" * 100_000, "[]", "\0", '{"owner": "a"}', '{"owner": "a", "time": 1' + "0" * 400 + "}", '{"time": NaN}']
+)
+def test_a_writer_that_nobody_could_be_is_replaced(content: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who says that it writes an object storage; deep JSON was a traceback."""
+    from mitsonar.io.storage import Storage
+
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    place = Storage("memory://hostile")
+    place.write("writer.json", content.encode())
+    with place.locked() as still_ours:
+        still_ours()
+
+
 # ---------------------------------------------------------------- run.json
 
 
@@ -736,6 +771,29 @@ def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
     for line in lines:
         (tmp_path / "estimates.jsonl").write_text(json.dumps(good | line) + "\n")
         assert "line 1 is damaged" in refusal(lambda: read_odometry(tmp_path))
+
+
+def test_a_journal_that_never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_odometry(tmp_path)
+    (tmp_path / "estimates.jsonl").unlink()
+    (tmp_path / "estimates.jsonl").symlink_to("/dev/zero")
+    monkeypatch.setattr("mitsonar.mapping.odometry_run.LARGEST_JOURNAL", 1000)
+    assert "larger than 1,000 bytes" in refusal(lambda: read_odometry(tmp_path))
+
+
+def test_answers_that_promise_more_than_is_there(tmp_path: Path) -> None:
+    """A comparison is gone on with: its tables of answers are a stranger's too."""
+    from mitsonar.estimation.benchmark import Answers
+    from mitsonar.estimation.kept_answers import kept_answers
+
+    folder, methods = kept_answers(tmp_path / "out", {"a": 1}), {"flow": None}
+    folder.keep("high", "none", {"flow": Answers.unasked(4)})
+    assert folder.load("high", "none", methods, 4)["flow"].ms.shape == (4,)  # type: ignore[arg-type, index]
+    path = tmp_path / "out" / "answers-high-none.npz"
+    path.write_bytes(with_part(path.read_bytes(), "flow/ms.npy", header("(1000000000000,)")))
+    assert "is damaged" in refusal(lambda: folder.load("high", "none", methods, 4))  # type: ignore[arg-type]
+    changed_run(tmp_path / "out", finished="no")
+    assert "remove the folder" in refusal(lambda: kept_answers(tmp_path / "out", {"a": 1}))
 
 
 @pytest.mark.parametrize("height", ["3", 0, -1.0, 1e9, float("nan"), [3.0], True])
