@@ -41,7 +41,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from mutations import changed_bytes, limits, npz, outcome, with_part
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -665,7 +665,7 @@ def test_a_device_that_never_ends() -> None:
     assert "larger than" in refusal(lambda: read_yaml("/dev/zero", "recipe"))
 
 
-@pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1])
+@pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1], ids=shortened)
 def test_what_is_no_count_is_refused(value: Any) -> None:
     from mitsonar.io.plain_data import whole_number
 
@@ -673,7 +673,10 @@ def test_what_is_no_count_is_refused(value: Any) -> None:
     assert whole_number(2**63 - 1, "beams") == 2**63 - 1
 
 
-@pytest.mark.parametrize("value", ["3", True, None, [3.0], float("nan"), float("inf"), -float("inf"), 10**400, -(10**5000)])
+NO_NUMBERS: list[Any] = ["3", True, None, [3.0], float("nan"), float("inf"), -float("inf"), 10**400, -(10**5000)]
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=shortened)
 def test_what_is_no_finite_number_is_refused(value: Any) -> None:
     from mitsonar.io.plain_data import finite_number
 
