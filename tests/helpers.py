@@ -239,6 +239,31 @@ def tiny_recipe(**changes: Any) -> Any:
     return recipe_from(fields)
 
 
+TINY_TRAINING: dict[str, Any] = {
+    "recipe": {"network": "posenet", "split": "scene"},
+    "metrics": {"none": {"rmse": [3.0, 2.0, 0.1], "pairs": 50}, "high": {"rmse": [6.0, 2.0, 0.2], "pairs": 50}},
+    "trained": {"pairs": 1200, "minutes": 2.5, "epochs": 3, "seed": 0},
+}
+"""What a checkpoint tells of a training."""
+
+
+def tiny_network(seed: int = 0, **options: Any) -> Any:
+    """A small network with drawn weights."""
+    import torch
+
+    from mitsonar.networks.create import create_network
+
+    torch.manual_seed(seed)
+    return create_network("posenet", **{"width": 1 / 16, "size": (40, 24), **options})
+
+
+def tiny_samples(**words: Any) -> Any:
+    """The samples that the tiny recipe would give; there are none."""
+    from mitsonar.datasets.torch_pairs import Samples
+
+    return Samples(tiny_recipe(), **{"labels": "normx10", "noise": "low", **words})
+
+
 DOWN: dict[str, Any] = {
     "sonar__azimuth_fov_deg": 100.0,
     "sonar__elevation_fov_deg": 100.0,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import struct
 import warnings
@@ -16,13 +15,16 @@ from typing import Any
 import numpy as np
 import trimesh
 import yaml
-from helpers import HEARD, TINY, tiny_recipe
+from helpers import HEARD, TINY, TINY_TRAINING, tiny_network, tiny_recipe, tiny_samples
 from mutations import Rng, changed_arrays, changed_bytes, changed_json, changed_text, changed_value, npz
 
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.simulation.render_run import RENDERING, progress_of
 
 
 @dataclass(frozen=True)
@@ -152,13 +154,14 @@ def resume_frames(folder: Path) -> None:
 
 def make_store(folder: Path) -> None:
     from mitsonar.datasets.plan import Plan
-    from mitsonar.datasets.store import DataStore, versions
-    from mitsonar.io.storage import Place
+    from mitsonar.datasets.store import PACKAGES, DataStore
+    from mitsonar.io.provenance import versions
+    from mitsonar.io.storage import Storage
 
     recipe = tiny_recipe(sonar__beams=4, sonar__range_bins=6)
     plan = Plan.of(recipe, 10)
-    about = {"gain": 1.0, "level_scale": 1.0, "variant": "llvm_ad_mono", "versions": versions()}
-    store = DataStore.create(Place(folder / "data.zarr"), recipe, plan, about)
+    about = {"gain": 1.0, "level_scale": 1.0, "variant": "llvm_ad_mono", "versions": versions(PACKAGES)}
+    store = DataStore.create(Storage(folder / "data.zarr"), recipe, plan, about)
     store = DataStore.open(folder / "data.zarr", write=True, unfinished=True)
     for shard in range(store.shards):
         count = store.frames_of(shard).stop - store.frames_of(shard).start
@@ -227,34 +230,45 @@ def spoil_sonar(rng: Rng, folder: Path) -> None:
 # ---------------------------------------------------------------- runs
 
 
-RECIPE = {"scene": "x", "frames": 30, "sonar": SONAR.model_dump()}
-TALLY = {
+ASKED: dict[str, Any] = {"scene": "x", "frames": 30, "sonar": SONAR.model_dump()}
+TALLY: dict[str, Any] = {
     "frames": 10,
     "rays": {"inside": 5, "nearer": 0, "farther": 1, "missed": 2},
     "pixels": 9,
     "filled": 3,
     "saturated": 0,
     "worst": [1, 2],
+    "empty": 1,
+    "first_empty": [4, 0, 0, 0, 2],
 }
-STATE = {"finished": False, "frames_done": 10, "warnings": ["a"], "gain": 2.0, "tally": TALLY, "recipe": RECIPE}
+STATE = {"frames_done": 10, "warnings": ["a"], "gain": 2.0, "tally": TALLY}
+
+
+def begun(folder: Path, kind: RunKind, asked: dict[str, Any], **notes: Any) -> None:
+    """The file of a run that was broken off."""
+    run = RunDirectory.begin(folder, kind, asked)
+    run.start(**notes)
 
 
 def make_run(folder: Path) -> None:
-    (folder / "run.json").write_text(json.dumps(STATE))
+    begun(folder, RENDERING, ASKED, **STATE)
 
 
 def read_run(folder: Path) -> None:
-    from mitsonar.simulation.render_run import begin
-    from mitsonar.simulation.tally import Tally
-
-    state = begin(folder, RECIPE, "frames", overwrite=False, resume=True)
-    if state["finished"]:
+    run = RunDirectory.begin(folder, RENDERING, ASKED, resume=True)
+    if run.finished:
         return
-    assert isinstance(int(state["frames_done"]), int)
-    if state["frames_done"]:
-        assert float(state["gain"]) > 0
-        tally = Tally.restore(SONAR, state["tally"])
-        tally.warnings(None, np.zeros((30, 6))) if not (tally.rays["nearer"] + tally.rays["farther"]) else None
+    found = progress_of(run, SONAR, ASKED["frames"])
+    assert 0 <= found.frames <= 30
+    assert 0 < found.gain < np.inf
+    found.tally.warnings(Nearby(), np.zeros((30, 6)))
+
+
+class Nearby:
+    """A source whose returns lie outside the window, in any frame."""
+
+    def window_range(self, pose: Any, ping: int) -> tuple[float, float]:
+        return 0.1, 99.0
 
 
 def make_odometry(folder: Path) -> None:
@@ -262,20 +276,19 @@ def make_odometry(folder: Path) -> None:
     from mitsonar.mapping.odometry_run import _line_of
     from mitsonar.motion.composition import Motion
 
-    state = {"kind": "mitsonar odometry", "finished": False, "title": "t", "recipe": {"a": 1}}
-    (folder / "run.json").write_text(json.dumps(state))
+    begun(folder, ODOMETRY, {"a": 1}, source="s", scale=None, seconds=1.5)
     estimate = Estimate(Motion(0.1, 0.2, 0.3), np.eye(3), True, "", {})
     (folder / "estimates.jsonl").write_text("".join(_line_of(pair, estimate) for pair in range(3)))
 
 
 def read_odometry(folder: Path) -> None:
-    from mitsonar.mapping.odometry_run import OdometryFolder
-
-    OdometryFolder.begin(folder, {"recipe": {"a": 1}}, overwrite=False, resume=True).kept()
+    OdometryFolder(RunDirectory.begin(folder, ODOMETRY, {"a": 1}, resume=True)).kept()
 
 
 def spoil_odometry(rng: Rng, folder: Path) -> None:
-    path = folder / ("run.json" if rng.random() < 0.3 else "estimates.jsonl")
+    if rng.random() < 0.3:
+        return spoil_file("run.json", changed_json)(rng, folder)
+    path = folder / "estimates.jsonl"
     first, *rest = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(changed_json(rng, first) + b"\n" + b"".join(rest))
 
@@ -284,11 +297,9 @@ def spoil_odometry(rng: Rng, folder: Path) -> None:
 
 
 def make_checkpoint(folder: Path) -> None:
-    from test_checkpoint import ABOUT, samples, tiny
-
     from mitsonar.networks.checkpoint import Checkpoint
 
-    Checkpoint.of(tiny(), samples(), **ABOUT).save(folder / "network.ckpt")
+    Checkpoint.of(tiny_network(), tiny_samples(), **TINY_TRAINING).save(folder / "network.ckpt")
 
 
 def spoil_checkpoint(rng: Rng, folder: Path) -> None:

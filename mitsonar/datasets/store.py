@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +20,7 @@ from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import Modality, StoredArray, StoredAxis
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import check_plain, whole_number
+from mitsonar.io.plain_data import check_plain, finite_number, whole_number
 from mitsonar.io.provenance import other_versions
 from mitsonar.io.storage import Storage
 from mitsonar.records.columns import FEW_ROWS, rows_that_fit
@@ -484,8 +483,7 @@ def _check_attributes(about: dict[str, Any], recipe: Recipe, modality: Modality)
     if total != sequences or len(numbers) != len(about["scenes"]):
         raise ValueError(f"scenes have {total:,} sequences, {sequences:,} are promised for {frames:,} frames")
     for name in modality.settled:
-        if type(about[name]) not in (int, float) or not 0 < about[name] < math.inf:
-            raise ValueError(f"{name} must be a finite number above 0")
+        finite_number(about[name], name, above=0)
     versions = about["versions"]
     if not (isinstance(versions, dict) and isinstance(about["variant"], str)):
         raise ValueError("versions or variant is something else")

@@ -17,7 +17,7 @@ from mitsonar.estimation.benchmark_tables import table_lines
 from mitsonar.estimation.crlb.image_crlb import LAWS
 from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import read_json, write_json, write_whole
+from mitsonar.io.whole_files import read_json, read_npz, write_json, write_whole
 
 __all__ = ["COMPARISON", "AnswerFolder", "kept_answers"]
 
@@ -29,6 +29,7 @@ COMPARISON = RunKind(
     notes={},
     packages=("mitsonar", "numpy", "opencv-python-headless", "torch"),
     deciding=("mitsonar",),
+    replaced=False,
 )
 
 
@@ -76,8 +77,8 @@ class AnswersOnDisk(AnswerFolder):
         if not path.exists():
             return None
         try:
-            with np.load(path) as table:
-                found = {name: Answers.from_arrays(table, name) for name in methods}
+            table = read_npz(path)
+            found = {name: Answers.from_arrays(table, name) for name in methods}
             if any(len(values) != count for one in found.values() for values in vars(one).values()):
                 raise ValueError("it holds other numbers of pairs")
             return found

@@ -5,13 +5,15 @@ from __future__ import annotations
 import datetime
 import itertools
 import json
+import math
+import sys
 from typing import Any
 
 import yaml
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 
-__all__ = ["check_plain", "parse_json", "parse_yaml", "whole_number"]
+__all__ = ["check_plain", "finite_number", "parse_json", "parse_yaml", "whole_number"]
 
 DEEPEST = 40
 """Lists and tables within each other."""
@@ -28,13 +30,17 @@ MOST_BRACKETS = 200
 LARGEST_INTEGER = 2**64
 """Beyond it there is no seed and no count."""
 
+LARGEST_COUNT = 2**63 - 1
+"""What NumPy can count to."""
 
-def parse_json(text: str | bytes, source: str) -> Any:
+
+def parse_json(text: str | bytes, source: str, *, check: bool = True) -> Any:
     """The value of a JSON text.
 
     Args:
         text: of the file.
         source: is named in errors.
+        check: its depth, size and integers; without, :func:`check_plain` is the caller's to call.
 
     Raises:
         MitsonarError: not JSON, or of a depth, a size or with integers that cannot be.
@@ -45,7 +51,8 @@ def parse_json(text: str | bytes, source: str) -> Any:
         raise MitsonarError(f"{source} nests more than {DEEPEST} deep: it is damaged") from None
     except ValueError as error:
         raise MitsonarError(f"cannot read {source}: it is not JSON ({' '.join(str(error).split())[:160]})") from None
-    check_plain(value, source)
+    if check:
+        check_plain(value, source)
     return value
 
 
@@ -111,16 +118,29 @@ def check_plain(value: Any, source: str, most: int = MOST_VALUES) -> None:
             raise MitsonarError(f"{source} holds a {type(one).__name__}: only tables, lists, texts and numbers are known")
 
 
-def whole_number(value: Any, name: str, low: int, high: int) -> int:
+def whole_number(value: Any, name: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
     """A number of a file as an integer.
 
     Raises:
         MitsonarError: it is none, or outside ``low`` .. ``high``.
     """
     if type(value) is not int or not low <= value <= high:
-        said = repr(value)[:40] if isinstance(value, str | float | bool) or type(value) is int else type(value).__name__
-        raise MitsonarError(f"{name} must be a whole number in {low:,}..{high:,}: got {said}")
+        top = "2^63" if high == LARGEST_COUNT else f"{high:,}"
+        raise MitsonarError(f"{name} must be a whole number in {low:,}..{top}: got {shortened(value)}")
     return value
+
+
+def finite_number(value: Any, name: str, above: float = -math.inf, below: float = math.inf) -> float:
+    """A number of a file as a float.
+
+    Raises:
+        MitsonarError: it is none, not finite, or not between ``above`` and ``below``.
+    """
+    if type(value) not in (int, float) or not above < value < below or abs(value) > sys.float_info.max:
+        over = "" if above == -math.inf else f" above {above:g}"
+        under = "" if below == math.inf else f" below {below:g}"
+        raise MitsonarError(f"{name} must be a finite number{over}{under}: got {shortened(value)}")
+    return float(value)
 
 
 def _brackets(text: str) -> int:

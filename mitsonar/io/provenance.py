@@ -52,15 +52,15 @@ def differences(had: Mapping[str, Any], asked: Mapping[str, Any], within: str = 
     for key in [*asked, *(key for key in had if key not in asked)]:
         one, other = had.get(key), asked.get(key)
         if isinstance(one, Mapping) and isinstance(other, Mapping):
-            found += differences(one, other, f"{within}{key}.")
+            found += differences(one, other, f"{within}{shown(key)}.")
         elif one != other:
-            found.append(f"{within}{key} {shown(one)}, not {shown(other)}")
+            found.append(f"{within}{shown(key)} {shown(one)}, not {shown(other)}")
     return found
 
 
 def shown(value: object) -> str:
-    """A value in a sentence; a long one is cut."""
-    text = str(value)
+    """A value in a sentence, in one line; a long one is cut."""
+    text = " ".join(str(value).split())
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 

@@ -11,9 +11,11 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
+from mitsonar.io.plain_data import check_plain, finite_number, whole_number
 from mitsonar.io.provenance import plain_json, refuse_other, shown, versions
 from mitsonar.io.whole_files import read_json, write_json
 
@@ -24,9 +26,6 @@ RUN_FILE = "run.json"
 LEFT_BY_A_KILL = (".part", "writer.lock")
 """Ends of the names of files that a killed run may leave; a folder that holds only these is free."""
 
-DEEPEST = 20
-"""Levels of a run's file."""
-
 
 @dataclass(frozen=True)
 class RunKind:
@@ -36,16 +35,19 @@ class RunKind:
         name: in ``run.json`` and in sentences: ``odometry``.
         outputs: names (or patterns) of all that a run writes beside ``run.json``. A resumed run keeps them, a replaced one
             loses them; nothing else in the folder is ever removed.
-        notes: what ``run.json`` may tell of a run, with types: ``int`` is a count from 0, ``list`` holds texts and numbers.
+        notes: what ``run.json`` may tell of a run, with types: ``int`` is a count from 0, ``list`` holds texts and numbers,
+            ``float | None`` may be null.
         packages: those whose versions are kept.
         deciding: those without whose versions a run does not go on, since the rest would differ.
+        replaced: whether its command knows ``--overwrite``.
     """
 
     name: str
     outputs: tuple[str, ...]
-    notes: Mapping[str, type]
+    notes: Mapping[str, type | UnionType]
     packages: tuple[str, ...] = ("mitsonar", "numpy")
     deciding: tuple[str, ...] = ()
+    replaced: bool = True
 
 
 @dataclass
@@ -153,10 +155,26 @@ class RunDirectory:
         Raises:
             MitsonarError: it exceeds ``most``.
         """
-        found = self.notes.get(name) or 0
-        if found > most:
-            raise _damage(self.path / RUN_FILE, f"{name} is at most {most}, got {found}")
-        return int(found)
+        try:
+            return whole_number(self.notes.get(name, 0), name, 0, most)
+        except MitsonarError as error:
+            raise self.damage(error) from None
+
+    def amount(self, name: str) -> float | None:
+        """A note that is a number above 0, None where there is none.
+
+        Raises:
+            MitsonarError: it is 0 or less.
+        """
+        try:
+            return None if self.notes.get(name) is None else finite_number(self.notes[name], name, above=0)
+        except MitsonarError as error:
+            raise self.damage(error) from None
+
+    def damage(self, said: object) -> MitsonarError:
+        """The error that says of what is wrong with the run's file what can be done."""
+        do = "begin anew with --overwrite" if self.kind.replaced else "remove the folder"
+        return MitsonarError(f"{self.path / RUN_FILE} is damaged ({said}): {do}, or choose another -o")
 
     def _write(self) -> None:
         unknown = set(self.notes) - set(self.kind.notes)
@@ -195,59 +213,63 @@ def _holds_a_run(path: Path) -> bool:
 
 def _read(path: Path, kind: RunKind, *, damaged_will_do: bool = False) -> RunDirectory:
     """The run in a folder, every value of its type; of a damaged one that will be replaced, only the kind."""
-    file = path / RUN_FILE
-    told = read_json(file)
+    told = read_json(path / RUN_FILE, check=False)
     if told.get("kind") != kind.name:
         raise MitsonarError(f"{path} holds no {kind.name} of mitsonar and is kept as it is: choose another -o")
+    run = RunDirectory(path, kind, {}, {})
     if damaged_will_do:
-        return RunDirectory(path, kind, {}, {})
-    if _deeper_than(told, DEEPEST):
-        raise _damage(file, f"it has more than {DEEPEST} levels")
-    expected = {**OWN, **kind.notes}
-    for key, value in told.items():
-        if key not in expected:
-            raise _damage(file, f"unknown key {shown(key)}")
-        if not _is(value, expected[key]) and not (value is None and key in kind.notes):
-            raise _damage(file, f"{key} is {NAMES[expected[key]]}, got {shown(value)}")
-    lacking = set(OWN) - set(told)
-    if lacking:
-        raise _damage(file, f"it lacks {min(lacking)}")
-    notes = {key: told[key] for key in kind.notes if key in told}
-    state = {"finished": told["finished"], "_replaces": told["replaces"], "_started": True}
-    return RunDirectory(path, kind, told["asked"], told["versions"], notes, **state)
+        return run
+    try:
+        _check(told, kind)
+    except MitsonarError as error:
+        raise run.damage(error) from None
+    run.asked, run.versions, run.finished = told["asked"], told["versions"], told["finished"]
+    run.notes = {key: told[key] for key in kind.notes if key in told}
+    run._replaces, run._started = told["replaces"], True
+    return run
 
 
 OWN: dict[str, type] = {"kind": str, "finished": bool, "replaces": bool, "asked": dict, "versions": dict}
 """Keys of every run's file."""
 
-NAMES: dict[type, str] = {
-    bool: "true or false",
-    int: "a count",
-    float: "a finite number",
-    str: "a text",
-    dict: "an object",
-    list: "a list of texts and numbers",
-}
+NAMES: dict[type, str] = {bool: "true or false", str: "a text", dict: "an object"}
 
 
-def _is(value: object, expected: type) -> bool:
-    """Whether a value that JSON gave is what is expected."""
-    if expected is int:
-        return type(value) is int and 0 <= value < 2**63
-    if expected is float:
-        return type(value) in (int, float) and abs(value) < 1e300  # type: ignore[arg-type, operator]
-    if expected is list:
-        return isinstance(value, list) and all(_is(one, str) or _is(one, float) for one in value)
-    return type(value) is expected
+def _check(told: dict[str, Any], kind: RunKind) -> None:
+    """That a file's keys are those of a kind of run, and its values what they must be.
+
+    Raises:
+        MitsonarError: one is not.
+    """
+    check_plain(told, "it")
+    expected = {**OWN, **kind.notes}
+    for key, value in told.items():
+        if key not in expected:
+            raise MitsonarError(f"unknown key {shown(key)}")
+        _check_value(value, key, expected[key])
+    lacking = set(OWN) - set(told)
+    if lacking:
+        raise MitsonarError(f"it lacks {min(lacking)}")
 
 
-def _deeper_than(value: object, levels: int) -> bool:
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return levels < 0 or any(_deeper_than(one, levels - 1) for one in inner)
-
-
-def _damage(file: Path, said: str) -> MitsonarError:
-    return MitsonarError(f"{file} is damaged ({said}): remove the folder, or choose another -o")
+def _check_value(value: Any, name: str, expected: type | UnionType) -> None:
+    """That a value of the file is what is expected."""
+    if isinstance(expected, UnionType):
+        known, _ = get_args(expected)
+        if value is not None:
+            _check_value(value, name, known)
+    elif expected is int:
+        whole_number(value, name)
+    elif expected is float:
+        finite_number(value, name)
+    elif expected is list:
+        if not isinstance(value, list) or not all(isinstance(one, str | int | float) for one in value):
+            raise MitsonarError(f"{name} must be a list of texts and numbers: got {shortened(value)}")
+        for place, one in enumerate(value):
+            if not isinstance(one, str):
+                finite_number(one, f"{name}[{place}]")
+    elif type(value) is not expected:
+        raise MitsonarError(f"{name} must be {NAMES[expected]}: got {shortened(value)}")
 
 
 def _remove(path: Path, outputs: Iterable[str]) -> None:

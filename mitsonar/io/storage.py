@@ -12,7 +12,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import zarr
 from fsspec.core import url_to_fs
@@ -20,6 +19,7 @@ from fsspec.implementations.local import LocalFileSystem
 from zarr.abc.store import Store
 
 from mitsonar.errors import MitsonarError
+from mitsonar.io.plain_data import finite_number, parse_json
 
 __all__ = ["Storage"]
 
@@ -168,17 +168,17 @@ class Storage:
 
     def _owner(self) -> str:
         """Who says that it writes here."""
-        return str(json.loads(self.read(LOCK))["owner"])
+        return str(parse_json(self.read(LOCK), LOCK)["owner"])
 
     def _say(self, owner: str) -> None:
         self.write(LOCK, json.dumps({"owner": owner, "time": time.time()}).encode())
 
     def _refuse_if_written(self, besides: str = "") -> None:
         try:
-            found: dict[str, Any] = json.loads(self.read(LOCK))
-            age = time.time() - float(found["time"])
+            found = parse_json(self.read(LOCK), LOCK)
+            age = time.time() - finite_number(found["time"], "time")
             owner = str(found["owner"])
-        except (FileNotFoundError, ValueError, KeyError, TypeError):
+        except (FileNotFoundError, ValueError, KeyError, TypeError):  # nobody whom we could name
             return
         if owner != besides and age < STALE_S:
             host, process, *_ = [*owner.split(), "?"]

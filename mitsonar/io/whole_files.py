@@ -92,13 +92,17 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
     return content
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
+def read_json(path: str | Path, *, check: bool = True) -> dict[str, Any]:
     """The object in a JSON file.
+
+    Args:
+        path: of the file.
+        check: see :func:`~mitsonar.io.plain_data.parse_json`.
 
     Raises:
         MitsonarError: no such file, not JSON, not an object, or of a size that cannot be.
     """
-    value = parse_json(read_bytes(path, "file", LARGEST_JSON), str(path))
+    value = parse_json(read_bytes(path, "file", LARGEST_JSON), str(path), check=check)
     if not isinstance(value, dict):
         raise MitsonarError(f"{path} must hold a JSON object")
     return value

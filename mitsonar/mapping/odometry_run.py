@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
-from mitsonar.io.plain_data import parse_json, whole_number
-from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
-from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.io.plain_data import finite_number, parse_json, whole_number
+from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.whole_files import read_bytes, write_json, write_whole
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source
 from mitsonar.motion.composition import Motion
@@ -38,12 +38,16 @@ ODOMETRY = RunKind(
         *("table.md", "table.json", "path.png"),
     ),
     notes={
-        **{"source": str, "inputs": str, "smooth": str, "scale": str, "frame": str, "factors": list, "from": list},
+        **{"source": str, "inputs": str, "smooth": str, "scale": str | None, "frame": str, "factors": list, "from": list},
         **{"not_believed": int, "warnings": list, "seconds": float, "pairs_in_these_seconds": int, "workers": int},
     },
     packages=("mitsonar", "numpy", "scipy", "opencv-python-headless"),
     deciding=("mitsonar",),
 )
+
+
+LARGEST_JOURNAL = 2**30
+"""Bytes: some three million pairs."""
 
 
 class OdometryFolder:
@@ -77,9 +81,10 @@ class OdometryFolder:
             MitsonarError: ``run.json`` is damaged.
         """
         height = self.run.asked.get("height_m")
-        if height is None or (type(height) in (int, float) and 0 < height < 1e6):
-            return height
-        raise MitsonarError(f"{self.path / RUN_FILE} is damaged (height_m is {height!r}): make the odometry again")
+        try:
+            return None if height is None else finite_number(height, "height_m", above=0, below=1e6)
+        except MitsonarError as error:
+            raise self.run.damage(error) from None
 
     @property
     def estimated(self) -> Trajectory:
@@ -108,7 +113,7 @@ class OdometryFolder:
         journal = self.path / "estimates.jsonl"
         if not journal.exists():
             return {}
-        content = journal.read_bytes()
+        content = read_bytes(journal, "journal", LARGEST_JOURNAL)
         whole = content[: content.rfind(b"\n") + 1]
         if len(whole) < len(content):
             with journal.open("r+b") as file:

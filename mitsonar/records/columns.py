@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import parse_json
+from mitsonar.io.plain_data import finite_number, parse_json, whole_number
 from mitsonar.io.whole_files import read_json, refuse_beyond_memory
 
 __all__ = [
@@ -119,9 +119,8 @@ def number_of(table: Mapping[str, Any], name: str, default: float) -> float:
         MitsonarError: it is none.
     """
     value = np.asarray(table.get(name, default))
-    if value.ndim or value.dtype.kind not in "fiu" or not 0 < float(value) < math.inf:
-        raise MitsonarError(f"{name} must be a finite number above 0: got {str(value)[:40]}")
-    return float(value)
+    single = value.ndim == 0 and value.dtype.kind in "fiu"
+    return finite_number(float(value) if single else str(value), name, above=0)
 
 
 def table_in(table: Mapping[str, Any], name: str, source: str, default: str | None = None) -> dict[str, Any]:
@@ -172,8 +171,7 @@ def open_group(path: Path, columns: Mapping[str, Column], rows: str, done: str |
             check_column(array, name, columns[name], {columns[rows].dims[0]: count}, "it")
     attributes = dict(group.attrs)
     written = count if done is None else attributes.pop(done, count)
-    if type(written) is not int or not 0 <= written <= count:
-        raise ValueError(f"{done} must be a whole number in 0..{count:,}")
+    whole_number(written, str(done), 0, count)
     return {**arrays, **{name: np.array(value) for name, value in attributes.items()}}, written
 
 
@@ -190,8 +188,8 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[Any, dict[str, Any]
     names = sorted(one.parent.name for one in path.glob("*/zarr.json"))
     for name in ("", *names):
         metadata = read_json(path / name / "zarr.json")
-        if name and not all(isinstance(length, int) and length >= 0 for length in metadata["shape"]):
-            raise ValueError(f"the shape of {name} is damaged")
+        for length in metadata["shape"] if name else ():
+            whole_number(length, f"a length of {name}")
     group = zarr.open_group(path, mode=mode, zarr_format=3)
     arrays = {name: group[name] for name in names}
     if not all(isinstance(array, zarr.Array) for array in arrays.values()):

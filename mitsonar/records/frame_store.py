@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.plain_data import whole_number
 from mitsonar.records.columns import arrays_in, check_column
 from mitsonar.records.sonar_frames import COLUMNS, PER_FRAME, SonarFrames
 
@@ -80,7 +81,8 @@ class FrameStore:
         cells = (sonar.range_bins, sonar.beams)
         sizes = {"frames": frames, "bins": cells[0], "beams": cells[1], "six": 6}
         try:
-            if type(self.group.attrs["frames_done"]) is not int or not done <= self.done <= frames:
+            whole_number(self.group.attrs["frames_done"], "frames_done")
+            if not done <= self.done <= frames:
                 raise ValueError(f"it holds {self.done:,} frames, run.json says {done:,} of {frames:,}")
             _, arrays = arrays_in(self.path, "r+")
             for name, array in arrays.items():

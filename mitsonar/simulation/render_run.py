@@ -30,7 +30,17 @@ from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_
 from mitsonar.simulation.tally import Tally
 from mitsonar.simulation.variant import ensure_variant
 
-__all__ = ["RENDERING", "SIMULATORS", "Outputs", "RenderReport", "Source", "StoredEchoes", "run"]
+__all__ = [
+    "RENDERING",
+    "SIMULATORS",
+    "Outputs",
+    "Progress",
+    "RenderReport",
+    "Source",
+    "StoredEchoes",
+    "progress_of",
+    "run",
+]
 
 SIMULATORS = ("mitsonar", "mitsuba", "drjit", "numpy")
 """Packages that decide what is simulated, to the last bit."""
@@ -137,7 +147,7 @@ def run(
     elif not made.finished:
         progress(made.count("frames_done", len(trajectory)))
         store = _make_frames(source, trajectory, made, outputs, progress)
-        tally = Tally.restore(source.sonar, made.notes["tally"])
+        tally = progress_of(made, source.sonar, len(trajectory)).tally
         made.note(warnings=[*source.notes, *tally.warnings(source, trajectory.poses)])
         if len(trajectory) <= LONGEST_NPZ:
             store.pack(made.path / "frames.npz")
@@ -170,10 +180,10 @@ def _make_frames(
     source: Source, trajectory: Trajectory, made: RunDirectory, outputs: Outputs, progress: Callable[[int], None]
 ) -> FrameStore:
     """Write the frames that are missing; the run's notes follow each batch."""
-    folder, done, tally, store = made.path, made.count("frames_done", len(trajectory)), Tally(source.sonar), None
+    folder, earlier, store = made.path, progress_of(made, source.sonar, len(trajectory)), None
+    done, tally, gain = earlier.frames, earlier.tally, earlier.gain
     if done > 0:
         store = FrameStore.open(folder / "frames.zarr")
-        tally = Tally.restore(source.sonar, made.notes.get("tally"))
         store.check(len(trajectory), source.sonar, done)
     if store is not None and done == len(trajectory):
         return store
@@ -182,9 +192,10 @@ def _make_frames(
     if outputs.labels:
         made.notes |= {"shape_names": list(names[0]), "object_names": list(names[1])}
     if done == 0:
-        made.notes["gain"], batches = constant_gain(batches)
+        gain, batches = constant_gain(batches)
+        made.notes["gain"] = gain
     for pings in batches:
-        frames, image = _frames_of(pings, source.sonar, trajectory, outputs, _gain(made), names)
+        frames, image = _frames_of(pings, source.sonar, trajectory, outputs, gain, names)
         store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
         _write_pictures(folder, pings.first, frames, outputs)
         if outputs.exr:
@@ -197,16 +208,34 @@ def _make_frames(
     return store
 
 
-def _gain(made: RunDirectory) -> float:
-    """The gain of all frames of a run.
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is: frames that are written, the gain of all frames (1 before the first), and what they add up to."""
+
+    frames: int
+    gain: float
+    tally: Tally
+
+
+def progress_of(made: RunDirectory, sonar: Sonar, frames: int) -> Progress:
+    """How far a run of ``frames`` frames is, from its file.
 
     Raises:
-        MitsonarError: its file tells none.
+        MitsonarError: the file is damaged.
     """
-    gain = made.notes.get("gain")
-    if gain is None or not gain > 0:
-        raise MitsonarError(f"{made.path} does not tell its gain: begin anew with --overwrite")
-    return float(gain)
+    done = made.count("frames_done", frames)
+    if done == 0:
+        return Progress(0, 1.0, Tally(sonar))
+    gain = made.amount("gain")
+    if gain is None:
+        raise made.damage("it tells no gain")
+    try:
+        tally = Tally.restore(sonar, made.notes.get("tally", {}))
+    except MitsonarError as error:
+        raise made.damage(error) from None
+    if tally.frames != done:
+        raise made.damage(f"frames_done is {done}, the tally counts {tally.frames:,} frames")
+    return Progress(done, gain, tally)
 
 
 class StoredEchoes:

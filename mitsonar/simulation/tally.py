@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.plain_data import whole_number
 from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames
 from mitsonar.simulation.rendered_pings import RenderedPings
 
@@ -98,26 +99,26 @@ class Tally:
         return {name: getattr(self, name) for name in names}
 
     @classmethod
-    def restore(cls, sonar: Sonar, state: Any) -> Tally:
-        """The tally of a run that was broken off.
+    def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
+        """The tally of a run that was broken off, as JSON gives it back.
 
         Raises:
             MitsonarError: the state is damaged.
         """
         kept = cls(sonar)
-        try:
-            single = (state[name] for name in kept.state() if name not in ("rays", "worst", "first_empty"))
-            counts = [*state["worst"], *state["first_empty"], *state["rays"].values(), *single]
-            if (
-                len(state["worst"]) != 2
-                or len(state["first_empty"]) not in (0, 5)
-                or set(state["rays"]) != set(kept.rays)
-                or set(state) != set(kept.state())
-            ):
-                raise ValueError("other counts")
-            if not all(type(count) is int and 0 <= count < 2**63 for count in counts):
-                raise ValueError("counts are whole and not negative")
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise MitsonarError(f"the tally of the run is damaged ({error}): begin anew with --overwrite") from None
+        rays, worst, empty = (state.get(name) for name in ("rays", "worst", "first_empty"))
+        if set(state) != set(kept.state()) or not isinstance(rays, dict) or set(rays) != set(kept.rays):
+            raise MitsonarError(f"the tally must hold {', '.join(kept.state())}, and rays {', '.join(kept.rays)}")
+        if not isinstance(worst, list) or len(worst) != 2 or not isinstance(empty, list) or len(empty) not in (0, 5):
+            raise MitsonarError("worst of the tally must be two counts, first_empty five or none")
+        for count in (*rays.values(), *worst, *empty):
+            whole_number(count, "a count of the tally")
+        frames = whole_number(state["frames"], "frames of the tally")
+        pixels = whole_number(state["pixels"], "pixels of the tally")
+        for name in ("filled", "saturated"):
+            whole_number(state[name], f"{name} of the tally", 0, pixels)
+        whole_number(state["empty"], "empty of the tally", 0, frames if empty else 0)
+        for number in (worst[1], *empty[:1]):
+            whole_number(number, "a frame of the tally", 0, max(0, frames - 1))
         tuples = {name: tuple(state[name]) for name in ("worst", "first_empty")}
         return cls(sonar, **{**state, "rays": dict(state["rays"]), **tuples})

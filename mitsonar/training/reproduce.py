@@ -48,6 +48,7 @@ TABLES = RunKind(
     outputs=("table.md", "table.json", "table-*.png", "data", "runs", "rows"),
     notes={"tables": list, "recipes": dict},
     packages=("mitsonar", "mitsuba", "drjit", "torch", "lightning", "numpy"),
+    replaced=False,
 )
 
 UNSEEN_SEED = 7919

@@ -17,6 +17,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from mitsonar.config.training_recipe import TrainingRecipe
 from mitsonar.errors import MitsonarError
+from mitsonar.io.plain_data import whole_number
 from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.motion_errors import Axis
@@ -30,7 +31,7 @@ TRAINING = RunKind(
     "training",
     outputs=("recipe.yaml", "last.ckpt", "network.ckpt", "log.csv", "curve.png"),
     notes={
-        **{"gain": float, "threads": int, "accelerator": str, "epoch_samples": int, "steps": int, "machine": dict},
+        **{"gain": float | None, "threads": int, "accelerator": str, "epoch_samples": int, "steps": int, "machine": dict},
         **{"steps_done": int, "minutes": float},
     },
     packages=("mitsonar", "torch", "lightning", "numpy"),
@@ -57,8 +58,9 @@ class StateFile(TorchCheckpointIO):
         """
         try:
             state = torch.load(path, map_location=map_location or "cpu", weights_only=True)
-            if not isinstance(state["state_dict"], dict) or not isinstance(state["global_step"], int):
+            if not isinstance(state["state_dict"], dict):
                 raise ValueError("it holds something else")
+            whole_number(state["global_step"], "global_step")
         except Exception as error:  # a damaged zip or pickle raises whatever its bytes lead to
             raise MitsonarError(
                 f"{path} is damaged ({str(error).splitlines()[0] if str(error) else type(error).__name__}): begin anew with "

@@ -128,7 +128,7 @@ def train(
         raise MitsonarError(f"--threads must be at least 1: got {threads}")
     folder = RunFolder(Path(out), writes=leads())
     known = folder.known() if resume else None
-    gain = None if known is None else known.notes.get("gain")
+    gain = None if known is None else known.amount("gain")
     threads = threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
     material = material_of(recipe, data, render=render, gain=gain)
     network = network_for(recipe, material)

@@ -178,20 +178,22 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"done": "3"}, "done is a count, got 3"),
-        ({"done": -1}, "done is a count, got -1"),
-        ({"done": True}, "done is a count"),
-        ({"done": 2**70}, "done is a count"),
-        ({"gain": float("nan")}, "gain is a finite number, got nan"),
-        ({"gain": 10**400}, "gain is a finite number"),
-        ({"words": ["a", {}]}, "words is a list of texts"),
-        ({"tally": [1]}, "tally is an object"),
-        ({"name": 3}, "name is a text"),
-        ({"finished": "yes"}, "finished is true or false"),
-        ({"asked": []}, "asked is an object"),
+        ({"done": "3"}, r"done must be a whole number in 0\.\.2\^63: got '3'"),
+        ({"done": -1}, r"done must be a whole number in .*: got -1"),
+        ({"done": True}, "done must be a whole number"),
+        ({"done": 2**70}, "it holds an integer of 71 bits"),
+        ({"done": 2**63}, "done must be a whole number"),
+        ({"gain": float("nan")}, "gain must be a finite number: got nan"),
+        ({"gain": 10**400}, "it holds an integer of 1,329 bits"),
+        ({"words": ["a", {}]}, "words must be a list of texts and numbers"),
+        ({"words": ["a", True]}, r"words\[1\] must be a finite number"),
+        ({"tally": [1]}, "tally must be an object"),
+        ({"name": 3}, "name must be a text"),
+        ({"finished": "yes"}, "finished must be true or false"),
+        ({"asked": []}, "asked must be an object"),
         ({"versions": None}, "it lacks versions"),
         ({"doen": 3}, "unknown key doen"),
-        ({"tally": json.loads("[" * 100 + "]" * 100)}, "it has more than 20 levels"),
+        ({"tally": json.loads("[" * 100 + "]" * 100)}, "it nests more than 40 deep"),
     ],
 )
 def test_values_of_another_type_are_named(tmp_path: Path, values: dict[str, Any], said: str) -> None:
@@ -205,7 +207,11 @@ def test_values_of_another_type_are_named(tmp_path: Path, values: dict[str, Any]
 def test_a_count_beyond_what_is_possible_is_named(tmp_path: Path) -> None:
     run = begun(tmp_path)
     run.note(done=7)
-    with pytest.raises(MitsonarError, match="done is at most 5, got 7"):
+    said = r"run\.json is damaged \(done must be a whole number in 0\.\.5: got 7\): begin anew with --overwrite, or choose"
+    with pytest.raises(
+        MitsonarError,
+        match=said,
+    ):
         run.count("done", 5)
     assert run.count("lacking", 5) == 0
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import tiny_recipe
+from helpers import TINY_TRAINING, tiny_network, tiny_recipe, tiny_samples
 
 from mitsonar.errors import MitsonarError
 
@@ -24,29 +24,14 @@ from mitsonar.networks.checkpoint import FILE, Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 
-ABOUT: dict[str, Any] = {
-    "recipe": {"network": "posenet", "split": "scene"},
-    "metrics": {"none": {"rmse": [3.0, 2.0, 0.1], "pairs": 50}, "high": {"rmse": [6.0, 2.0, 0.2], "pairs": 50}},
-    "trained": {"pairs": 1200, "minutes": 2.5, "epochs": 3, "seed": 0},
-}
-
-
-def tiny(seed: int = 0, **options: Any) -> Any:
-    torch.manual_seed(seed)
-    return create_network("posenet", **{"width": 1 / 16, "size": (40, 24), **options})
-
-
-def samples(**words: Any) -> Samples:
-    return Samples(tiny_recipe(), **{"labels": "normx10", "noise": "low", **words})
-
 
 @pytest.fixture(scope="module")
 def checkpoint() -> Checkpoint:
-    return Checkpoint.of(tiny(), samples(), **ABOUT)
+    return Checkpoint.of(tiny_network(), tiny_samples(), **TINY_TRAINING)
 
 
 def test_what_is_saved_comes_back(checkpoint: Checkpoint, tmp_path: Path) -> None:
-    network = tiny().eval()
+    network = tiny_network().eval()
     checkpoint.save(tmp_path / FILE)
     state = torch.get_rng_state()
     for found in (Checkpoint.load(tmp_path), Checkpoint.load(tmp_path / FILE)):
@@ -56,7 +41,7 @@ def test_what_is_saved_comes_back(checkpoint: Checkpoint, tmp_path: Path) -> Non
         assert torch.equal(found.build()(image), network(image))
         assert found.digest == checkpoint.digest
     assert torch.equal(torch.get_rng_state(), state), "building must not disturb what is drawn"
-    assert Checkpoint.of(tiny(1), samples()).digest != checkpoint.digest
+    assert Checkpoint.of(tiny_network(1), tiny_samples()).digest != checkpoint.digest
     assert not found.build().training
     assert list(tmp_path.iterdir()) == [tmp_path / FILE]
 
@@ -88,11 +73,11 @@ def test_it_says_what_it_was_trained_on(checkpoint: Checkpoint) -> None:
         assert words in text
     both = Checkpoint.of(
         create_network("posenet_dual", width=1 / 16, size=(40, 24), cartesian_size=(32, 40)),
-        samples(coordinates="both", cartesian_rows=32),
+        tiny_samples(coordinates="both", cartesian_rows=32),
     )
     assert (both.arrangement["coordinates"], both.arrangement["cartesian_rows"]) == ("both", 32)
     raised = Checkpoint.of(
-        tiny(), Samples(tiny_recipe(mount={"up_m": 0.5, "pitch_deg": 20, "roll_deg": 3}, flight__height_m=[1, 4]))
+        tiny_network(), Samples(tiny_recipe(mount={"up_m": 0.5, "pitch_deg": 20, "roll_deg": 3}, flight__height_m=[1, 4]))
     )
     assert raised.fixed == "height 1.5..4.5 m, pitch 20 deg, roll 3 deg"
 
@@ -118,10 +103,12 @@ def test_answers_become_motions(checkpoint: Checkpoint) -> None:
 
 def test_only_our_networks_and_plain_values(checkpoint: Checkpoint) -> None:
     with pytest.raises(MitsonarError, match="one of our networks: got Linear"):
-        Checkpoint.of(torch.nn.Linear(2, 3), samples())
+        Checkpoint.of(torch.nn.Linear(2, 3), tiny_samples())
     with pytest.raises(MitsonarError, match="numbers, texts, lists and tables only"):
-        Checkpoint.of(tiny(), samples(), trained={"when": object()})
-    held = Checkpoint.of(tiny(), samples(), trained={"rate": np.float32(0.5), "folder": Path("a") / "b", "steps": (1, 2)})
+        Checkpoint.of(tiny_network(), tiny_samples(), trained={"when": object()})
+    held = Checkpoint.of(
+        tiny_network(), tiny_samples(), trained={"rate": np.float32(0.5), "folder": Path("a") / "b", "steps": (1, 2)}
+    )
     assert held.trained == {"rate": 0.5, "folder": "a/b", "steps": [1, 2]}
 
 

@@ -18,9 +18,8 @@ import pytest
 import yaml
 from helpers import TINY, Command, by_itself, refused
 from hostile_readers import (
+    ASKED,
     READERS,
-    RECIPE,
-    STATE,
     TALLY,
     attack,
     frames,
@@ -28,9 +27,13 @@ from hostile_readers import (
     make_exr,
     make_frames_zarr,
     make_meshes,
+    make_odometry,
+    make_run,
     make_store,
     read_exr,
     read_meshes,
+    read_odometry,
+    read_run,
     responses,
     serialized,
 )
@@ -38,12 +41,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from mutations import changed_bytes, limits, npz, outcome, with_part
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 
 SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
 """Readers that take 20 ms and more a mutant."""
+
+USUAL, FEWER = 200, 30
+"""Mutants in the tests that are run always, of the others and of those."""
 
 learn = pytest.mark.learn
 
@@ -65,8 +71,7 @@ def refusal(read: Callable[[], Any]) -> str:
 
 @pytest.mark.parametrize("name", cases())
 def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
-    """300 of each kind, 30 where reading one takes tens of milliseconds."""
-    count = 30 if name in SLOW else 300
+    count = FEWER if name in SLOW else USUAL
     found = attack(name, tmp_path, count)
     assert found["read"] + found["refused"] == count
     assert found["refused"] > 0
@@ -75,7 +80,7 @@ def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases())
 def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
-    found = attack(name, tmp_path, 10_000, first=300)
+    found = attack(name, tmp_path, 10_000, first=USUAL)
     print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
     assert min(found.values()) > 0
 
@@ -660,42 +665,103 @@ def test_a_device_that_never_ends() -> None:
     assert "larger than" in refusal(lambda: read_yaml("/dev/zero", "recipe"))
 
 
+@pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1], ids=shortened)
+def test_what_is_no_count_is_refused(value: Any) -> None:
+    from mitsonar.io.plain_data import whole_number
+
+    assert refusal(lambda: whole_number(value, "beams")).startswith("beams must be a whole number in 0..2^63: got ")
+    assert whole_number(2**63 - 1, "beams") == 2**63 - 1
+
+
+NO_NUMBERS: list[Any] = ["3", True, None, [3.0], float("nan"), float("inf"), -float("inf"), 10**400, -(10**5000)]
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=shortened)
+def test_what_is_no_finite_number_is_refused(value: Any) -> None:
+    from mitsonar.io.plain_data import finite_number
+
+    assert refusal(lambda: finite_number(value, "gain")).startswith("gain must be a finite number: got ")
+    for number in (0, 2.0):
+        said = refusal(lambda number=number: finite_number(number, "gain", above=0, below=2))  # type: ignore[misc]
+        assert said == f"gain must be a finite number above 0 below 2: got {number}"
+    assert finite_number(1, "gain", above=0, below=2) == 1.0
+
+
+@pytest.mark.parametrize(
+    "content", ["[" * 100_000, "[]", "\0", '{"owner": "a"}', '{"owner": "a", "time": 1' + "0" * 400 + "}", '{"time": NaN}']
+)
+def test_a_writer_that_nobody_could_be_is_replaced(content: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who says that it writes an object storage; deep JSON was a traceback."""
+    from mitsonar.io.storage import Storage
+
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    place = Storage("memory://hostile")
+    place.write("writer.json", content.encode())
+    with place.locked() as still_ours:
+        still_ours()
+
+
 # ---------------------------------------------------------------- run.json
 
 
 BAD_STATES: dict[str, dict[str, Any]] = {
-    **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12)},
+    **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12, 9)},
     **{f"gain {value}": {"gain": value} for value in ("2", 0, -1.0, float("nan"), None)},
     **{f"tally {value}": {"tally": value} for value in (None, [], {}, {**TALLY, "worst": 3}, {**TALLY, "rays": {"a": 1}})},
     "tally of texts": {"tally": {**TALLY, "pixels": "9"}},
     "worst frame": {"tally": {**TALLY, "worst": [1, 99]}},
+    "an empty frame that is not told": {"tally": {**TALLY, "first_empty": []}},
+    "an empty frame beyond": {"tally": {**TALLY, "first_empty": [10, 0, 0, 0, 2]}},
+    "more saturated pixels than pixels": {"tally": {**TALLY, "pixels": 0, "filled": 0, "saturated": 1}},
     "warnings": {"warnings": "none"},
     "finished": {"finished": "no"},
-    "recipe": {"recipe": [1]},
+    "asked": {"asked": [1]},
+    "versions": {"versions": "none"},
+    "another key": {"more": 1},
 }
+
+
+def changed_run(folder: Path, **changes: Any) -> None:
+    changed_metadata(folder / "run.json", lambda value: value.update(changes))
 
 
 @pytest.mark.parametrize("name", BAD_STATES)
 def test_a_run_that_cannot_go_on(name: str, tmp_path: Path) -> None:
     """Counts of another type were tracebacks on --resume."""
-    from mitsonar.simulation.render_run import begin
-
-    (tmp_path / "run.json").write_text(json.dumps(STATE | BAD_STATES[name]))
-    said = refusal(lambda: begin(tmp_path, RECIPE, "frames", overwrite=False, resume=True))
+    make_run(tmp_path)
+    read_run(tmp_path)
+    changed_run(tmp_path, **BAD_STATES[name])
+    said = refusal(lambda: read_run(tmp_path))
     assert "damaged" in said
     assert "--overwrite" in said
 
 
-def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
-    from mitsonar.mapping.odometry_run import OdometryFolder
+def test_a_run_that_tells_no_gain_cannot_go_on(tmp_path: Path) -> None:
+    make_run(tmp_path)
+    for name, words in (("gain", "tells no gain"), ("tally", "tally must hold")):
+        before = (tmp_path / "run.json").read_bytes()
+        changed_metadata(tmp_path / "run.json", lambda value, name=name: value.pop(name))  # type: ignore[misc]
+        assert words in refusal(lambda: read_run(tmp_path))
+        (tmp_path / "run.json").write_bytes(before)
 
-    state = {"kind": "mitsonar odometry", "finished": False, "recipe": {"a": 1}}
+
+def test_what_differs_is_said_in_one_short_line(tmp_path: Path) -> None:
+    """Keys and values are a stranger's: of any length, with ends of lines."""
+    make_run(tmp_path)
+    changed_run(tmp_path, asked={**ASKED, "k" * 9000: 1, "line\nline": "a\nb"})
+    said = refusal(lambda: read_run(tmp_path))
+    assert "line line a b, not None" in said
+    assert len(said) < 1000
+
+
+def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
+    make_odometry(tmp_path)
+    before = (tmp_path / "run.json").read_bytes()
+    for change in ({"asked": [1]}, {"asked": 5}, {"factors": [None]}, {"seconds": "1"}, {"workers": 1.5}):
+        changed_run(tmp_path, **change)
+        assert "damaged" in refusal(lambda: read_odometry(tmp_path))
+        (tmp_path / "run.json").write_bytes(before)
     good = {"pair": 0, "motion": [0, 0, 0], "covariance": None, "valid": True, "reason": ""}
-    for change in ({"recipe": [1]}, {"recipe": 5}):
-        (tmp_path / "run.json").write_text(json.dumps(state | change))
-        assert "damaged" in refusal(
-            lambda: OdometryFolder.begin(tmp_path, {"recipe": {"a": 1}}, overwrite=False, resume=True)
-        )
     lines = [
         {"pair": "1"},
         {"pair": -1},
@@ -707,7 +773,41 @@ def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
     lines += [{"valid": 1}, {"reason": None}, {"covariance": [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]}]
     for line in lines:
         (tmp_path / "estimates.jsonl").write_text(json.dumps(good | line) + "\n")
-        assert "line 1 is damaged" in refusal(lambda: OdometryFolder(tmp_path, state).kept())
+        assert "line 1 is damaged" in refusal(lambda: read_odometry(tmp_path))
+
+
+def test_a_journal_that_never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_odometry(tmp_path)
+    (tmp_path / "estimates.jsonl").unlink()
+    (tmp_path / "estimates.jsonl").symlink_to("/dev/zero")
+    monkeypatch.setattr("mitsonar.mapping.odometry_run.LARGEST_JOURNAL", 1000)
+    assert "larger than 1,000 bytes" in refusal(lambda: read_odometry(tmp_path))
+
+
+def test_answers_that_promise_more_than_is_there(tmp_path: Path) -> None:
+    """A comparison is gone on with: its tables of answers are a stranger's too."""
+    from mitsonar.estimation.benchmark import Answers
+    from mitsonar.estimation.kept_answers import kept_answers
+
+    folder, methods = kept_answers(tmp_path / "out", {"a": 1}), {"flow": None}
+    folder.keep("high", "none", {"flow": Answers.unasked(4)})
+    assert folder.load("high", "none", methods, 4)["flow"].ms.shape == (4,)  # type: ignore[arg-type, index]
+    path = tmp_path / "out" / "answers-high-none.npz"
+    path.write_bytes(with_part(path.read_bytes(), "flow/ms.npy", header("(1000000000000,)")))
+    assert "is damaged" in refusal(lambda: folder.load("high", "none", methods, 4))  # type: ignore[arg-type]
+    changed_run(tmp_path / "out", finished="no")
+    assert "remove the folder" in refusal(lambda: kept_answers(tmp_path / "out", {"a": 1}))
+
+
+@pytest.mark.parametrize("height", ["3", 0, -1.0, 1e9, float("nan"), [3.0], True])
+def test_a_height_of_an_odometry_that_cannot_be(height: Any, tmp_path: Path) -> None:
+    from mitsonar.mapping.odometry_run import OdometryFolder
+
+    make_odometry(tmp_path)
+    changed_run(tmp_path, finished=True, asked={"height_m": height})
+    assert "height_m must be a finite number" in refusal(lambda: OdometryFolder.open(tmp_path).height_m)
+    changed_run(tmp_path, asked={"height_m": 3})
+    assert OdometryFolder.open(tmp_path).height_m == 3.0
 
 
 # ---------------------------------------------------------------- checkpoints, echoes, trajectories
