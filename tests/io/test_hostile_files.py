@@ -499,6 +499,9 @@ def spoilt(data_set: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(data_set, tmp_path / "data.zarr"))
 
 
+BAD_SCENES: list[Any] = [[], None, 5, [{}], [{"number": 0, "group": 9, "seed": 0, "sequences": 10}]]
+
+
 @pytest.mark.parametrize(
     "fields",
     [
@@ -506,7 +509,7 @@ def spoilt(data_set: Path, tmp_path: Path) -> Path:
         *({"sequences": value} for value in (10**12, 1e300, 0, "10")),
         *({"shard_frames": value} for value in (0, -5, 1e300, "5")),
         *({"chunk_frames": value} for value in (0, 3.5, None)),
-        *({"scenes": value} for value in ([], None, 5, [{}], [{"number": 0, "group": 9, "seed": 0, "sequences": 10}])),
+        *({"scenes": value} for value in BAD_SCENES),
         *({"level_scale": value} for value in ("nan", "1", -1, [1])),
         {"recipe": [1]},
         {"recipe": {"name": []}},
@@ -556,7 +559,8 @@ def test_numbers_of_sequences_that_cannot_be(spoilt: Path) -> None:
 
     from mitsonar.datasets.store import DataStore
 
-    zarr.open_group(spoilt, mode="r+")["sequence"][3] = 2**31 - 1
+    group: Any = zarr.open_group(spoilt, mode="r+")
+    group["sequence"][3] = 2**31 - 1
     assert "sequence is damaged" in refusal(lambda: DataStore.open(spoilt).read("sequence"))
 
 
@@ -704,10 +708,12 @@ def test_a_writer_that_nobody_could_be_is_replaced(content: str, monkeypatch: py
 # ---------------------------------------------------------------- run.json
 
 
+BAD_TALLIES: list[Any] = [None, [], {}, {**TALLY, "worst": 3}, {**TALLY, "rays": {"a": 1}}]
+
 BAD_STATES: dict[str, dict[str, Any]] = {
     **{f"frames_done {value}": {"frames_done": value} for value in ("3", -1, 31, 1e300, None, [1], True, 10**12, 9)},
     **{f"gain {value}": {"gain": value} for value in ("2", 0, -1.0, float("nan"), None)},
-    **{f"tally {value}": {"tally": value} for value in (None, [], {}, {**TALLY, "worst": 3}, {**TALLY, "rays": {"a": 1}})},
+    **{f"tally {value}": {"tally": value} for value in BAD_TALLIES},
     "tally of texts": {"tally": {**TALLY, "pixels": "9"}},
     "worst frame": {"tally": {**TALLY, "worst": [1, 99]}},
     "an empty frame that is not told": {"tally": {**TALLY, "first_empty": []}},
@@ -761,8 +767,8 @@ def test_an_odometry_that_cannot_go_on(tmp_path: Path) -> None:
         changed_run(tmp_path, **change)
         assert "damaged" in refusal(lambda: read_odometry(tmp_path))
         (tmp_path / "run.json").write_bytes(before)
-    good = {"pair": 0, "motion": [0, 0, 0], "covariance": None, "valid": True, "reason": ""}
-    lines = [
+    good: dict[str, Any] = {"pair": 0, "motion": [0, 0, 0], "covariance": None, "valid": True, "reason": ""}
+    lines: list[dict[str, Any]] = [
         {"pair": "1"},
         {"pair": -1},
         {"motion": [1]},
