@@ -27,7 +27,6 @@ ROOMS = (
     "config",
     "plotting",
     "simulation",
-    "recordings",
     "datasets",
     "networks",
     "estimation",
