@@ -16,6 +16,7 @@ SETUPTOOLS = PROJECT["tool"]["setuptools"]
 
 ROOMS = (
     "errors",
+    "arrays",
     "io",
     "motion",
     "instruments",
