@@ -227,9 +227,9 @@ CHUNK = 2048
 def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *, greys: int = 255) -> Information:
     """Compute the Fisher information of noisy, clipped pixels, stored as grey values 0..``greys``.
 
-    The noise is that of Almanza-Medina, 2.2.3; the distribution is derived here. A pixel holds an echo ``level / filled`` with
-    probability ``filled``, else none: where the edge of a shadow crosses a pixel, only part of the pings fill it. Let p_e and
-    p_0 be the distributions of a pixel with and without echo. The pixel's is p = filled p_e + (1 - filled) p_0. The
+    The noise is that of Almanza-Medina, 2.2.3; the distribution is derived here. A pixel holds an echo ``level / filled``
+    with probability ``filled``, else none: where the edge of a shadow crosses a pixel, only part of the pings fill it. Let
+    p_e and p_0 be the distributions of a pixel with and without echo. The pixel's is p = filled p_e + (1 - filled) p_0. The
     information is the sum over grey values of g g' / p, with g the derivatives of p.
 
     The information of an added Rayleigh value alone grows with the logarithm of ``greys``: its density begins with a corner,

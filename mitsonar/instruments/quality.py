@@ -8,8 +8,8 @@ range, ``dR / R = de / tan(grazing angle)``, whatever the range bins are. It fal
 across lower the part of the error that is jitter.
 
 Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random. The error is
-the texture's contrast over the square root of the rays in one bin. These are ``rays_across`` until an elevation cell is shorter
-than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the texture.
+the texture's contrast over the square root of the rays in one bin. These are ``rays_across`` until an elevation cell is
+shorter than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the texture.
 """
 
 from __future__ import annotations
