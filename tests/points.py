@@ -116,7 +116,8 @@ def run(
     start = start or Pose(0.0, 0.0, height_m)
     end = end or compose(start, motion)
     velocity = (np.array(end[:3]) - np.array(start[:3])) / span_s
-    poses, keep = np.linspace(start, end, pings), []
+    poses = np.linspace(start, end, pings)
+    keep: list[Any] = []
     response = np.array([ping(sonar, ground, Pose(*pose), velocity, keep=keep) for pose in poses])
     rng = np.random.default_rng([seed, 1])
     response = response + noise * (rng.standard_normal((*response.shape, 2)) @ [1, 1j]) / np.sqrt(2)

@@ -43,7 +43,7 @@ ROOMS = (
 def folder_of(package: str) -> Path:
     """Where a package's files are in the checkout."""
     if package in SETUPTOOLS["package-dir"]:
-        return ROOT / SETUPTOOLS["package-dir"][package]
+        return ROOT / str(SETUPTOOLS["package-dir"][package])
     return ROOT / package.replace(".", "/")
 
 

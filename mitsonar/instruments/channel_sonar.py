@@ -248,7 +248,7 @@ class ChannelSonar(Instrument):
         """Return the positions of the receivers in the vehicle's axes ``(receivers, 3)`` [m]."""
         return np.array([receiver.position for receiver in self.receivers], dtype=float)
 
-    def raised_cosine(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    def raised_cosine(self, frequency_hz: NDArray[np.floating]) -> NDArray[np.float64]:
         """Compute the raised cosine X_R at baseband frequencies [Hz] (Almanza-Medina, eq. 5.16, corrected).
 
         X_R is 1 up to c = (1 - alpha) F_d / 2, 0 from a = (1 + alpha) F_d / 2 on, and half a period of a cosine between.
@@ -260,7 +260,7 @@ class ChannelSonar(Instrument):
             return np.where(beyond <= 0, 1.0, 0.0)
         return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip(beyond / width, 0, 1)))
 
-    def pulse(self, delay_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pulse(self, delay_s: NDArray[np.floating]) -> NDArray[np.float64]:
         """Compute the response to one echo of amplitude 1 at delay 0: the transform of X_R over the sampling rate.
 
         Args:

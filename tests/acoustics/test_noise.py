@@ -19,7 +19,7 @@ Z = 4.5
 
 
 def noisy(image: np.ndarray, model: NoiseModel = HIGH, seed: int = 11, first: int = 0) -> np.ndarray:
-    return model.apply(image, seed=seed, frames=np.arange(first, first + len(image)))
+    return np.asarray(model.apply(image, seed=seed, frames=np.arange(first, first + len(image))))
 
 
 def assert_mean(values: np.ndarray, mean: float, std: float) -> None:
@@ -187,7 +187,7 @@ def test_torch_draws_the_same_sums() -> None:
     rng = np.random.default_rng(7)
     vector, nonzero, order = rng.random((4, 64), dtype=np.float32) * 20, rng.integers(0, 97, (4, 64)), np.arange(4)
     wanted = HIGH.apply_sum(vector, nonzero, 96, seed=5, frames=order)
-    got = HIGH.apply_sum(*map(torch.from_numpy, (vector, nonzero)), 96, seed=5, frames=torch.from_numpy(order))
+    got = HIGH.apply_sum(torch.from_numpy(vector), torch.from_numpy(nonzero), 96, seed=5, frames=torch.from_numpy(order))
     np.testing.assert_array_equal(got.numpy(), wanted)
     assert wanted.dtype == np.float32
     np.testing.assert_array_equal(NOISE_MODELS["none"].apply_sum(vector, nonzero, 96, seed=5, frames=order), vector)

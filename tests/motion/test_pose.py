@@ -235,7 +235,8 @@ def test_motions_invert_compose() -> None:
     pose, poses, driven = Pose(3.0, -2.0, 2.5, 0.6, 0.1, np.pi - 0.01), [], []
     poses.append(pose)
     for _ in range(60):
-        motion = Motion(*rng.uniform(-0.02, 0.02, 2), rng.uniform(-0.02, 0.05))
+        sideways, forward = rng.uniform(-0.02, 0.02, 2)
+        motion = Motion(sideways, forward, rng.uniform(-0.02, 0.05))
         pose = compose(pose, motion)
         pose = pose._replace(heading=(pose.heading + np.pi) % (2 * np.pi) - np.pi)
         poses.append(pose)

@@ -44,7 +44,7 @@ def assert_same_as_mitsuba(loaded: mi.Scene, ray: mi.Ray3f | None = None, least:
         if shape.bsdf() is not None:
             seen = np.array(si.shape == mi.ShapePtr(shape)) & valid
             assert (np.array(hit.shape_id)[seen] == number).all(), shape.id()
-    return reflectivity
+    return np.asarray(reflectivity)
 
 
 # ---------------------------------------------------------------- the rule for BSDFs
@@ -138,7 +138,7 @@ def sheet(attribute: str, centre: float = 0.0) -> mi.Mesh:
     properties["bsdf"] = mi.load_dict(diffuse({"type": "mesh_attribute", "name": attribute}))
     mesh = mi.Mesh("sheet", vertex_count=x.size, face_count=len(faces), has_vertex_normals=True, props=properties)
     values = np.random.default_rng(6).random(len(faces) if attribute.startswith("face") else x.size, dtype=np.float32)
-    mesh.add_attribute(attribute, 1, values)
+    mesh.add_attribute(attribute, 1, values)  # type: ignore[arg-type]  # the stubs know no NumPy arrays here
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.column_stack([x.ravel() + centre, y.ravel(), z.ravel()]).astype(np.float32).ravel()
     parameters["faces"] = faces.astype(np.uint32).ravel()

@@ -28,7 +28,9 @@ def at(texture: mi.Texture, *, uv: Any = None, p: Any = None, active: Any = True
 
 
 def texture(kind: str, **properties: Any) -> mi.Texture:
-    return mi.load_dict({"type": kind, **properties})
+    loaded = mi.load_dict({"type": kind, **properties})
+    assert isinstance(loaded, mi.Texture)
+    return loaded
 
 
 def grid(count: int, step: float, start: float = 0.5) -> np.ndarray:
@@ -234,7 +236,7 @@ def test_all_ways_to_ask_agree(kind: str) -> None:
     one = np.array(source.eval_1(si))
     np.testing.assert_array_equal(np.array(source.eval(si)).ravel(), one)
     np.testing.assert_array_equal(np.array(source.eval_3(si)), np.tile(one, (3, 1)))
-    active = mi.Bool(np.arange(100) % 2 == 0)
+    active: DeviceArray = mi.Bool(np.arange(100) % 2 == 0)
     np.testing.assert_array_equal(np.array(source.eval_1(si, active)), np.where(np.arange(100) % 2 == 0, one, 0))
     assert source.is_spatially_varying()
 
