@@ -1,4 +1,4 @@
-"""Scenes, plain NumPy truths and scripts that several tests share. Truths are written from SPEC.md, not from the code."""
+"""Scenes, plain NumPy truths and scripts of several tests. Truths are written from the formulas, not from the code."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def scene(**shapes: MitsubaDict) -> mi.Scene:
 
 
 def place_of(scene: mi.Scene, name: str) -> int:
-    """The place of a shape in the scene, which ``shape_id`` tells."""
+    """The index of a shape in the scene, as in ``shape_id``."""
     return [shape.id() for shape in scene.shapes()].index(name)
 
 
@@ -87,7 +87,7 @@ def place_of(scene: mi.Scene, name: str) -> int:
 
 
 def axes(pose: Pose) -> tuple[Array, Array, Array]:
-    """Starboard, forward and up of a pose in the world, from the conventions of SPEC.md, section 1."""
+    """Starboard, forward and up of a pose in the world, from the conventions of poses."""
     sin_h, cos_h, sin_p, cos_p = np.sin(pose.heading), np.cos(pose.heading), np.sin(pose.pitch), np.cos(pose.pitch)
     forward = np.array([cos_p * sin_h, cos_p * cos_h, -sin_p])
     level = np.array([cos_h, -sin_h, 0.0])  # starboard before the roll

@@ -97,7 +97,7 @@ DATA = ("scenes", "recipes")
 """Packages that hold data; a script that makes them may stand beside."""
 
 PACKAGES = {name for name, path in MODULES.items() if path.stem == "__init__"}
-"""Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
+"""Their ``__init__`` is outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
 HOUSE = {name: imported(path) for name, path in MODULES.items() if name not in PACKAGES and room(name) not in DATA}
 """What each module imports."""

@@ -69,8 +69,7 @@ def attitude_of(
 ) -> Attitude:
     """Estimate height, pitch and roll of the frames' mean.
 
-    First echoes measure the height where the window shows them, unless the relief is given. Otherwise the given height
-    counts, and without one the height in the frames.
+    First echoes measure the height, unless the relief is given. Else the given height counts, then that of the frames.
 
     Args:
         frames: consecutive frames.
@@ -82,8 +81,7 @@ def attitude_of(
     Raises:
         MitsonarError: no pitch; a height neither given nor measured, or not above 0 or the relief.
     """
-    known = frames.poses is not None and bool(np.isfinite(frames.poses[:, 3:5]).all())
-    pose = frames.poses.mean(axis=0) if known and frames.poses is not None else None
+    pose = _mean_pose(frames)
     pitch = pitch_rad if pitch_rad is not None else (None if pose is None else float(pose[3]))
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
@@ -116,6 +114,13 @@ def attitude_of(
         reason = f"first echoes tell a height of {measured.height_m:.2f} m, not {given:.2f} m: height or pitch is wrong"
         return Attitude(given, STD_GIVEN * given, pitch, roll, reason)
     return Attitude(measured.height_m, STD_MEASURED * measured.height_m, pitch, roll, even=measured.even)
+
+
+def _mean_pose(frames: SonarFrames) -> NDArray[np.float64] | None:
+    """Return the mean of the poses ``(6,)``; None where pitch or roll is unknown."""
+    if frames.poses is None or not np.isfinite(frames.poses[:, 3:5]).all():
+        return None
+    return np.asarray(frames.poses.mean(axis=0))
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:

@@ -1,4 +1,4 @@
-"""Poses of ROS, of NED and of mitsonar tell the same: closed forms, round trips, the same picture, and what is warned of."""
+"""Poses of ROS, of NED and of mitsonar agree: closed forms, round trips, the same picture, and what is warned of."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 POSE = Pose(1.0, -2.0, 3.0, 0.4, -0.2, 2.1)
 
-KINDS: dict[str, dict[str, Any]] = {
+KINDS: dict[str, MitsubaDict] = {
     "azimuth": {"bearing": "azimuth"},
     "cone": {"bearing": "cone"},
     "azimuth, narrow beams": {"bearing": "azimuth", "beam_width_deg": 1.1},
@@ -69,7 +69,7 @@ def fan(source: ImagingSonar) -> Fan:
 
 
 def test_properties_are_those_of_a_sonar() -> None:
-    fields: dict[str, Any] = {
+    fields: MitsubaDict = {
         **{"azimuth_fov_deg": 33.0, "elevation_fov_deg": 9.0, "beams": 5, "rays_per_beam": 7, "range_min": 1.5},
         **{"range_max": 2.5, "range_bins": 11, "sound_speed": 1480.0, "bearing": "cone", "beam_layout": "sine"},
         **{"beam_width_deg": 0.7, "rays_across": 3, "jitter": False, "seed": 4, "model": "thesis"},
@@ -124,7 +124,7 @@ CROP: MitsubaDict = {"crop_width": 8, "crop_height": 12, "crop_offset_x": 0, "cr
         ({"to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, r"only turn and move"),
     ],
 )
-def test_contradictions_are_errors_that_say_so(fields: dict[str, Any], message: str) -> None:
+def test_contradictions_are_errors_that_say_so(fields: MitsubaDict, message: str) -> None:
     if "to_world" in fields:
         fields = {"to_world": mi.ScalarTransform4f(fields["to_world"])}
     with pytest.raises(RuntimeError, match=message):
@@ -231,7 +231,7 @@ def test_lift_and_side_are_the_derivatives(kind: str, jitter: bool) -> None:
     source = sensor(**KINDS[kind], jitter=jitter)
     got, sonar, step = fan(source), source.sonar, 1e-4
 
-    def seen(vector: Any) -> np.ndarray:  # sensor axes (port, up, forward) to (starboard, forward, up)
+    def seen(vector: DeviceArray) -> np.ndarray:  # sensor axes (port, up, forward) to (starboard, forward, up)
         port, up, forward = (np.array(axis) + np.zeros(sonar.rays) for axis in vector)
         return np.stack([-port, forward, up], axis=1)
 
