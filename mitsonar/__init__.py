@@ -4,15 +4,15 @@
     scene = mitsonar.load_scene("sunken_ship")
     frames = mitsonar.Simulator(scene, mitsonar.load_sonar("didson300")).render([mitsonar.Pose(0, 0, 3)])
 
-Importing mitsonar loads no Mitsuba and sets no variant; it makes sure that the plugins (``imaging_sonar``, ``echo`` ...) are
-registered for whatever variant is set, now or later.
+Importing mitsonar loads no Mitsuba and sets no variant. It registers the plugins (``imaging_sonar``, ``echo`` ...) for the
+variant that is set, now or later.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mitsonar import plugins
 from mitsonar.errors import explain_missing
@@ -107,15 +107,16 @@ _MODULES = {
 plugins.install()
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name == "__version__":
         return version("mitsonar")
     if name not in _MODULES:
         raise AttributeError(f"module 'mitsonar' has no attribute {name!r}")
     try:
-        return getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
+        found: object = getattr(import_module(f"mitsonar.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
         raise explain_missing(error) from None
+    return found
 
 
 def __dir__() -> list[str]:

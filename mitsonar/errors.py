@@ -1,4 +1,4 @@
-"""What goes wrong, in words a user can act on: what, got, allowed, what to do."""
+"""Errors and warnings, in words a user can act on: what, got, allowed, what to do."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import difflib
 import re
 import reprlib
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pydantic import BaseModel, ValidationError
+    from pydantic_core import ErrorDetails
 
 
 __all__ = [
@@ -39,10 +40,10 @@ EXTRAS = {
     "sklearn": ("learn", "classical regression"),
     "s3fs": ("s3", "object storage"),
 }
-"""Packages that a plain installation lacks: the extra that brings them, and what needs them."""
+"""Optional packages: the extra that installs each, and what needs it."""
 
 MARK = "\x1f"
-"""Stands before and after an argument's name in a message, and is never shown."""
+"""Marks the begin and the end of an argument's name in a message; never shown."""
 
 
 class MitsonarError(ValueError):
@@ -52,11 +53,11 @@ class MitsonarError(ValueError):
         return self.said({})
 
     def said(self, options: Mapping[str, str]) -> str:
-        """The message with the words of who reads it.
+        """Return the message in the words of its reader.
 
         Args:
-            options: what stands for arguments that :func:`argument` names, ``{"height_m": "--height"}``; others keep their
-                Python names.
+            options: the option for each argument that :func:`argument` names, ``{"height_m": "--height"}``. Other arguments
+                keep their Python names.
         """
 
         def typed(found: re.Match[str]) -> str:
@@ -66,24 +67,25 @@ class MitsonarError(ValueError):
 
 
 def argument(name: str) -> str:
-    """Name an argument in the message of a :class:`MitsonarError`: where the command line has an option for it, that is
-    printed instead.
+    """Mark the name of an argument in the message of a :class:`MitsonarError`.
+
+    Where the command line has an option for the argument, it prints the option instead.
 
     Args:
-        name: of the argument, perhaps after words on what it belongs to, which an option does not need: ``sonar model``.
+        name: of the argument. Words before it say what it belongs to, as in ``sonar model``; an option replaces them too.
     """
     return f"{MARK}{name}{MARK}"
 
 
 class MitsonarWarning(UserWarning):
-    """A result that stands, but that the user should know something about."""
+    """A fact about a valid result that the user should know."""
 
 
 def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
-    """Turn an absent optional package into a sentence that names the extra which brings it.
+    """Turn an absent optional package into a sentence that names the extra which installs it.
 
     Raises:
-        ModuleNotFoundError: the error itself, where no extra brings that module.
+        ModuleNotFoundError: the error itself, where no extra installs that module.
     """
     package = (error.name or "").partition(".")[0]
     if package not in EXTRAS:
@@ -93,7 +95,7 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
-    """The known names, nearest to ``wrong`` first, for the end of an error message."""
+    """List the known names, those near to ``wrong`` first, for the end of an error message."""
     known = list(names)
     near = [name for name in known if wrong and wrong.lower() in name.lower()]
     near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
@@ -101,21 +103,21 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
 
 
 def meant(wrong: object, names: Iterable[str]) -> str:
-    """Ask for the nearest of some names, for the end of a message that lists them; empty where none is near."""
+    """Suggest the nearest of some names, for the end of a message that lists them; empty where none is near."""
     near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
     return f"; did you mean {near[0]}?" if near else ""
 
 
 def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:
-    """The first of pydantic's complaints as one sentence: what, got, allowed.
+    """Turn the first of pydantic's complaints into one sentence: what, got, allowed.
 
     Args:
-        error: what pydantic raised.
-        model: whose fields are the known keys.
-        what: what the keys belong to, in the sentence: ``sonar``.
-        see: where more is said, for the end of the sentence.
+        error: as pydantic raised it.
+        model: its fields are the known keys.
+        what: the owner of the keys, for the sentence: ``sonar``.
+        see: a page with more, for the end of the sentence.
     """
-    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a typing slip explains what is missing
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a mistyped key explains a missing one
     where = [str(part) for part in first["loc"]]
     key = ".".join(where)
     if first["type"] == "extra_forbidden":
@@ -124,21 +126,21 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
     if first["type"] == "missing":
         return f"{what} lacks {key}{see}"
     if first["type"] == "value_error":
-        said = str(first["ctx"]["error"])
-        return f"{argument(f'{what} {key}')}: {said}" if where else said
+        reason = str(first["ctx"]["error"])
+        return f"{argument(f'{what} {key}')}: {reason}" if where else reason
     message = first["msg"][0].lower() + first["msg"][1:]
     return f"{argument(f'{what} {key}')}: {message}, got {shortened(first['input'])}{_meant(first)}{see}"
 
 
-def _meant(error: Mapping[str, Any]) -> str:
-    """The nearest of the names that a key may have, where its value is none of them."""
+def _meant(error: ErrorDetails) -> str:
+    """Suggest the nearest of the names that a value may have, where it is none of them."""
     if error["type"] != "literal_error":
         return ""
     return meant(error["input"], re.findall(r"'([^']*)'", str(error["ctx"]["expected"])))
 
 
 def shortened(value: object) -> str:
-    """A value as Python writes it, cut where it is long: it may be huge, or refer to itself."""
+    """Return a value as Python writes it, cut where it is long. The value may be huge, or refer to itself."""
     if isinstance(value, int) and abs(value) > 10**40:
         return f"an integer of {value.bit_length():,} bits"
     brief = reprlib.Repr()
@@ -147,11 +149,11 @@ def shortened(value: object) -> str:
 
 
 def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:
-    """The fields of a model nested in another; empty where it cannot be told."""
+    """Return the fields of a model nested in another; empty where the annotation does not name one model."""
     from pydantic import BaseModel
 
     for name in where:
-        if name.isdigit():  # a place in a list
+        if name.isdigit():  # an index in a list
             continue
         field = model.model_fields.get(name)
         nested = [kind for kind in _kinds(field.annotation if field else None) if issubclass(kind, BaseModel)]
@@ -162,7 +164,7 @@ def _fields_of(model: type[BaseModel], where: list[str]) -> dict[str, object]:
 
 
 def _kinds(annotation: object) -> list[type]:
-    """The classes in an annotation: ``list[A] | None`` holds A and NoneType."""
+    """List the classes in an annotation: ``list[A] | None`` holds A and NoneType."""
     from typing import get_args
 
     parts = get_args(annotation)

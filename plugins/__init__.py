@@ -1,8 +1,8 @@
 """Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``channel_sonar``, ``echo``, ``cell_noise`` ...
 
 Mitsuba keeps one registry of plugins a variant, and a class can derive from ``mi.Sensor`` only once a variant is set.
-So :func:`install` registers them for the variant that is set, if any, and again after each change of variant, whether
-Mitsuba is imported before mitsonar or after it.
+:func:`install` registers them for the variant that is set, if any, and after each change of variant. Mitsuba may be imported
+before mitsonar or after it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ PLUGINS = (
     "cell_noise",
     "perlin",
 )
-"""The modules that speak Mitsuba, in the order in which they import each other."""
+"""The modules that use Mitsuba, in the order in which they import each other."""
 
 
 def install() -> None:
-    """Register the plugins now if Mitsuba is imported, otherwise as soon as it is. Sets no variant."""
+    """Register the plugins now if Mitsuba is imported, otherwise as soon as it is. Set no variant."""
     if "mitsuba" in sys.modules:
         _watch_variants()
     elif not any(isinstance(finder, _AfterMitsuba) for finder in sys.meta_path):
@@ -57,29 +57,32 @@ def _register(_old: str | None, new: str | None) -> None:
 
 
 class _AfterMitsuba(MetaPathFinder, Loader):
-    """Finds ``mitsuba`` as usual, then watches its variants: ``import mitsonar`` need not wait for it to load."""
+    """Find ``mitsuba`` as usual, then watch its variants. ``import mitsonar`` need not wait until it is loaded."""
 
     def __init__(self) -> None:
         self.real: Loader | None = None
-        self.looking = False
+        self.searching = False
 
     def find_spec(self, name: str, path: object = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        if name != "mitsuba" or self.looking:
+        """Return the spec of ``mitsuba`` with this loader in front of its own; None for any other module."""
+        if name != "mitsuba" or self.searching:
             return None
-        self.looking = True  # the real finders are asked for it
+        self.searching = True  # ask the other finders for it
         try:
             spec = importlib.util.find_spec(name)
         finally:
-            self.looking = False
+            self.searching = False
         if spec is not None and spec.loader is not None:
             self.real, spec.loader = spec.loader, self
         return spec
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        """Create the module as its own loader does."""
         assert self.real is not None
         return self.real.create_module(spec)
 
     def exec_module(self, module: ModuleType) -> None:
+        """Load the module, leave the import system, and register the plugins."""
         assert self.real is not None
         module.__spec__.loader = module.__loader__ = self.real  # type: ignore[union-attr]
         self.real.exec_module(module)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
+from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
-from mitsonar.plugins.hashed_texture import HashedTexture
+from mitsonar.plugins.hashed_texture import HashedTexture, number_of_property
 
 __all__ = ["CellNoise"]
 
@@ -21,7 +20,7 @@ class CellNoise(HashedTexture):
     ``mean`` [0.5] and ``std`` [0.2], clipped to 0..1; ``octaves`` [1]: grids of half the cell each with half the weight;
     ``seed`` [0]; ``to_uv``: transform of uv.
 
-    It does not filter: a ray reads the one cell that it hits.
+    It does not filter. A ray reads the one cell that it hits.
 
     .. code-block:: xml
 
@@ -34,8 +33,8 @@ class CellNoise(HashedTexture):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, cells=2048.0, cell_size=0.015)
         self.distribution = str(props.get("distribution", "uniform"))
-        self.low, self.high = float(props.get("low", 0.0)), float(props.get("high", 1.0))
-        self.middle, self.std = float(props.get("mean", 0.5)), float(props.get("std", 0.2))
+        self.low, self.high = number_of_property(props, "low", 0.0), number_of_property(props, "high", 1.0)
+        self.middle, self.std = number_of_property(props, "mean", 0.5), number_of_property(props, "std", 0.2)
         if self.distribution not in ("uniform", "gaussian"):
             raise MitsonarError(f"cell_noise distribution must be uniform or gaussian: got {self.distribution!r}")
         if not 0 <= self.low <= self.high <= 1 or not 0 <= self.middle <= 1 or not self.std >= 0:
@@ -44,17 +43,18 @@ class CellNoise(HashedTexture):
                 f"high {self.high:g}, mean {self.middle:g}, std {self.std:g}"
             )
 
-    def octave(self, place: Any, seed: int) -> mi.Float:
-        """The value of the cell around ``place``, in cells."""
-        first, second = self.hash(dr.floor(place), seed)
-        value = (mi.Float(first >> 8) + 0.5) * 2.0**-24
+    def octave(self, point: DeviceArray, seed: int) -> DeviceArray:
+        """Return the value of the cell that holds ``point``, in cells."""
+        first, second = self.hash(dr.floor(point), seed)
+        value: DeviceArray = (mi.Float(first >> 8) + 0.5) * 2.0**-24
         if self.distribution == "uniform":
             return self.low + value * (self.high - self.low)
         angle = (mi.Float(second >> 8) + 0.5) * (2.0**-24 * 2 * dr.pi)
         value = self.middle + self.std * dr.sqrt(-2 * dr.log(value)) * dr.cos(angle)
         return dr.select(value > 0, dr.select(value < 1, value, 1), 0)
 
-    def mean(self) -> mi.Float:
+    def mean(self) -> DeviceArray:
+        """Return the mean of the distribution, which Mitsuba uses for importance sampling."""
         return mi.Float((self.low + self.high) / 2 if self.distribution == "uniform" else self.middle)
 
 

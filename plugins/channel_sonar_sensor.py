@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
+from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import LOOKS, ChannelSonar, FieldOfView, four_receivers
 from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
@@ -22,19 +24,19 @@ class ChannelSensor(mi.Sensor):
     """A transmitter and named receivers between which channel impulse responses are measured.
 
     Properties: those of :class:`mitsonar.instruments.channel_sonar.ChannelSonar` (``carrier_hz`` [Hz, 80000],
-    ``bandwidth_hz`` [Hz,
-    4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max`` [m, 25],
-    ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``, ``points_per_m2`` [1700],
-    ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front, left, back, right]: names with commas between; fields
-    of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg`` [deg,
-    50], ``taper`` [0.5]; of one: the same and ``heading_deg`` with its name before, ``front_heading_deg``, and its place,
-    ``front_position`` [m, starboard, forward, up]; of the transmitter: ``transmitter_shape`` [all] and so on; ``to_world``:
-    of the vehicle, local +z forward, +y up.
+    ``bandwidth_hz`` [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max``
+    [m, 25], ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``,
+    ``points_per_m2`` [1700], ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front, left, back, right]: names with
+    commas between; ``to_world``: of the vehicle, local +z forward, +y up.
 
-    Receivers that are called front, left, back or right stand 0.1 m from the transmitter and look that way unless told
-    otherwise; others must have a heading and a position. As a camera it sends one ray, forward: responses are made by
-    ``mitsonar impulse``. It does not model a vehicle that shadows its own receivers, several bounces, or the way between
-    transmitter and receiver.
+    Fields of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg``
+    [deg, 50], ``taper`` [0.5]. Of one receiver: the same and ``heading_deg``, with the receiver's name before, as in
+    ``front_heading_deg``; and its position, ``front_position`` [m, starboard, forward, up]. Of the transmitter:
+    ``transmitter_shape`` [all] and so on.
+
+    By default the receivers front, left, back and right lie 0.1 m from the transmitter and point that way. Others must have
+    a heading and a position. As a camera the sensor sends one ray, forward; ``mitsonar impulse`` computes responses. It does
+    not model a vehicle that shadows its own receivers, several bounces, or the direct path from transmitter to receiver.
 
     .. code-block:: xml
 
@@ -60,33 +62,48 @@ class ChannelSensor(mi.Sensor):
 
     @property
     def pose(self) -> Pose:
-        """Where ``to_world`` puts the vehicle."""
+        """Return the pose of the vehicle, from ``to_world``."""
         return pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
 
-    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
-        """A ray forward, and weight 1."""
+    def sample_ray(
+        self,
+        time: DeviceArray,
+        sample1: DeviceArray,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: DeviceArray = True,
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Return a ray forward, and weight 1."""
         matrix = to_world_matrices(self.pose)[0]
         ray = dr.zeros(mi.Ray3f, dr.width(sample2))
         ray.o, ray.d = mi.Point3f(*map(float, matrix[:3, 3])), mi.Vector3f(*map(float, matrix[:3, 2]))
-        ray.maxt, ray.time = dr.largest(mi.Float), time
+        ray.maxt, ray.time = dr.largest(mi.Float)  # type: ignore[no-untyped-call]  # Dr.Jit gives it no types, time
         return ray, mi.Spectrum(1.0)
 
-    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
-        """As :meth:`sample_ray`."""
+    def sample_ray_differential(
+        self,
+        time: DeviceArray,
+        sample1: DeviceArray,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: DeviceArray = True,
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """Return the same as :meth:`sample_ray`."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
 
     def to_string(self) -> str:
+        """Return one line for Mitsuba's logs."""
         return f"ChannelSensor[{self.sonar!r}]"
 
 
 def is_channel_sonar(sensor: mi.Sensor) -> bool:
-    """Whether a sensor is one, also of an earlier load of this module: the class is made anew with each variant."""
+    """Return whether a sensor is one. Compare names: each variant makes the class anew."""
     return any(base.__name__ == ChannelSensor.__name__ for base in type(sensor).__mro__)
 
 
 def _read(props: mi.Properties) -> ChannelSonar:
-    """The instrument that the properties say."""
+    """Read the instrument from the properties."""
     fields = _some(props, OWN)
     shared = _some(props, tuple(name for name in FIELD if name != "heading_deg"))
     sends = {"shape": "all", **_some(props, FIELD, "transmitter_")}
@@ -99,7 +116,7 @@ def _read(props: mi.Properties) -> ChannelSonar:
             raise MitsonarError(f"receivers are names with commas between them, as 'bow, port': got {props['receivers']!r}")
         made = known.get(name, {"name": name, "field": {}})
         if f"{name}_position" in props:
-            made["position"] = _place(f"{name}_position", props[f"{name}_position"])
+            made["position"] = _position(f"{name}_position", props[f"{name}_position"])
         receivers.append({**made, "field": {**made["field"], **shared, **own}})
         missing = [
             key for key, there in (("heading_deg", "heading_deg" in own), ("position", "position" in made)) if not there
@@ -108,31 +125,31 @@ def _read(props: mi.Properties) -> ChannelSonar:
             _refuse_unknown(props, names)
             keys = " and ".join(f"{name}_{key}" for key in missing)
             raise MitsonarError(
-                f"receiver {name!r} must be told where it is and looks: give {keys} (position: a point, starboard, forward, "
-                "up in m; heading: 0 forward, 90 to starboard); front, left, back and right know theirs"
+                f"receiver {name!r} needs a position and a heading: give {keys} (position: a point, starboard, forward, "
+                "up in m; heading: 0 forward, 90 to starboard); front, left, back and right have defaults"
             )
     _refuse_unknown(props, names)
     return ChannelSonar.create(**fields, transmitter=sends, receivers=receivers)
 
 
-def _place(key: str, value: Any) -> tuple[float, ...]:
-    """A point, or three numbers with commas."""
+def _position(key: str, value: object) -> tuple[float, ...]:
+    """Three numbers from a point, or from a text with commas."""
     try:
-        given = value.replace(",", " ").split() if isinstance(value, str) else np.ravel(value)
-        place = tuple(float(number) for number in given)
+        given = value.replace(",", " ").split() if isinstance(value, str) else np.ravel(cast(ArrayLike, value))
+        position = tuple(float(number) for number in given)
     except (TypeError, ValueError):
-        place = ()
-    if len(place) != 3:
+        position = ()
+    if len(position) != 3:
         example = f'<point name="{key}" value="0, 0.3, 0"/>'
         raise MitsonarError(f"{key} is a point, starboard, forward, up in m, {example}: got {value!r}")
-    return place
+    return position
 
 
 def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
-    """Properties that the sensor does not have.
+    """Refuse properties that the sensor does not have.
 
     Raises:
-        MitsonarError: some.
+        MitsonarError: there are some.
     """
     known = {*OWN, *FIELD, "receivers", "to_world", "id", *(f"transmitter_{key}" for key in FIELD)} - {"heading_deg"}
     known |= {f"{name}_{key}" for name in names for key in (*FIELD, "position")}
@@ -141,7 +158,8 @@ def _refuse_unknown(props: mi.Properties, names: list[str]) -> None:
             raise MitsonarError(f"the sensor channel_sonar has no property {key!r}: {nearest_names(key, sorted(known))}")
 
 
-def _some(props: mi.Properties, names: tuple[str, ...], before: str = "") -> dict[str, Any]:
+def _some(props: mi.Properties, names: tuple[str, ...], before: str = "") -> dict[str, object]:
+    """Return the properties of these names that are given."""
     return {name: props[before + name] for name in names if before + name in props}
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
-from mitsonar.plugins.imaging_sonar_sensor import Fan, is_imaging_sonar
+from mitsonar.arrays import DeviceArray
+from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar, is_imaging_sonar
 from mitsonar.plugins.surfaces import Surfaces
 from mitsonar.records.echoes import CHANNELS, Echoes
 
@@ -18,20 +19,21 @@ GRAZING = 0.02
 """Sine of the flattest angle (1.1 deg) at which a cell's tangent plane is followed: beyond it leaves the object."""
 
 
-def steep(toward: Any) -> Any:
-    """The part of a ray along the normal, kept off 0 where the ray grazes (see :data:`GRAZING`)."""
-    return dr.select(dr.abs(toward) > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
+def steep(toward: DeviceArray) -> DeviceArray:
+    """Return the part of a ray along the normal, kept away from 0 where the ray grazes (see :data:`GRAZING`)."""
+    size: DeviceArray = dr.abs(toward)
+    return dr.select(size > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
 
 
 class Echo(ADIntegrator):
-    """Records what each ray meets: range, reflectivity, |cosine|, point, geometric normal, shape, solid angle.
+    """Record what each ray meets: range, reflectivity, |cosine|, point, geometric normal, shape, solid angle.
 
-    Channels after the film's own (reflectivity times cosine): those of
+    The film's own channel holds reflectivity times cosine. The channels after it are those of
     :class:`mitsonar.records.echoes.Echoes`, in its order, all float32. A miss has ``hit`` 0, ``shape_id`` -1 and zero
-    elsewhere. Each pixel gets exactly one ray, through its cell (``imaging_sonar``) or its centre (any other sensor),
-    whatever the sampler says, so nothing is averaged. The range counts from the sensor's position, also where a camera
-    starts its rays at a near plane. With other sensors than ``imaging_sonar`` the solid angle is 0 and ``near_m`` =
-    ``far_m`` = ``range_m``.
+    elsewhere. Each pixel gets exactly one ray, whatever the sampler asks for, so nothing is averaged. The ray passes through
+    the pixel's cell (``imaging_sonar``) or its centre (any other sensor). The range counts from the sensor's position, also
+    where a camera starts its rays at a near plane. With other sensors than ``imaging_sonar`` the solid angle is 0 and
+    ``near_m`` = ``far_m`` = ``range_m``.
 
     Properties: none. Reflectivity of BSDFs that are not diffuse: see :mod:`mitsonar.plugins.surfaces`. It does not
     model multiple bounces, transmission or volumes.
@@ -42,17 +44,24 @@ class Echo(ADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        super().__init__(props)
+        super().__init__(props)  # type: ignore[no-untyped-call]  # Mitsuba's own class has no types
         self._fan: Fan | None = None
         self._origin = mi.Point3f(0)
 
     @staticmethod
-    def measure(scene: mi.Scene, surfaces: Surfaces, ray: mi.Ray3f, fan: Fan, skipped: Any = 0.0) -> Echoes:
-        """The echoes of rays that start ``skipped`` metres from the sonar; ``fan.lift`` and ``fan.side`` in world axes.
+    def measure(scene: mi.Scene, surfaces: Surfaces, ray: mi.Ray3f, fan: Fan, skipped: DeviceArray = 0.0) -> Echoes:
+        """Return the echoes of rays, arrays that are not evaluated yet.
 
-        On the tangent plane of the point hit, dR/de = -R (n . dd/de) / (n . d), and the same by bearing: this gives the
-        range interval of the cell's middle line, wherever in its cell the ray is, so that on a plane cells join
-        without gap or overlap also where rays jitter.
+        On the tangent plane of the point hit, dR/de = -R (n . dd/de) / (n . d), and the same by bearing. This gives the
+        range interval of the cell's middle line, wherever in its cell the ray is. So on a plane cells join without gap or
+        overlap, also where rays jitter.
+
+        Args:
+            scene: is traced.
+            surfaces: tables of that scene.
+            ray: one a cell, in world axes.
+            fan: the same rays; ``lift`` and ``side`` in world axes.
+            skipped: distance from the sonar to where each ray starts [m].
         """
         hit = surfaces.hit(scene, ray)
         valid = hit.valid
@@ -65,7 +74,7 @@ class Echo(ADIntegrator):
         low, high = middle + slope * fan.below, middle + slope * fan.above
         point = ray.o + ray.d * hit.t
 
-        def kept(value: Any) -> mi.Float:
+        def kept(value: DeviceArray) -> DeviceArray:
             return dr.select(valid, value, 0)
 
         return Echoes(
@@ -87,41 +96,51 @@ class Echo(ADIntegrator):
         )
 
     def aov_names(self) -> list[str]:
-        """The channels' names."""
+        """Return the names of the channels."""
         return list(CHANNELS)
 
-    def prepare(self, sensor: mi.Sensor, seed: Any = 0, spp: int = 0, aovs: list[str] | None = None) -> Any:
-        """One sample a pixel, whatever is asked."""
-        return super().prepare(sensor, seed, 1, aovs or [])
+    def prepare(
+        self, sensor: mi.Sensor, seed: DeviceArray = 0, spp: int = 0, aovs: list[str] | None = None
+    ) -> tuple[mi.Sampler, int]:
+        """Prepare one sample a pixel, whatever ``spp`` is asked."""
+        sampler, samples = super().prepare(sensor, seed, 1, aovs or [])
+        return sampler, samples
 
-    def sample_rays(self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler) -> Any:
-        """The one ray of every pixel."""
+    def sample_rays(
+        self, scene: mi.Scene, sensor: mi.Sensor, sampler: mi.Sampler
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Vector2f]:
+        """Return the one ray of every pixel, its weight, and its film position in pixels."""
         size = sensor.film().crop_size()
         index = dr.arange(mi.UInt32, dr.prod(size))
         row, column = index // size.x, index % size.x
         position = mi.Point2f((mi.Float(column) + 0.5) / size.x, (mi.Float(row) + 0.5) / size.y)
-        ray, weight = sensor.sample_ray_differential(
-            time=sensor.shutter_open(), sample1=0.5, sample2=position, sample3=mi.Point2f(0.5)
-        )
+        time: DeviceArray = sensor.shutter_open()
+        half: DeviceArray = 0.5
+        ray, weight = sensor.sample_ray_differential(time=time, sample1=half, sample2=position, sample3=mi.Point2f(0.5))
         if is_imaging_sonar(sensor):
-            self._fan = sensor.film_fan(position).carried(sensor.lines())
+            sonar = cast(ImagingSonar, sensor)
+            self._fan = sonar.film_fan(position).carried(sonar.lines())
         else:
             self._fan = Fan(ray.d, mi.Vector3f(0), mi.Vector3f(0), *(mi.Float(0) for _ in range(5)))
         self._origin = mi.Point3f(sensor.world_transform().translation())
         return ray, weight, mi.Vector2f(mi.Vector2u(column, row)) + mi.Vector2f(sensor.film().crop_offset())
 
-    def sample(self, mode: Any, scene: mi.Scene, sampler: Any, ray: mi.RayDifferential3f, **_: Any) -> Any:
-        """Values, validity, channels and no state, as ``ADIntegrator`` wants them."""
+    def sample(  # type: ignore[override]  # ADIntegrator.sample overrides its own parent with other arguments
+        self, mode: object, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, **_: object
+    ) -> tuple[mi.Spectrum, DeviceArray, list[DeviceArray], None]:
+        """Return values, validity, channels and no state, as ``ADIntegrator`` expects them."""
         surfaces = Surfaces.of(scene)
         for note in surfaces.notes:
-            mi.Log(mi.LogLevel.Warn, note)
+            mi.Log(mi.LogLevel.Warn, note)  # type: ignore[operator]  # an `object` to Mitsuba's stubs
         assert self._fan is not None
-        skipped = dr.dot(ray.o - self._origin, ray.d)
+        offset: DeviceArray = ray.o - self._origin
+        skipped = dr.dot(offset, ray.d)
         echoes = self.measure(scene, surfaces, mi.Ray3f(ray), self._fan, skipped)
         value = mi.Spectrum(echoes.reflectivity * echoes.cosine)
         return value, echoes.hit > 0, [getattr(echoes, name) for name in CHANNELS], None
 
     def to_string(self) -> str:
+        """Return one line for Mitsuba's logs."""
         return "Echo[]"
 
 

@@ -1,34 +1,37 @@
-"""What the textures ``cell_noise`` and ``perlin`` share: a value that is a hash of the place on a surface."""
+"""The base class of the textures ``cell_noise`` and ``perlin``: a value that is a hash of the point on a surface."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
+from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
 
-__all__ = ["ROUNDS", "HashedTexture"]
+__all__ = ["ROUNDS", "HashedTexture", "number_of_property"]
 
 ROUNDS = 8
 """Rounds of the hash (Tiny Encryption Algorithm): with Mitsuba's default of 4, neighbours correlate by 0.4."""
 
 
 class HashedTexture(mi.Texture):
-    """A sum of octaves over uv or world position; a subclass gives :meth:`octave`."""
+    """A sum of octaves over uv or world position. A subclass defines :meth:`octave`."""
 
     def __init__(self, props: mi.Properties, *, cells: float, cell_size: float, octaves: int = 1) -> None:
         super().__init__(props)
         self.coordinates = str(props.get("coordinates", "uv"))
         if self.coordinates not in ("uv", "position"):
             raise MitsonarError(f"{self.name} coordinates must be uv or position: got {self.coordinates!r}")
-        self.cells = float(props.get("cells", cells))
-        self.cell_size = float(props.get("cell_size", cell_size))
-        self.octaves = int(props.get("octaves", octaves))
-        self.seed = int(props.get("seed", 0))
-        to_uv = np.array(props.get("to_uv", mi.ScalarTransform4f()).matrix, dtype=float)
+        self.cells = number_of_property(props, "cells", cells)
+        self.cell_size = number_of_property(props, "cell_size", cell_size)
+        self.octaves = int(cast(int, props.get("octaves", octaves)))
+        self.seed = int(cast(int, props.get("seed", 0)))
+        transform = cast(mi.ScalarTransform4f, props.get("to_uv", mi.ScalarTransform4f()))
+        to_uv: NDArray[np.float64] = np.array(transform.matrix, dtype=float)
         self.to_uv = to_uv[:2][:, [0, 1, 3]]
         if not (self.cells > 0 and self.cell_size > 0 and 1 <= self.octaves <= 24):
             raise MitsonarError(
@@ -38,53 +41,70 @@ class HashedTexture(mi.Texture):
 
     @property
     def name(self) -> str:
-        """The class's name, for messages."""
+        """Return the name of the class, for messages."""
         return type(self).__name__
 
-    def octave(self, place: Any, seed: int) -> mi.Float:
-        """The value at ``place``, in cells (2 or 3 coordinates)."""
+    def octave(self, point: DeviceArray, seed: int) -> DeviceArray:
+        """Return the values of one octave.
+
+        Args:
+            point: Dr.Jit points of 2 or 3 coordinates, in cells.
+            seed: of this octave, 0..2^32 - 1.
+        """
         raise NotImplementedError
 
-    def finish(self, value: mi.Float) -> mi.Float:
-        """What is done to the sum of octaves."""
+    def finish(self, value: DeviceArray) -> DeviceArray:
+        """Return the value of the texture for the mean of the octaves; a subclass may change it."""
         return value
 
-    def hash(self, place: Any, seed: int) -> tuple[mi.UInt32, mi.UInt32]:
-        """64 random bits for a lattice point and a seed (0..2^32 - 1)."""
-        whole = [dr.reinterpret_array(mi.UInt32, mi.Int32(axis)) for axis in place]
-        key = mi.UInt32(seed)
+    def hash(self, point: DeviceArray, seed: int) -> tuple[DeviceArray, DeviceArray]:
+        """Return 64 random bits, as two ``UInt32``, for a lattice point and a seed (0..2^32 - 1)."""
+        whole: list[DeviceArray] = [dr.reinterpret_array(mi.UInt32, mi.Int32(axis)) for axis in point]
+        key: DeviceArray = mi.UInt32(seed)
         if len(whole) == 3:
             key = mi.sample_tea_32(whole[2], key, ROUNDS)[0]
-        return mi.sample_tea_32(whole[0], whole[1] ^ key, ROUNDS)
+        first, second = mi.sample_tea_32(whole[0], whole[1] ^ key, ROUNDS)
+        return first, second
 
-    def value(self, si: mi.SurfaceInteraction3f) -> mi.Float:
-        """The mean of the octaves, each with half the weight of the one before."""
+    def value(self, si: mi.SurfaceInteraction3f) -> DeviceArray:
+        """Return the mean of the octaves. Each has half the weight of the one before."""
         on_surface = self.coordinates == "uv"
-        place = self._moved(si.uv) * self.cells if on_surface else si.p / self.cell_size
-        total, weight = mi.Float(0), 0.0
+        point = self._transformed(si.uv) * self.cells if on_surface else si.p / self.cell_size
+        total: DeviceArray = mi.Float(0)
+        weight = 0.0
         for octave in range(self.octaves):
-            total += 0.5**octave * self.octave(place * 2**octave, _scramble(self.seed, octave))
+            total += 0.5**octave * self.octave(point * 2**octave, _scramble(self.seed, octave))
             weight += 0.5**octave
         return self.finish(total / weight)
 
-    def _moved(self, uv: mi.Point2f) -> mi.Point2f:
-        """uv after ``to_uv``."""
+    def _transformed(self, uv: mi.Point2f) -> mi.Point2f:
+        """Apply ``to_uv``."""
         return mi.Point2f(*(float(u) * uv.x + float(v) * uv.y + float(one) for u, v, one in self.to_uv))
 
-    def eval(self, si: mi.SurfaceInteraction3f, active: Any = True) -> Any:
+    def eval(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.UnpolarizedSpectrum:
+        """Return :meth:`value` as a spectrum; 0 where not active."""
         return mi.UnpolarizedSpectrum(dr.select(active, self.value(si), 0))
 
-    def eval_1(self, si: mi.SurfaceInteraction3f, active: Any = True) -> Any:
+    def eval_1(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> DeviceArray:
+        """Return :meth:`value`; 0 where not active."""
         return dr.select(active, self.value(si), 0)
 
-    def eval_3(self, si: mi.SurfaceInteraction3f, active: Any = True) -> Any:
+    def eval_3(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.Color3f:
+        """Return :meth:`value` as a grey colour; 0 where not active."""
         return mi.Color3f(self.eval_1(si, active))
 
     def is_spatially_varying(self) -> bool:
+        """Return True: Mitsuba must not take the texture for a constant."""
         return True
 
     def to_string(self) -> str:
+        """Return one line for Mitsuba's logs."""
         return f"{self.name}[coordinates = {self.coordinates}, octaves = {self.octaves}, seed = {self.seed}]"
+
+
+def number_of_property(props: mi.Properties, name: str, default: float) -> float:
+    """Return a number among a plugin's properties."""
+    return float(cast(float, props.get(name, default)))
 
 
 def _scramble(seed: int, octave: int) -> int:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
@@ -36,15 +37,15 @@ class Fan:
     d: mi.Vector3f
     lift: mi.Vector3f
     side: mi.Vector3f
-    below: mi.Float
-    above: mi.Float
-    aside: mi.Float
-    solid_angle: mi.Float
-    elevation: mi.Float
+    below: DeviceArray
+    above: DeviceArray
+    aside: DeviceArray
+    solid_angle: DeviceArray
+    elevation: DeviceArray
 
     def carried(self, lines: list[mi.Vector4f]) -> Fan:
-        """The same rays in the world's axes; ``lines`` are the first three rows of ``to_world``."""
-        return replace(self, **{name: carried(lines, getattr(self, name)) for name in ("d", "lift", "side")})
+        """Return the same rays in the world's axes; ``lines`` are the first three rows of ``to_world``."""
+        return replace(self, d=carried(lines, self.d), lift=carried(lines, self.lift), side=carried(lines, self.side))
 
 
 class ImagingSonar(mi.Sensor):
@@ -56,13 +57,13 @@ class ImagingSonar(mi.Sensor):
     (sin b, cos b cos e, cos b sin e).
 
     Properties: those of :class:`mitsonar.instruments.imaging_sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
-    ``elevation_fov_deg`` [deg, 14],
-    ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512], ``sound_speed`` [m/s, 1500],
-    ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing], ``jitter`` [physical: true],
-    ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``frame_rate_hz`` [Hz, 10], ``quality`` [standard]: draft,
-    standard or fine, ``thesis_rays`` [700], ``rays_per_beam`` and ``rays_across`` [from quality; of the model thesis
-    ``thesis_rays`` and one]); ``preset``, a name that the others change; ``ping`` [0], which draw of the jitter;
-    ``to_world``. A film may be given if it says the same as beams and rays do.
+    ``elevation_fov_deg`` [deg, 14], ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512],
+    ``sound_speed`` [m/s, 1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing],
+    ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``frame_rate_hz`` [Hz, 10],
+    ``quality`` [standard]: draft, standard or fine, ``thesis_rays`` [700], ``rays_per_beam`` and ``rays_across`` [from
+    quality; of the model ``thesis`` these are ``thesis_rays`` and one]); ``preset``: a name; the others change its
+    numbers; ``ping`` [0]: number of the jitter's draw; ``to_world``. A film is not needed. One that is given must have the
+    size that follows from beams and rays.
 
     It does not model side lobes, beam patterns within the width, or a sonar that moves during a ping.
 
@@ -78,7 +79,7 @@ class ImagingSonar(mi.Sensor):
 
     def __init__(self, props: mi.Properties) -> None:
         self.sonar = _read_sonar(props)
-        self.ping = int(props.get("ping", 0))
+        self.ping = int(cast(int, props.get("ping", 0)))
         if self.ping < 0:
             raise MitsonarError(f"ping must be 0 or more: got {self.ping}")
         if not any(isinstance(child, mi.Film) for _, child in props.objects(mark_queried=False)):
@@ -89,20 +90,20 @@ class ImagingSonar(mi.Sensor):
 
     @property
     def pose(self) -> Pose:
-        """Where ``to_world`` puts the sonar."""
+        """Return the pose of the sonar, from ``to_world``."""
         return pose_from_to_world(np.array(self.world_transform().matrix, dtype=float).reshape(4, 4))
 
     def lines(self) -> list[mi.Vector4f]:
-        """The first three rows of ``to_world``, as :func:`carried` wants them."""
+        """Return the first three rows of ``to_world``, for :func:`carried`."""
         return [mi.Vector4f(*map(float, row)) for row in to_world_matrices(self.pose)[0, :3].astype(np.float32)]
 
-    # ---------------------------------------------------------------- the law of the rays
+    # ---------------------------------------------------------------- directions of the rays
 
     def fan(self, column: mi.UInt32, row: mi.UInt32, key: mi.UInt32) -> Fan:
-        """The ray of each cell; ``key`` (see :meth:`key`) draws its place within the cell where the sonar jitters."""
+        """Return the ray of each cell. Where the sonar jitters, ``key`` (see :meth:`key`) draws its position in the cell."""
         sonar = self.sonar
         beam, step = column // sonar.across, column % sonar.across
-        across, along = self._place_in_cell(row * sonar.columns + column, key)
+        across, along = self._position_in_cell(row * sonar.columns + column, key)
         width = sonar.beam_width_rad / sonar.across
         height = np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
         middle = self._axis(beam) + (mi.Float(step) + (0.5 - sonar.across / 2)) * width
@@ -124,17 +125,17 @@ class ImagingSonar(mi.Sensor):
         return Fan(d, lift, side, below, above, aside, solid_angle, elevation)
 
     def key(self, ping: int) -> int:
-        """32 bits that stand for (seed, ping) in the jitter's hash."""
+        """Return 32 bits of (seed, ping), the key of the jitter's hash."""
         return int(np.random.SeedSequence((self.sonar.seed, ping)).generate_state(1)[0])
 
     def _axis(self, beam: mi.UInt32) -> mi.Float:
-        """Bearing of a beam's axis [rad]; the same law as ``Sonar.bearing_rad``."""
-        half = np.radians(self.sonar.azimuth_fov_deg) / 2
-        place = (mi.Float(beam) + (0.5 - self.sonar.beams / 2)) * (2 / self.sonar.beams)
-        return place * half if self.sonar.beam_layout == "even" else dr.asin(place * np.sin(half))
+        """Bearing of a beam's axis [rad]; the same formula as ``Sonar.bearing_rad``."""
+        half = float(np.radians(self.sonar.azimuth_fov_deg)) / 2
+        part = (mi.Float(beam) + (0.5 - self.sonar.beams / 2)) * (2 / self.sonar.beams)  # -1..1 across the fan
+        return part * half if self.sonar.beam_layout == "even" else dr.asin(part * np.sin(half))
 
-    def _place_in_cell(self, ray: mi.UInt32, key: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-        """Across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray)."""
+    def _position_in_cell(self, ray: DeviceArray, key: DeviceArray) -> tuple[mi.Float, mi.Float]:
+        """Return the position across and down the cell, 0..1: its centre, or a hash of (seed, ping, ray)."""
         if not self.sonar.jittered:
             return mi.Float(0.5), mi.Float(0.5)
         first, second = mi.sample_tea_32(ray, key, ROUNDS)
@@ -142,33 +143,48 @@ class ImagingSonar(mi.Sensor):
 
     # ---------------------------------------------------------------- what Mitsuba asks of a sensor
 
-    def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
-        """The ray of the film's cell that ``sample2`` lies in, and weight 1."""
+    def sample_ray(
+        self,
+        time: DeviceArray,
+        sample1: DeviceArray,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: DeviceArray = True,
+    ) -> tuple[mi.Ray3f, mi.Spectrum]:
+        """Return the ray of the film's cell that holds ``sample2``, and weight 1."""
         fan = self.film_fan(sample2)
         lines = self.lines()
         ray = dr.zeros(mi.Ray3f, dr.width(fan.d))
         ray.o = mi.Point3f(*(line.w for line in lines))
         ray.d = carried(lines, fan.d)
-        ray.maxt = dr.largest(mi.Float)
+        ray.maxt = dr.largest(mi.Float)  # type: ignore[no-untyped-call]  # Dr.Jit gives it no types
         ray.time = time
         return ray, mi.Spectrum(1.0)
 
-    def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
-        """As :meth:`sample_ray`; a sonar's rays have no differentials."""
+    def sample_ray_differential(
+        self,
+        time: DeviceArray,
+        sample1: DeviceArray,
+        sample2: mi.Point2f,
+        sample3: mi.Point2f,
+        active: DeviceArray = True,
+    ) -> tuple[mi.RayDifferential3f, mi.Spectrum]:
+        """Return the same as :meth:`sample_ray`. A sonar's rays have no differentials."""
         ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
         return mi.RayDifferential3f(ray), weight
 
     def film_fan(self, position: mi.Point2f) -> Fan:
-        """The rays of film positions 0..1."""
+        """Return the rays of film positions 0..1."""
         column = mi.UInt32(position.x * self.sonar.columns)
         row = mi.UInt32(position.y * self.sonar.rays_per_beam)
         return self.fan(column, row, dr.opaque(mi.UInt32, self.key(self.ping)))
 
     def to_string(self) -> str:
+        """Return one line for Mitsuba's logs."""
         return f"ImagingSonar[{self.sonar!r}]"
 
     def _film(self) -> mi.Film:
-        return mi.load_dict(
+        film = mi.load_dict(
             {
                 "type": "hdrfilm",
                 "width": self.sonar.columns,
@@ -178,6 +194,7 @@ class ImagingSonar(mi.Sensor):
                 "rfilter": {"type": "box"},
             }
         )
+        return cast(mi.Film, film)
 
     def _check_film(self) -> None:
         film, wanted = self.film(), (self.sonar.columns, self.sonar.rays_per_beam)
@@ -197,17 +214,17 @@ def _read_sonar(props: mi.Properties) -> Sonar:
 
 
 def _local(starboard: mi.Float, forward: mi.Float, up: mi.Float) -> mi.Vector3f:
-    """From (starboard, forward, up) to the sensor's axes."""
+    """Turn (starboard, forward, up) into the sensor's axes."""
     return mi.Vector3f(-starboard, up, forward)
 
 
 def carried(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
-    """A direction from the sensor's axes to the world's, by the same products wherever rays are made."""
+    """Return a direction of the sensor's axes in the world's; every caller gets the same products, and so the same bits."""
     return mi.Vector3f(*(line.x * v.x + line.y * v.y + line.z * v.z for line in lines))
 
 
 def is_imaging_sonar(sensor: mi.Sensor) -> bool:
-    """Whether a sensor is one, also of an earlier load of this module: the class is made anew with each variant."""
+    """Return whether a sensor is one. Compare names: each variant makes the class anew."""
     return any(base.__name__ == ImagingSonar.__name__ for base in type(sensor).__mro__)
 
 

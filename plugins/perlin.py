@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
+from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
-from mitsonar.plugins.hashed_texture import HashedTexture
+from mitsonar.plugins.hashed_texture import HashedTexture, number_of_property
 
 __all__ = ["Perlin"]
 
@@ -18,10 +17,10 @@ class Perlin(HashedTexture):
 
     Properties: ``coordinates`` [uv]: uv or position; ``cells`` [64]: lattice cells a unit of uv; ``cell_size`` [m, 0.5]:
     edge of a lattice cell for position; ``octaves`` [4]: each with half the cell and half the weight of the one before;
-    ``low`` [0], ``high`` [1]: reflectivity that the noise's -1..1 stands for, after ``contrast`` [1.5] times it, clipped;
+    ``low`` [0], ``high`` [1]: reflectivity at noise -1 and 1, clipped; ``contrast`` [1.5]: factor of the noise before that;
     ``seed`` [0]; ``to_uv``: transform of uv.
 
-    It does not repeat, but for the 2^32 lattice points of its hash.
+    It repeats only after the 2^32 lattice points of its hash.
 
     .. code-block:: xml
 
@@ -33,37 +32,39 @@ class Perlin(HashedTexture):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props, cells=64.0, cell_size=0.5, octaves=4)
-        self.low, self.high = float(props.get("low", 0.0)), float(props.get("high", 1.0))
-        self.contrast = float(props.get("contrast", 1.5))
+        self.low, self.high = number_of_property(props, "low", 0.0), number_of_property(props, "high", 1.0)
+        self.contrast = number_of_property(props, "contrast", 1.5)
         if not 0 <= self.low <= self.high <= 1 or not self.contrast > 0:
             raise MitsonarError(
                 f"perlin needs 0 <= low <= high <= 1 and contrast > 0: got low {self.low:g}, high {self.high:g}, "
                 f"contrast {self.contrast:g}"
             )
 
-    def octave(self, place: Any, seed: int) -> mi.Float:
-        """Reflectivity before the octaves are averaged; ``place`` in lattice cells."""
-        corner = dr.floor(place)
-        inside = place - corner
+    def octave(self, point: DeviceArray, seed: int) -> DeviceArray:
+        """Return the reflectivity of one octave at ``point``, in lattice cells."""
+        corner = dr.floor(point)
+        inside = point - corner
         ease = inside * inside * inside * (inside * (inside * 6 - 15) + 10)
         value = self._blend(corner, inside, ease, seed, ())
         value = (value * self.contrast + 1) / 2
         return self.low + (self.high - self.low) * value
 
-    def finish(self, value: mi.Float) -> mi.Float:
-        """Into low..high, which the sum of octaves seldom leaves."""
+    def finish(self, value: DeviceArray) -> DeviceArray:
+        """Clip to low..high, which the mean of the octaves seldom leaves."""
         return dr.select(value > self.low, dr.select(value < self.high, value, self.high), self.low)
 
-    def _blend(self, corner: Any, inside: Any, ease: Any, seed: int, chosen: tuple[int, ...]) -> mi.Float:
-        """Interpolates, dimension by dimension, the ramps of the lattice points around."""
+    def _blend(
+        self, corner: DeviceArray, inside: DeviceArray, ease: DeviceArray, seed: int, chosen: tuple[int, ...]
+    ) -> DeviceArray:
+        """Interpolate the ramps of the lattice points around, one dimension after the other."""
         if len(chosen) == len(corner):
             return self._ramp(corner, inside, seed, chosen)
         low = self._blend(corner, inside, ease, seed, (*chosen, 0))
         high = self._blend(corner, inside, ease, seed, (*chosen, 1))
         return dr.lerp(low, high, ease[len(chosen)])
 
-    def _ramp(self, corner: Any, inside: Any, seed: int, chosen: tuple[int, ...]) -> mi.Float:
-        """The linear ramp of one lattice point: its random unit gradient times the way from it."""
+    def _ramp(self, corner: DeviceArray, inside: DeviceArray, seed: int, chosen: tuple[int, ...]) -> DeviceArray:
+        """Return the linear ramp of one lattice point: its random unit gradient times the offset from it."""
         offset = type(corner)(*chosen)
         first, second = self.hash(corner + offset, seed)
         way = inside - offset
@@ -75,7 +76,8 @@ class Perlin(HashedTexture):
         across = dr.sqrt(dr.select(up * up < 1, 1 - up * up, 0))
         return (cos * across * way[0] + sin * across * way[1] + up * way[2]) * (2 / dr.sqrt(3.0))
 
-    def mean(self) -> mi.Float:
+    def mean(self) -> DeviceArray:
+        """Return the middle of low..high, which Mitsuba uses for importance sampling."""
         return mi.Float((self.low + self.high) / 2)
 
 

@@ -1,22 +1,24 @@
-"""What a ray meets: normal, reflectivity and shape, read from a table of facets where a surface allows it.
+"""The surface that a ray meets: normal, reflectivity and shape, read from a table of facets where the surface allows it.
 
-Reflectivity of a surface (one number in 0..1; colours count by their luminance):
+Reflectivity of a surface is one number in 0..1; colours count by their luminance:
 
 - a BSDF with a diffuse reflectance (``diffuse``, ``plastic``, ``roughplastic``; through ``twosided``, ``mask``,
   ``bumpmap``, ``normalmap``): that reflectance, textured or not;
 - ``principled``, ``principledthin``: the base colour; ``blendbsdf``: the weighted mean of the two;
-- any other (``dielectric``, ``conductor``, ``null`` ...) has none: :data:`DEFAULT_REFLECTIVITY` stands for it.
+- any other (``dielectric``, ``conductor``, ``null`` ...) has none; it gets :data:`DEFAULT_REFLECTIVITY`.
 
-The last two kinds are named in :attr:`Surfaces.notes`.
+:attr:`Surfaces.notes` names the shapes of the last two kinds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
+
+from mitsonar.arrays import DeviceArray
 
 __all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces", "facet_points", "reflectances_of", "reflectivity_at"]
 
@@ -33,32 +35,33 @@ WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
 class Hit:
     """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity`` 0..1, shape and object."""
 
-    valid: Any
-    t: Any
-    n: Any
-    reflectivity: Any
-    shape_id: Any
-    object_id: Any
+    valid: DeviceArray
+    t: DeviceArray
+    n: DeviceArray
+    reflectivity: DeviceArray
+    shape_id: DeviceArray
+    object_id: DeviceArray
 
 
 @dataclass
 class Surfaces:
-    """Tables of a scene's shapes; made once a scene by :meth:`of`.
+    """Tables of a scene's shapes. :meth:`of` makes them once a scene.
 
-    A triangle of a mesh is a row of four floats, normal and reflectivity: one fetch of 16 bytes replaces two virtual calls
-    and a dozen scattered reads. Where the reflectivity varies within triangles a second table gives uv, and the BSDF is
-    asked. Shapes that are not meshes (and instances, bump maps, vertex colours) are asked through Mitsuba.
+    A triangle of a mesh is a row of four floats, normal and reflectivity. One fetch of 16 bytes replaces two virtual calls
+    and a dozen scattered reads. Where the reflectivity varies within triangles, a second table gives uv, and the BSDF is
+    evaluated. Mitsuba itself evaluates other shapes, and instances, bump maps and vertex colours.
 
     Attributes:
-        facets: normal and reflectivity (negative: ask the BSDF), four floats a triangle.
+        facets: normal and reflectivity (negative: evaluate the BSDF), four floats a triangle.
         corners: uv of the first corner and its change to the second and third, eight floats a triangle (two unused).
-        shapes: by registry index, four numbers a shape: first facet (-1: ask Mitsuba), first row in ``corners``, place of
-            the shape in ``scene.shapes()``, unused.
-        constant: by registry index, reflectivity of a shape that has no diffuse reflectance; negative: ask its BSDF.
+        shapes: by registry index, four numbers a shape: first facet (-1: not in the tables), first row in ``corners``,
+            index of the shape in ``scene.shapes()``, unused.
+        constant: by registry index, reflectivity of a shape that has no diffuse reflectance; negative:
+            evaluate its BSDF.
         objects: number of the object that a triangle belongs to (the mesh's attribute ``face_id``, 0 without it), one a
             triangle; empty but for one 0 where no mesh has it.
-        textured: some shape has a reflectivity that varies within a triangle.
-        foreign: some shape is not in the tables.
+        textured: whether some shape has a reflectivity that varies within a triangle.
+        foreign: whether some shape is not in the tables.
         notes: what a user should know about the scene's BSDFs, a sentence each.
     """
 
@@ -73,7 +76,7 @@ class Surfaces:
 
     @classmethod
     def of(cls, scene: mi.Scene) -> Surfaces:
-        """The tables of a scene."""
+        """Return the tables of a scene."""
         shapes = scene.shapes()
         size = 1 + max((_registry_index(shape) for shape in shapes), default=0)
         rows = [[-1, 0, -1, 0] for _ in range(size)]
@@ -86,7 +89,7 @@ class Surfaces:
         for number, shape in enumerate(shapes):
             index = _registry_index(shape)
             rows[index][2] = number
-            if shape.bsdf() is None:  # an instance: its group's shapes are asked through Mitsuba
+            if shape.bsdf() is None:  # an instance: Mitsuba evaluates the shapes of its group
                 continue
             kinds, textures = _walk(shape.bsdf())
             if not kinds <= DIFFUSE | APPROXIMATED | WRAPPERS:
@@ -97,12 +100,13 @@ class Surfaces:
             flat = constant[index] >= 0 or (TWO_FACED not in kinds and all(map(_constant_on_facets, textures)))
             if shape.is_mesh() and (flat or not (kinds & BENT or any(map(_by_vertex, textures)))):
                 rows[index][:2] = facet_count, corner_count
-                facets.append(_facet_rows(shape, constant[index], flat))
-                facet_count += shape.face_count()
-                tabled.append(shape)
+                mesh = cast(mi.Mesh, shape)
+                facets.append(_facet_rows(mesh, constant[index], flat))
+                facet_count += mesh.face_count()
+                tabled.append(mesh)
                 if not flat:
-                    corners.append(_corner_rows(shape))
-                    corner_count += shape.face_count()
+                    corners.append(_corner_rows(mesh))
+                    corner_count += mesh.face_count()
         tables = cls(
             facets=dr.concat(facets) if facets else dr.zeros(mi.Float, 4),
             corners=dr.concat(corners) if corners else dr.zeros(mi.Float, 8),
@@ -116,48 +120,58 @@ class Surfaces:
         dr.eval(tables.arrays())
         return tables
 
-    def arrays(self) -> dict[str, Any]:
-        """The tables themselves, the inputs of a launch, by their names."""
+    def arrays(self) -> dict[str, DeviceArray]:
+        """Return the tables by name: the inputs of a launch."""
         return {name: getattr(self, name) for name in ("facets", "corners", "shapes", "constant", "objects")}
 
-    def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: Any = True) -> Hit:
-        """Trace rays to the nearest surface. The arrays are not evaluated: what follows joins the same kernel."""
-        found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
+        """Trace rays to the nearest surface. The arrays are not evaluated: later operations join the same kernel."""
+        coherent: DeviceArray = True
+        found = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         valid = found.is_valid() & active
-        index = dr.reinterpret_array(mi.UInt32, found.shape)
+        index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
         known = valid & (index * 4 < dr.width(self.shapes))
         shape = dr.gather(mi.Vector4i, self.shapes, index, known)
         first = dr.select(known, shape.x, -1)
         tabled = first >= 0
         row = dr.gather(mi.Vector4f, self.facets, mi.UInt32(first) + found.prim_index, tabled)
-        normal, reflectivity = mi.Normal3f(row.x, row.y, row.z), row.w
-        shape_id = dr.select(known, shape.z, -1)
+        normal: DeviceArray = mi.Normal3f(row.x, row.y, row.z)
+        reflectivity: DeviceArray = row.w
+        shape_id: DeviceArray = dr.select(known, shape.z, -1)
         if self.textured:
-            asked = tabled & (reflectivity < 0)
-            si = self._on_facet(found, ray, normal, mi.UInt32(shape.y), asked)
-            own = _one_number(found.shape.bsdf().eval_diffuse_reflectance(si, asked))
-            reflectivity = dr.select(asked, _unit(own), reflectivity)
+            evaluated = tabled & (reflectivity < 0)
+            si = self._on_facet(found, ray, normal, mi.UInt32(shape.y), evaluated)
+            own: DeviceArray = _one_number(found.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
+            reflectivity = dr.select(evaluated, _unit(own), reflectivity)
         if self.foreign:
-            asked = valid & ~tabled
-            si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, asked)
+            evaluated = valid & ~tabled
+            si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
             fixed = dr.select(known, dr.gather(mi.Float, self.constant, index, known), -1)
-            own = _one_number(si.bsdf().eval_diffuse_reflectance(si, asked & (fixed < 0)))
+            own = _one_number(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
             normal = dr.select(tabled, normal, si.n)
             reflectivity = dr.select(tabled, reflectivity, _unit(dr.select(fixed < 0, own, fixed)))
-            top = dr.reinterpret_array(mi.UInt32, found.instance)
+            top: DeviceArray = dr.reinterpret_array(mi.UInt32, found.instance)
             inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
             shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
         numbered = tabled & (dr.width(self.objects) > 1)
         object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + found.prim_index, numbered)
         return Hit(valid, found.t, normal, reflectivity, shape_id, object_id)
 
-    def _on_facet(self, found: Any, ray: mi.Ray3f, normal: mi.Normal3f, first: mi.UInt32, active: mi.Bool) -> Any:
-        """What a texture or BSDF asks of a point: uv, position, triangle, and the side that is seen."""
+    def _on_facet(
+        self,
+        found: mi.PreliminaryIntersection3f,
+        ray: mi.Ray3f,
+        normal: DeviceArray,
+        first: mi.UInt32,
+        active: DeviceArray,
+    ) -> mi.SurfaceInteraction3f:
+        """Collect what a texture or BSDF reads at a point: uv, position, triangle, and the side that is hit."""
         corner = (first + found.prim_index) * 2
         uv = dr.gather(mi.Vector4f, self.corners, corner, active)
         change = dr.gather(mi.Vector4f, self.corners, corner + 1, active)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(found.t))
-        si.t, si.p, si.n = found.t, ray.o + ray.d * found.t, normal
+        offset: DeviceArray = ray.d * found.t
+        si.t, si.p, si.n = found.t, ray.o + offset, normal
         si.uv = mi.Point2f(uv.x, uv.y) + mi.Point2f(uv.z, uv.w) * found.prim_uv.x
         si.uv += mi.Point2f(change.x, change.y) * found.prim_uv.y
         si.shape, si.prim_index = found.shape, found.prim_index
@@ -166,20 +180,22 @@ class Surfaces:
 
 
 def _registry_index(shape: mi.Shape) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+    index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+    return int(index[0])
 
 
-def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> mi.Float:
-    """Normal and reflectivity of each triangle, as Mitsuba itself computes them."""
+def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> DeviceArray:
+    """Return normal and reflectivity of each triangle, as Mitsuba itself computes them."""
     si = facet_points(mesh, dr.arange(mi.UInt32, mesh.face_count()), mi.Point2f(1 / 3))
-    own = mi.Float(-1)
+    own: DeviceArray = mi.Float(-1)
     if flat:
         own = reflectivity_at(mesh.bsdf(), si) if constant < 0 else mi.Float(constant)
-    return dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, own))
+    rows: DeviceArray = dr.ravel(mi.Vector4f(si.n.x, si.n.y, si.n.z, own))
+    return rows
 
 
 def _object_ids(meshes: list[mi.Mesh]) -> mi.Float:
-    """The attribute ``face_id`` of all triangles, 0 where a mesh has none; one 0 if no mesh has any."""
+    """Return the attribute ``face_id`` of all triangles, 0 where a mesh has none; one 0 if no mesh has any."""
     given = [bool(mesh.has_attribute("face_id")[0]) for mesh in meshes]
     if not any(given):
         return dr.zeros(mi.Float, 1)
@@ -191,9 +207,9 @@ def _object_ids(meshes: list[mi.Mesh]) -> mi.Float:
 
 
 def _corner_rows(mesh: mi.Mesh) -> mi.Float:
-    """uv of each triangle's first corner, and its change to the second and to the third."""
+    """Return uv of each triangle's first corner, and its change to the second and to the third."""
     facets = dr.arange(mi.UInt32, mesh.face_count())
-    first, second, third = (facet_points(mesh, facets, mi.Point2f(*place)).uv for place in ((0, 0), (1, 0), (0, 1)))
+    first, second, third = (facet_points(mesh, facets, mi.Point2f(*corner)).uv for corner in ((0, 0), (1, 0), (0, 1)))
     second, third = second - first, third - first
     rows = mi.Float(dr.zeros(mi.Float, 8 * mesh.face_count()))
     start = dr.arange(mi.UInt32, mesh.face_count()) * 8
@@ -202,55 +218,63 @@ def _corner_rows(mesh: mi.Mesh) -> mi.Float:
     return rows
 
 
-def facet_points(mesh: mi.Mesh, facet: mi.UInt32, place: mi.Point2f) -> mi.SurfaceInteraction3f:
-    """Points on triangles: ``facet`` is the triangle's number, ``place`` its second and third barycentric coordinate."""
+def facet_points(mesh: mi.Mesh, facet: DeviceArray, uv: mi.Point2f) -> mi.SurfaceInteraction3f:
+    """Return points on triangles.
+
+    Args:
+        mesh: that has the triangles.
+        facet: numbers of the triangles, ``UInt32``.
+        uv: second and third barycentric coordinates of the points.
+    """
     count = dr.width(facet)
-    found = dr.zeros(mi.PreliminaryIntersection3f, count)
+    found: DeviceArray = dr.zeros(mi.PreliminaryIntersection3f, count)
     found.valid = dr.full(mi.Bool, True, count)
     found.t = mi.Float(1)
     found.prim_index = facet
-    found.prim_uv = place
+    found.prim_uv = uv
     found.shape = mi.ShapePtr(mesh)
     ray = dr.zeros(mi.Ray3f, count)
     ray.d = mi.Vector3f(0, 0, 1)
-    return found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame)
+    return cast(mi.SurfaceInteraction3f, found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame))
 
 
 def reflectances_of(bsdf: mi.BSDF) -> list[mi.Object]:
-    """The textures that a BSDF's reflectivity may come from."""
+    """Return the textures that a BSDF's reflectivity may come from."""
     return _walk(bsdf)[1]
 
 
-def reflectivity_at(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> mi.Float:
-    """Reflectivity 0..1 of a BSDF at points; :data:`DEFAULT_REFLECTIVITY` where it has no diffuse reflectance."""
+def reflectivity_at(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> DeviceArray:
+    """Return the reflectivity 0..1 of a BSDF at points; :data:`DEFAULT_REFLECTIVITY` where it has no diffuse reflectance."""
     if not _walk(bsdf)[0] <= DIFFUSE | APPROXIMATED | WRAPPERS:
         return mi.Float(DEFAULT_REFLECTIVITY)
     return _unit(_one_number(bsdf.eval_diffuse_reflectance(si)))
 
 
-def _one_number(spectrum: Any) -> mi.Float:
+def _one_number(spectrum: DeviceArray) -> DeviceArray:
+    """Return the luminance of a spectrum."""
     return mi.luminance(spectrum) if mi.is_rgb else spectrum[0]
 
 
-def _unit(value: mi.Float) -> mi.Float:
-    """Into 0..1; by comparisons, since LLVM 15 and 16 abort on `max` (see simulation.variant)."""
+def _unit(value: DeviceArray) -> DeviceArray:
+    """Clip to 0..1, by comparisons: LLVM 15 and 16 abort on `max` (see simulation.variant)."""
     return dr.select(value > 0, dr.select(value < 1, value, 1), 0)
 
 
 class _Children(mi.TraversalCallback):
-    """Collects the objects directly below one."""
+    """Collect the objects directly below one."""
 
     def __init__(self) -> None:
         super().__init__()
         self.objects: list[mi.Object] = []
 
-    def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
+    def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
+        """Keep a value that is an object; Mitsuba calls this for each parameter."""
         if isinstance(value, mi.Object):
             self.objects.append(value)
 
 
 def _walk(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
-    """Class names of a BSDF and all nested ones, and the textures that their reflectance may come from."""
+    """Return the class names of a BSDF and all nested ones, and the textures that their reflectance may come from."""
     children = _Children()
     bsdf.traverse(children)
     kinds, textures = {bsdf.class_name()}, []

@@ -1,4 +1,4 @@
-"""Scenes, plain NumPy truths and scripts that several tests share. Truths are written from SPEC.md, not from the code."""
+"""Scenes, plain NumPy truths and scripts of several tests. Truths are written from the formulas, not from the code."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,21 +25,28 @@ Array = NDArray[np.float64]
 # ---------------------------------------------------------------- scenes
 
 
-def diffuse(reflectance: Any = 0.5) -> dict[str, Any]:
+MitsubaDict: TypeAlias = dict[str, Any]
+"""A part of a scene as Mitsuba's `load_dict` reads it."""
+
+RecipeFields: TypeAlias = dict[str, Any]
+"""Fields of a recipe, as a YAML file would hold them."""
+
+
+def diffuse(reflectance: float | MitsubaDict = 0.5) -> MitsubaDict:
     """A diffuse BSDF; ``reflectance`` a number or a texture."""
     if isinstance(reflectance, int | float):
         reflectance = {"type": "uniform", "value": float(reflectance)}
     return {"type": "diffuse", "reflectance": reflectance}
 
 
-def floor(bsdf: dict[str, Any] | None = None, half: float = 100.0) -> dict[str, Any]:
+def floor(bsdf: MitsubaDict | None = None, half: float = 100.0) -> MitsubaDict:
     """The plane z = 0, normal up."""
     import mitsuba as mi
 
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half), "bsdf": bsdf or diffuse()}
 
 
-def plate(point: ArrayLike, normal: ArrayLike, half: float = 50.0, bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
+def plate(point: ArrayLike, normal: ArrayLike, half: float = 50.0, bsdf: MitsubaDict | None = None) -> MitsubaDict:
     """A square plate through ``point`` with that normal."""
     import mitsuba as mi
 
@@ -49,12 +56,12 @@ def plate(point: ArrayLike, normal: ArrayLike, half: float = 50.0, bsdf: dict[st
     return {"type": "rectangle", "to_world": look @ mi.ScalarTransform4f().scale(half), "bsdf": bsdf or diffuse()}
 
 
-def sphere(center: ArrayLike, radius: float, bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
+def sphere(center: ArrayLike, radius: float, bsdf: MitsubaDict | None = None) -> MitsubaDict:
     """A sphere."""
     return {"type": "sphere", "center": np.asarray(center, float).tolist(), "radius": radius, "bsdf": bsdf or diffuse()}
 
 
-def box(center: ArrayLike, half: ArrayLike, bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
+def box(center: ArrayLike, half: ArrayLike, bsdf: MitsubaDict | None = None) -> MitsubaDict:
     """A box along the axes, a mesh."""
     import mitsuba as mi
 
@@ -62,15 +69,17 @@ def box(center: ArrayLike, half: ArrayLike, bsdf: dict[str, Any] | None = None) 
     return {"type": "cube", "to_world": place, "bsdf": bsdf or diffuse()}
 
 
-def scene(**shapes: dict[str, Any]) -> mi.Scene:
+def scene(**shapes: MitsubaDict) -> mi.Scene:
     """A scene of these shapes; each is named by its key."""
     import mitsuba as mi
 
-    return mi.load_dict({"type": "scene", **shapes})
+    loaded = mi.load_dict({"type": "scene", **shapes})
+    assert isinstance(loaded, mi.Scene)
+    return loaded
 
 
 def place_of(scene: mi.Scene, name: str) -> int:
-    """The place of a shape in the scene, which ``shape_id`` tells."""
+    """The index of a shape in the scene, as in ``shape_id``."""
     return [shape.id() for shape in scene.shapes()].index(name)
 
 
@@ -78,7 +87,7 @@ def place_of(scene: mi.Scene, name: str) -> int:
 
 
 def axes(pose: Pose) -> tuple[Array, Array, Array]:
-    """Starboard, forward and up of a pose in the world, from the conventions of SPEC.md, section 1."""
+    """Starboard, forward and up of a pose in the world, from the conventions of poses."""
     sin_h, cos_h, sin_p, cos_p = np.sin(pose.heading), np.cos(pose.heading), np.sin(pose.pitch), np.cos(pose.pitch)
     forward = np.array([cos_p * sin_h, cos_p * cos_h, -sin_p])
     level = np.array([cos_h, -sin_h, 0.0])  # starboard before the roll
@@ -155,7 +164,7 @@ def floor_levels(
     else:
         value = value * sonar.rays_per_beam / np.radians(sonar.elevation_fov_deg)
     over_bin = (value * weight).sum(-1) * reach
-    return (over_bin * width_weight).sum(-1) / 2
+    return np.asarray((over_bin * width_weight).sum(-1) / 2)
 
 
 def slope(x: ArrayLike, y: ArrayLike) -> float:
@@ -166,7 +175,7 @@ def slope(x: ArrayLike, y: ArrayLike) -> float:
 # ---------------------------------------------------------------- checks
 
 
-def assert_image_close(got: NDArray[Any], wanted: Array, rms: float, picture: Path) -> None:
+def assert_image_close(got: NDArray[np.floating], wanted: Array, rms: float, picture: Path) -> None:
     """Relative error below ``rms`` where ``wanted`` is not 0; a failure says by how much and leaves a picture to look at."""
     filled = wanted > 0
     relative = np.zeros(wanted.shape)
@@ -205,7 +214,7 @@ def run_python(script: str, *, block: tuple[str, ...] = (), **environment: str) 
 
 # ---------------------------------------------------------------- data sets
 
-TINY: dict[str, Any] = {
+TINY: RecipeFields = {
     "name": "tiny",
     "world": {"family": "rocky-field", "size_m": 20.0, "a_side": [6, 10]},
     "scenes": [{"count": 3, "sequences": 10}],
@@ -264,7 +273,7 @@ def tiny_samples(**words: Any) -> Any:
     return Samples(tiny_recipe(), **{"labels": "normx10", "noise": "low", **words})
 
 
-DOWN: dict[str, Any] = {
+DOWN: RecipeFields = {
     "sonar__azimuth_fov_deg": 100.0,
     "sonar__elevation_fov_deg": 100.0,
     "sonar__range_min": 2.0,
@@ -274,7 +283,7 @@ DOWN: dict[str, Any] = {
 """Changes of the tiny recipe: a sonar that looks straight down."""
 
 
-HEARD: dict[str, Any] = {
+HEARD: RecipeFields = {
     "name": "received",
     "world": {"family": "flat-objects", "size_m": 16.0, "seabed_cells": 96, "rectangles": 20, "ellipses": 20},
     "scenes": [{"count": 4, "sequences": 10}],

@@ -1,4 +1,4 @@
-"""Impulse responses of points on level ground in plain NumPy, written from SPEC.md section 3, for tests of estimators."""
+"""Impulse responses of points on level ground in plain NumPy, from Almanza-Medina, ch. 5, for tests of estimators."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def ping(
         ground: the scatterers.
         pose: of the transmitter.
         velocity: over ground x, y, z.
-        keep: for each receiver the points it may hear; filled by the first ping, read by later ones.
+        keep: for each receiver the points in its field of view; filled by the first ping, read by later ones.
     """
     turn = np.stack(axes(pose))
     place, speed = np.array(pose[:3]), np.asarray(velocity, dtype=float)
@@ -116,7 +116,8 @@ def run(
     start = start or Pose(0.0, 0.0, height_m)
     end = end or compose(start, motion)
     velocity = (np.array(end[:3]) - np.array(start[:3])) / span_s
-    poses, keep = np.linspace(start, end, pings), []
+    poses = np.linspace(start, end, pings)
+    keep: list[NDArray[Any]] = []
     response = np.array([ping(sonar, ground, Pose(*pose), velocity, keep=keep) for pose in poses])
     rng = np.random.default_rng([seed, 1])
     response = response + noise * (rng.standard_normal((*response.shape, 2)) @ [1, 1j]) / np.sqrt(2)

@@ -16,6 +16,7 @@ SETUPTOOLS = PROJECT["tool"]["setuptools"]
 
 ROOMS = (
     "errors",
+    "arrays",
     "io",
     "motion",
     "instruments",
@@ -41,7 +42,7 @@ ROOMS = (
 def folder_of(package: str) -> Path:
     """Where a package's files are in the checkout."""
     if package in SETUPTOOLS["package-dir"]:
-        return ROOT / SETUPTOOLS["package-dir"][package]
+        return ROOT / str(SETUPTOOLS["package-dir"][package])
     return ROOT / package.replace(".", "/")
 
 
@@ -95,7 +96,7 @@ DATA = ("scenes", "recipes")
 """Packages that hold data; a script that makes them may stand beside."""
 
 PACKAGES = {name for name, path in MODULES.items() if path.stem == "__init__"}
-"""Their ``__init__`` stands outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
+"""Their ``__init__`` is outside the order: it may import nothing of mitsonar but, at the top, the plugins' register."""
 
 HOUSE = {name: imported(path) for name, path in MODULES.items() if name not in PACKAGES and room(name) not in DATA}
 """What each module imports."""

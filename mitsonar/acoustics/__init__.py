@@ -1,1 +1,1 @@
-"""Levels and noise; no Mitsuba."""
+"""Levels of echoes, and noise."""

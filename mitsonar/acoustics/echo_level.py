@@ -1,9 +1,11 @@
-"""Levels: what an echo contributes to its bins."""
+"""Level of an echo: its contribution to its bins."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
+from mitsonar.arrays import AnyArray
 from mitsonar.instruments.imaging_sonar import Sonar
 
 if TYPE_CHECKING:
@@ -12,13 +14,14 @@ if TYPE_CHECKING:
 __all__ = ["largest_level", "level"]
 
 
-def level(echoes: Echoes, sonar: Sonar, where: Any) -> Any:
-    """Level of each echo, float64, with plain IEEE products so that NumPy and Dr.Jit agree to the bit.
+def level(echoes: Echoes, sonar: Sonar, where: Callable[..., AnyArray]) -> AnyArray:
+    """Compute the level of each echo, float64, by plain IEEE products: NumPy and Dr.Jit agree to the bit.
 
-    ``thesis``: C L, reflectivity times cosine (Almanza-Medina, eq. 2.2). ``physical``, monostatic: C cos(theta) dOmega
-    / R^2 times the gain law R^g [sr/m^2]: spreading 1/R^4 there and back, Lambert's cosine squared, and the lit area
-    dA = R^2 dOmega / cos(theta), which takes one cosine away again. The law is held nearer than the window or one bin,
-    and beyond four times the window's end (where only a footprint's tail can reach it).
+    ``thesis``: C L, reflectivity times cosine (Almanza-Medina, eq. 2.2).
+
+    ``physical``, monostatic: C cos(theta) dOmega / R^2 times the gain R^g [sr/m^2]. The factors are spreading 1/R^4 there
+    and back, Lambert's cosine squared, and the lit area dA = R^2 dOmega / cos(theta), which cancels one cosine. R is clamped
+    below to the window's begin or one bin, and above to four times the window's end, where only a footprint's tail reaches.
 
     Args:
         echoes: arrays of float64.
@@ -34,20 +37,21 @@ def level(echoes: Echoes, sonar: Sonar, where: Any) -> Any:
 
 
 def largest_level(sonar: Sonar, solid_angle: float) -> float:
-    """The most that one ray can contribute, ``solid_angle`` [sr] being the largest of a cell."""
+    """Return the largest level of one ray; ``solid_angle`` [sr] is the largest of a cell."""
     if sonar.model == "thesis":
         return 1.0
-    return max(_spreading(end, sonar.gain_exponent) for end in _ends(sonar)) * solid_angle
+    largest: float = max(_spreading(end, sonar.gain_exponent) for end in _ends(sonar))
+    return largest * solid_angle
 
 
 def _ends(sonar: Sonar) -> tuple[float, float]:
-    """Where the law of spreading and gain begins and ends to hold [m]."""
+    """Return the least and the greatest range of spreading and gain [m]."""
     nearest = max(sonar.range_min, sonar.bin_m)
     return nearest, max(4 * sonar.range_max, nearest)
 
 
-def _spreading(radius: Any, gain_exponent: int) -> Any:
-    """R^(g - 2) by products, not powers."""
+def _spreading(radius: AnyArray, gain_exponent: int) -> AnyArray:
+    """Compute R^(g - 2) by products, not powers."""
     match gain_exponent:
         case 0:
             return 1 / (radius * radius)

@@ -1,12 +1,12 @@
 """Noise of sonar images (Almanza-Medina, 2.2.3): a function of (seed, frame, cell), the same in NumPy and torch.
 
-Echo is clipped to [0, 1]; pixels without echo become Gaussian, others get an added Rayleigh value; clipped again.
+The echo is clipped to [0, 1]. Pixels without echo become Gaussian; others get an added Rayleigh value. The sum is clipped.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from array_api_compat import array_namespace, device
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.special import ndtr
 
+from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
 from mitsonar.io.whole_files import read_yaml
 
@@ -33,11 +34,11 @@ class NoiseModel(BaseModel):
 
     @property
     def is_none(self) -> bool:
-        """Whether frames stay as they are."""
+        """Return whether the model adds no noise."""
         return self.mean == self.std == self.scale == 0
 
-    def apply(self, image: Any, *, seed: int, frames: Any) -> Any:
-        """Noisy images, float32 in 0..1.
+    def apply(self, image: AnyArray, *, seed: int, frames: AnyArray) -> AnyArray:
+        """Add noise to images; return float32 in 0..1.
 
         Args:
             image: ``(frames, bins, beams)`` in 0..1, NumPy or torch.
@@ -47,7 +48,7 @@ class NoiseModel(BaseModel):
         xp = array_namespace(image)
         if self.is_none:
             return xp.clip(image, 0.0, 1.0)
-        if image.shape[0] > 1 and str(device(image)) == "cpu":  # what one frame needs stays in the cache
+        if image.shape[0] > 1 and str(device(image)) == "cpu":  # the arrays of one frame fit the cache
             one = [self.apply(image[k : k + 1, ...], seed=seed, frames=frames[k : k + 1]) for k in range(image.shape[0])]
             return xp.concat(one, axis=0)
         first, second = uniform(image.shape, seed=seed, frames=frames, like=image)
@@ -59,15 +60,15 @@ class NoiseModel(BaseModel):
         noisy = xp.round(xp.clip(noisy, 0.0, 1.0) * 2.0**30) * 2.0**-30
         return xp.astype(noisy, xp.float32)
 
-    def apply_sum(self, vector: Any, nonzero: Any, cells: int, *, seed: int, frames: Any) -> Any:
-        """Noisy sums over the beams, drawn from the law of the sum (its mean and variance, as a Gaussian), float32.
+    def apply_sum(self, vector: AnyArray, nonzero: AnyArray, cells: int, *, seed: int, frames: AnyArray) -> AnyArray:
+        """Add noise to sums over the beams; return float32. The noise is a Gaussian of the sum's mean and variance.
 
-        The noise of single pixels, :meth:`apply`, summed over a row of the image, has the same mean and variance as long as
-        echoes do not reach 1, where they would be clipped.
+        The noise of single pixels, :meth:`apply`, summed over a row of the image, has the same mean and variance. This holds
+        while echoes do not reach 1, where they would be clipped.
 
         Args:
             vector: sums of images in 0..1 ``(frames, bins)``, NumPy or torch.
-            nonzero: how many pixels of each row hold an echo, like ``vector``.
+            nonzero: number of pixels of each row that hold an echo, like ``vector``.
             cells: pixels of a row.
             seed: seed of the noise.
             frames: number of each frame ``(frames,)``, an integer array of the same kind.
@@ -87,13 +88,13 @@ class NoiseModel(BaseModel):
         return xp.astype(noisy, xp.float32)
 
     def grey_of_empty(self, greys: int = 255) -> NDArray[np.float64]:
-        """Probability of each grey value 0..``greys`` of a pixel without echo, as stored ``(greys + 1,)``."""
+        """Compute the probability of each grey value 0..``greys`` of a pixel without echo, as stored ``(greys + 1,)``."""
         edges = _grey_edges(greys)
         above = (self.mean > edges).astype(float) if self.std == 0 else ndtr((self.mean - edges) / self.std)
         return np.asarray(-np.diff(above, prepend=1.0, append=0.0), dtype=np.float64)
 
     def grey_of_echo(self, level: ArrayLike, greys: int = 255) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Probability of each grey value 0..``greys`` of a pixel with that echo, and its derivative by the echo.
+        """Compute the probability of each grey value 0..``greys`` of a pixel with an echo, and its derivative by the echo.
 
         Args:
             level: the echo before noise, above 0 ``(...)``.
@@ -103,10 +104,10 @@ class NoiseModel(BaseModel):
             Two arrays ``(..., greys + 1)``.
 
         Raises:
-            MitsonarError: echoes that no noise is added to: their grey value has no derivative.
+            MitsonarError: echoes get no noise, so their grey values have no derivative.
         """
         if self.scale == 0:
-            raise MitsonarError("the law of an echo needs noise: got scale 0; give a scale above 0")
+            raise MitsonarError("the distribution of an echo needs noise: got scale 0; give a scale above 0")
         over = (_grey_edges(greys) - np.asarray(level, dtype=float)[..., None]) / self.scale
         over = np.maximum(over, 0.0)
         above = np.ones((*over.shape[:-1], greys + 2))
@@ -118,7 +119,7 @@ class NoiseModel(BaseModel):
 
 
 def _clipped_gaussian(mean: float, std: float) -> tuple[float, float]:
-    """Mean and variance of a Gaussian clipped to 0..1."""
+    """Compute mean and variance of a Gaussian clipped to 0..1."""
     if std == 0:
         return mean, 0.0
 
@@ -144,10 +145,16 @@ NOISE_MODELS = {
 """Almanza-Medina's noise levels by name; ``chapter2`` is that of table 2.1."""
 
 
-def uniform(shape: tuple[int, int, int], *, seed: int, frames: Any, like: Any) -> tuple[Any, Any]:
-    """Two independent uniform numbers in (0, 1) for each cell, float64, of the array kind of ``like``.
+def uniform(shape: tuple[int, int, int], *, seed: int, frames: AnyArray, like: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Draw two independent uniform numbers in (0, 1) for each cell, float64, in the array library of ``like``.
 
-    A hash of seed, frame and cell (two rounds of 32-bit mixing, carried out in int64 so that NumPy and torch agree).
+    They are a hash of seed, frame and cell: two rounds of 32-bit mixing, in int64 so that NumPy and torch agree.
+
+    Args:
+        shape: (frames, bins, beams).
+        seed: of the noise.
+        frames: number of each frame ``(frames,)``.
+        like: an array of the library and device.
     """
     xp = array_namespace(like)
     count, bins, beams = shape
@@ -156,16 +163,17 @@ def uniform(shape: tuple[int, int, int], *, seed: int, frames: Any, like: Any) -
     key = _mix(frame & MASK, _mix_int(seed & MASK) ^ _mix_int((seed >> 32) + 0x51ED270B))
     first = _mix(cell, key)
     second = _mix(first, key ^ 0x2545F491)
-    return tuple((xp.astype(value, xp.float64) + 0.5) * 2.0**-32 for value in (first, second))  # type: ignore[return-value]
+    one, other = ((xp.astype(value, xp.float64) + 0.5) * 2.0**-32 for value in (first, second))
+    return one, other
 
 
-def _multiply(value: Any, factor: int) -> Any:
-    """``value * factor`` modulo 2^32: int64 arrays wrap, which leaves the low bits right."""
+def _multiply(value: AnyArray, factor: int) -> AnyArray:
+    """Multiply modulo 2^32. int64 arrays wrap, which keeps the low bits right."""
     return (value * factor) & MASK
 
 
-def _mix(value: Any, key: Any) -> Any:
-    """Chris Wellons's 32-bit integer hash `lowbias32`, keyed, twice."""
+def _mix(value: AnyArray, key: AnyArray) -> AnyArray:
+    """Hash by Chris Wellons's 32-bit integer hash `lowbias32`, keyed, twice."""
     for _ in range(2):
         value = value ^ key
         value = _multiply(value ^ (value >> 16), 0x7FEB352D)
@@ -180,19 +188,19 @@ def _mix_int(value: int) -> int:
 
 
 def _grey_edges(greys: int) -> NDArray[np.float64]:
-    """What a value must exceed to be stored as grey 1, 2 ... ``greys``: a non-zero value is at least 1."""
+    """Return the lower bounds of grey 1, 2 ... ``greys``; a value above zero is at least grey 1."""
     edges = (np.arange(1, greys + 1) - 0.5) / greys
     edges[0] = 0.0
     return edges
 
 
 class Information(NamedTuple):
-    """What noisy values tell of two numbers of each pixel: its mean echo, and how often it holds one at all.
+    """Information of noisy values about two numbers of each pixel: its mean echo, and the probability that it holds one.
 
     Attributes:
-        law: Fisher information of the exact law ``(..., 2, 2)``, in 1 / (fraction of the maximum)^2; None where echoes have
-            no noise, and a value tells its level without limit.
-        slope: derivative of the value's mean by the two ``(..., 2)``.
+        law: Fisher information of the exact distribution ``(..., 2, 2)``, in 1 / (fraction of the maximum)^2. None where
+            echoes have no noise and the information is unbounded.
+        slope: derivative of the value's mean by the two numbers ``(..., 2)``.
         variance: of the value ``(...)``.
     """
 
@@ -201,27 +209,33 @@ class Information(NamedTuple):
     variance: NDArray[np.float64]
 
     def matched(self, more: ArrayLike = 0.0) -> NDArray[np.float64]:
-        """Information of a Gaussian of this mean and variance ``(..., 2, 2)``: what least squares can use, never more than
-        ``law``. ``more`` variance may be added."""
+        """Compute the information of a Gaussian of this mean and variance ``(..., 2, 2)``.
+
+        Least squares can use this much. It never exceeds ``law``.
+
+        Args:
+            more: variance to add ``(...)``.
+        """
         variance = self.variance + np.asarray(more, dtype=float)
         return np.asarray(self.slope[..., :, None] * self.slope[..., None, :] / variance[..., None, None])
 
 
 CHUNK = 2048
-"""Pixels whose laws are held at a time: 4 MB an array."""
+"""Pixels whose distributions are held at a time: 4 MB an array."""
 
 
 def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *, greys: int = 255) -> Information:
-    """Fisher information of noisy, clipped pixels, stored as grey values 0..``greys`` (Almanza-Medina, 2.2.3; law ours).
+    """Compute the Fisher information of noisy, clipped pixels, stored as grey values 0..``greys``.
 
-    A pixel holds an echo ``level / filled`` with probability ``filled``, else none: where the edge of a shadow crosses a
-    pixel, only part of the pings fill it. With p_e, p_0 the laws of a pixel with and without echo, the pixel's is
-    p = filled p_e + (1 - filled) p_0, and the information the sum over grey values of g g' / p, g its derivatives.
+    The noise is that of Almanza-Medina, 2.2.3; the distribution is derived here. A pixel holds an echo ``level / filled``
+    with probability ``filled``, else none: where the edge of a shadow crosses a pixel, only part of the pings fill it. Let
+    p_e and p_0 be the distributions of a pixel with and without echo. The pixel's is p = filled p_e + (1 - filled) p_0. The
+    information is the sum over grey values of g g' / p, with g the derivatives of p.
 
     The information of an added Rayleigh value alone grows with the logarithm of ``greys``: its density begins with a corner,
-    which fine grey values show.
+    which fine grey values resolve.
 
-    Where echoes have no noise (scale 0) ``law`` is None, and ``variance`` is that of rounding, 1 / (12 greys^2).
+    Where echoes have no noise (scale 0) ``law`` is None, and ``variance`` is the variance of rounding, 1 / (12 greys^2).
 
     Args:
         noise: of the pixels.
@@ -243,7 +257,7 @@ def information(noise: NoiseModel, level: ArrayLike, filled: ArrayLike = 1.0, *,
 def _exact(
     noise: NoiseModel, echo: NDArray[np.float64], filled: NDArray[np.float64], greys: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """Law, slope and variance of some pixels."""
+    """Compute information, slope and variance of some pixels."""
     empty = noise.grey_of_empty(greys)
     p_echo, by_echo = noise.grey_of_echo(echo, greys)
     c = filled[:, None]
@@ -259,7 +273,7 @@ def _exact(
 def _noiseless(
     noise: NoiseModel, echo: NDArray[np.float64], filled: NDArray[np.float64], greys: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slope and variance where echoes are only rounded."""
+    """Compute slope and variance where echoes are only rounded."""
     mean, variance = _clipped_gaussian(noise.mean, noise.std)
     slope = np.stack([(echo < 1).astype(float), np.full_like(echo, -mean)], axis=-1)
     spread = filled * (1 - filled) * (echo - mean) ** 2 + (1 - filled) * variance
@@ -267,12 +281,13 @@ def _noiseless(
 
 
 def information_of_sums(noise: NoiseModel, nonzero: ArrayLike, cells: int) -> Information:
-    """Fisher information of noisy sums over the beams, :meth:`NoiseModel.apply_sum`, about the sum of the echoes and the
-    number of pixels that hold one; sums are not rounded.
+    """Compute the Fisher information of noisy sums over the beams (:meth:`NoiseModel.apply_sum`).
+
+    The two numbers are the sum of the echoes and the number of pixels that hold one. Sums are not rounded.
 
     Args:
         noise: of the pixels.
-        nonzero: how many pixels of each row hold an echo ``(...)``.
+        nonzero: number of pixels of each row that hold an echo ``(...)``.
         cells: pixels of a row.
     """
     nonzero = np.asarray(nonzero, dtype=float)
@@ -288,7 +303,7 @@ def information_of_sums(noise: NoiseModel, nonzero: ArrayLike, cells: int) -> In
 
 
 def load_noise(text: str) -> NoiseModel:
-    """``none``, ``low``, ``high``, ``chapter2``, three numbers ``mean,std,scale``, or a YAML file with these keys.
+    """Load a noise model: ``none``, ``low``, ``high``, ``chapter2``, ``mean,std,scale``, or a YAML file with these keys.
 
     Raises:
         MitsonarError: none of these, or a number outside 0..1.

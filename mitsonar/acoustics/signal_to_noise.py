@@ -1,4 +1,4 @@
-"""Ratios of signal to noise, as recipes and commands state them."""
+"""Signal to noise ratios, as recipes and commands write them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["snr_of", "snr_said"]
 
 
 def snr_of(text: str) -> float | None:
-    """A ratio of signal to noise in dB: ``20 dB``; ``none`` for no noise.
+    """Parse a signal to noise ratio in dB: ``20 dB``; ``none`` for no noise.
 
     Raises:
         MitsonarError: something else.
@@ -22,5 +22,5 @@ def snr_of(text: str) -> float | None:
 
 
 def snr_said(snr_db: float | None) -> str:
-    """What :func:`snr_of` reads."""
+    """Format a signal to noise ratio [dB] as :func:`snr_of` parses it."""
     return "none" if snr_db is None else f"{snr_db:g} dB"

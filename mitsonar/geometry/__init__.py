@@ -1,1 +1,1 @@
-"""Where a cell of an image lies, and how it moves with the sonar."""
+"""Geometry of images: scan conversion, level ground, height and attitude."""

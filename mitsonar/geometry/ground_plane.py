@@ -1,15 +1,15 @@
-"""Level ground: which point of it a cell of a sonar image shows, and how the cell moves with the sonar."""
+"""Level ground: the ground point of each cell of a sonar image, and its motion with the sonar."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_array_api_obj
 from numpy.typing import NDArray
 
+from mitsonar.arrays import AnyArray
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Bearing
 from mitsonar.motion.pose import Pose, vehicle_rotation
@@ -24,9 +24,9 @@ class GroundGeometry:
     Attributes:
         range_m: of the cells ``(bins,)`` [m].
         bearing_rad: of the cells ``(beams,)`` [rad].
-        bearing: which angle that is.
+        bearing: kind of that angle, ``azimuth`` or ``cone``.
         height_m: of the sonar over the ground.
-        pitch_rad: > 0 looks down.
+        pitch_rad: > 0 points down.
         roll_rad: > 0 puts starboard down.
     """
 
@@ -39,14 +39,14 @@ class GroundGeometry:
 
     @cached_property
     def turn(self) -> NDArray[np.float64]:
-        """The sonar's starboard, forward and up in level axes, as columns ``(3, 3)``."""
+        """Return the sonar's starboard, forward and up in level axes, as columns ``(3, 3)``."""
         return np.asarray(vehicle_rotation(Pose(0, 0, 0, self.pitch_rad, self.roll_rad, 0)).as_matrix()[0])
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
-        """Ground points of the cells ``(bins, beams, 2)``; nan where a cell's arc does not meet the ground.
+        """Return the ground points of the cells ``(bins, beams, 2)`` [m]; nan where a cell's arc does not meet the ground.
 
-        Of the two places where an arc can meet it, the one nearer to the sonar's axis in elevation.
+        An arc can meet the ground in two points. The one nearer to the sonar's axis in elevation counts.
         """
         radius, b = np.meshgrid(self.range_m, self.bearing_rad, indexing="ij")
         starboard, forward, up = self.turn[2]  # how much of each points up
@@ -62,21 +62,23 @@ class GroundGeometry:
         e = np.where(np.abs(one) <= np.abs(other), one, other)
         return np.asarray((directions(self.bearing, b, e) * radius[..., None] @ self.turn.T)[..., :2])
 
-    def to_polar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Range [m] and bearing [rad] of ground points ``(..., 2)``."""
+    def to_polar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Compute range [m] and bearing [rad] of ground points ``(..., 2)``."""
         s, f, u = self._in_sonar(points)
         radius = np.sqrt(s * s + f * f + u * u)
         return radius, np.arctan2(s, f) if self.bearing == "azimuth" else np.arcsin(s / radius)
 
-    def elevation(self, points: NDArray[np.floating]) -> NDArray[Any]:
-        """Elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
+    def elevation(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Compute the elevation [rad] in the sonar's frame of ground points ``(..., 2)``."""
         s, f, u = self._in_sonar(points)
         return np.asarray(np.arctan2(u, np.hypot(s, f) if self.bearing == "azimuth" else f))
 
     @cached_property
     def derivative(self) -> NDArray[np.float64]:
-        """How range [m] and bearing [rad] of each cell's ground point change with the motion (sideways, forward [m], yaw
-        [rad]; eq. 3.4), at rest ``(bins, beams, 2, 3)``."""
+        """Return the derivative of range [m] and bearing [rad] of each cell's ground point by the motion, at rest.
+
+        The motion is sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4). Shape: ``(bins, beams, 2, 3)``.
+        """
         x, y = np.moveaxis(self.points, -1, 0)
         s, f, u = self._in_sonar(self.points)
         radius = np.sqrt(s * s + f * f + u * u)
@@ -92,7 +94,10 @@ class GroundGeometry:
 
     @cached_property
     def derivative_by_height(self) -> NDArray[np.float64]:
-        """How range [m] and bearing [rad] of each cell's ground point change as the sonar rises [m] ``(bins, beams, 2)``."""
+        """Return the derivative of range [m] and bearing [rad] of each cell's ground point by the sonar's height [m].
+
+        Shape: ``(bins, beams, 2)``.
+        """
         s, f, u = self._in_sonar(self.points)
         radius = np.sqrt(s * s + f * f + u * u)
         along = self.height_m / radius
@@ -103,8 +108,8 @@ class GroundGeometry:
             turning = (aside - (s / radius) * along) / np.sqrt(radius * radius - s * s)
         return np.stack([along, turning], axis=-1)
 
-    def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[Any], ...]:
-        """Starboard, forward, up of ground points in the sonar's own axes."""
+    def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], ...]:
+        """Return starboard, forward, up of ground points in the sonar's own axes."""
         x, y, turn = points[..., 0], points[..., 1], self.turn.astype(points.dtype)
         below = points.dtype.type(self.height_m)
         starboard, forward, up = (x * turn[0, k] + y * turn[1, k] - below * turn[2, k] for k in range(3))
@@ -112,8 +117,16 @@ class GroundGeometry:
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each node the row and column of the one whose values it takes: its own where it meets the ground, else the first
-    farther out, in the nearest column that has one ``(ranges, bearings)``."""
+    """Find for each node the node whose values it takes.
+
+    A node on the ground takes its own. Another takes those of the first one farther out, in the nearest column with any.
+
+    Args:
+        known: whether a node meets the ground ``(ranges, bearings)``.
+
+    Returns:
+        Row and column, each ``(ranges, bearings)``.
+    """
     rows, columns = known.shape
     having = np.flatnonzero(known.any(axis=0))
     if not having.size:
@@ -123,10 +136,12 @@ def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
     return row, np.broadcast_to(column, row.shape)
 
 
-def moved(points: Any, motion: Any) -> Any:
-    """Where ground points ``(..., 2)`` lie for a sonar that has moved by (sideways, forward [m], yaw [rad]; eq. 3.4).
+def moved(points: AnyArray, motion: AnyArray) -> AnyArray:
+    """Compute the positions of ground points relative to a sonar that has moved (Almanza-Medina, eq. 3.4).
 
-    NumPy or torch; the motion is three numbers, or an array like the points whose leading axes go with theirs.
+    Args:
+        points: starboard, forward [m] ``(..., 2)``, of NumPy or torch.
+        motion: sideways, forward [m], yaw [rad]; three numbers, or an array whose leading axes broadcast with the points'.
     """
     xp = array_namespace(points)
     motion = xp.astype(motion if is_array_api_obj(motion) else xp.asarray(motion), points.dtype, copy=False)

@@ -1,14 +1,14 @@
-"""Scan conversion: from (range, bearing) to metres."""
+"""Scan conversion of images: from (range, bearing) to metres."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError
 
 __all__ = ["CartesianImage", "CartesianMap", "cartesian_map", "nearest_cells", "to_cartesian"]
@@ -29,7 +29,7 @@ class CartesianImage:
 
 @dataclass(frozen=True)
 class CartesianMap:
-    """Which cells make each pixel of a fan: bilinear between the cells' centres, for many images of one sonar.
+    """Cells and weights of each pixel of a fan, bilinear between the cells' centres, for many images of one sonar.
 
     Attributes:
         index: of four cells in the flattened image ``(4, rows, columns)`` int64.
@@ -40,10 +40,10 @@ class CartesianMap:
     index: NDArray[np.int64]
     weight: NDArray[np.float32]
     extent: tuple[float, float, float, float]
-    _kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    _kept: dict[str, list[AnyArray]] = field(default_factory=dict, repr=False, compare=False)
 
-    def apply(self, image: Any) -> Any:
-        """Fans ``(..., rows, columns)`` of images ``(..., bins, beams)``, NumPy or torch; 0 outside the fan."""
+    def apply(self, image: AnyArray) -> AnyArray:
+        """Convert images ``(..., bins, beams)`` of NumPy or torch to fans ``(..., rows, columns)``; 0 outside the fan."""
         xp = array_namespace(image)
         flat = xp.reshape(image, (-1, image.shape[-2] * image.shape[-1]))
         where = f"{xp.__name__} {device(image)}"
@@ -57,7 +57,7 @@ class CartesianMap:
         return xp.reshape(fan, (*image.shape[:-2], *self.index.shape[1:]))
 
 
-def nearest_cells(fan: CartesianMap, image: NDArray[Any], outside: Any) -> NDArray[Any]:
+def nearest_cells(fan: CartesianMap, image: NDArray[np.generic], outside: object) -> NDArray[np.generic]:
     """Return the value of the nearest cell in each pixel of a fan, for labels, which must not be mixed.
 
     Args:
@@ -74,7 +74,7 @@ def nearest_cells(fan: CartesianMap, image: NDArray[Any], outside: Any) -> NDArr
 
 
 def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianMap:
-    """The map of scan conversion: x = r sin b to starboard, y = r cos b forward.
+    """Make the map of scan conversion: x = r sin b to starboard, y = r cos b forward.
 
     Args:
         range_m: centres of the bins [m], rising.
@@ -100,8 +100,8 @@ def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -
     across = left + (np.arange(columns) + 0.5) * (right - left) / columns
     radius, angle = np.hypot(across, forward), np.arctan2(across, forward)
     inside = (radius >= near) & (radius <= far) & (angle >= port) & (angle <= starboard)
-    bin_, over_bin = _cell(_place(radius, range_m, range_edges), range_m.size)
-    beam, over_beam = _cell(_place(angle, bearing_rad, bearing_edges), bearing_rad.size)
+    bin_, over_bin = _cell(_fractional_index(radius, range_m, range_edges), range_m.size)
+    beam, over_beam = _cell(_fractional_index(angle, bearing_rad, bearing_edges), bearing_rad.size)
     index, weight = [], []
     for next_bin in (0, 1):
         for next_beam in (0, 1):
@@ -113,7 +113,7 @@ def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -
 
 
 def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianImage:
-    """One image ``(bins, beams)`` as a fan in metres; see :func:`cartesian_map`.
+    """Convert one image ``(bins, beams)`` to a fan in metres; see :func:`cartesian_map`.
 
     Raises:
         MitsonarError: shapes that do not fit, or ranges or bearings that do not rise.
@@ -127,22 +127,24 @@ def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, r
     return CartesianImage(fan, conversion.extent)
 
 
-def _cell(place: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The cell before a fractional index, and how far beyond it; the border cells' values hold beyond their centres."""
-    held = np.clip(place, 0, count - 1)
+def _cell(index: NDArray[np.float64], count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Split a fractional index into a cell and the part beyond it. Values of border cells hold beyond their centres."""
+    held = np.clip(index, 0, count - 1)
     whole = np.minimum(held.astype(np.int64), max(count - 2, 0))
     return whole, held - whole
 
 
 def _edges(centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Borders half-way between centres, and as far out at both ends."""
+    """Return the borders half-way between centres, and as far out at both ends."""
     if centres.size == 1:
         return np.array([centres[0] * 0.99 - 1e-3, centres[0] * 1.01 + 1e-3])
     middle = (centres[1:] + centres[:-1]) / 2
     return np.concatenate([[2 * centres[0] - middle[0]], middle, [2 * centres[-1] - middle[-1]]])
 
 
-def _place(value: NDArray[np.float64], centres: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Fractional index of a value among the centres."""
+def _fractional_index(
+    value: NDArray[np.float64], centres: NDArray[np.float64], edges: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the fractional index of a value among the centres."""
     known = np.concatenate([edges[:1], centres, edges[-1:]])
-    return np.interp(value, known, np.concatenate([[-0.5], np.arange(centres.size), [centres.size - 0.5]]))
+    return np.asarray(np.interp(value, known, np.concatenate([[-0.5], np.arange(centres.size), [centres.size - 0.5]])))

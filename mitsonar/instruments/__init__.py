@@ -1,1 +1,1 @@
-"""What the instruments are: sonars, their presets, and the views of a ping."""
+"""Instruments: sonars, their presets, and the views of a ping."""

@@ -1,15 +1,17 @@
-"""What the instrument of impulse responses is: a transmitter and receivers, where they look, and the band of the signal."""
+"""The instrument of impulse responses: a transmitter and receivers, their fields of view, and the band of the signal."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from collections.abc import Callable
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mitsonar.instruments.imaging_sonar import Instrument
+from mitsonar.arrays import AnyArray
+from mitsonar.instruments.imaging_sonar import FieldValue, Instrument
 
 __all__ = [
     *("LOOKS", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
@@ -20,29 +22,31 @@ ChannelModel = Literal["scatterers", "rays"]
 SEE = " (see docs/guides/impulse-responses.md)"
 
 PADDING = 2
-"""The frequency response is taken so many times finer than asked: tails of pulses before t = 0 wrap into what is cropped."""
+"""Factor by which the frequency response is sampled finer than asked. Tails of pulses before t = 0 then wrap into a part
+that is cropped."""
 
 
 class Maths(NamedTuple):
     """The functions of an array library that fields of view are computed with."""
 
-    asin: Any
-    atan2: Any
-    cos: Any
-    clip: Any
-    where: Any
+    asin: Callable[..., AnyArray]
+    atan2: Callable[..., AnyArray]
+    cos: Callable[..., AnyArray]
+    clip: Callable[..., AnyArray]
+    where: Callable[..., AnyArray]
 
 
 NUMPY = Maths(np.arcsin, np.arctan2, np.cos, np.clip, np.where)
 
 
 class FieldOfView(BaseModel):
-    """Where a transducer looks, in the vehicle's axes (starboard, forward, up), and how its sensitivity falls off.
+    """Field of view of a transducer in the vehicle's axes (starboard, forward, up), and its sensitivity.
 
-    ``rectangular``: ``across_deg`` to both sides of a vertical plane and ``along_deg`` in it; ``circular``: a cone of
-    ``across_deg``; ``all``: everywhere. Its middle looks ``tilt_deg`` away from straight down, towards ``heading_deg``.
-    Sensitivity (of amplitudes) is 1 in the middle and falls to 0 at the edges as half a period of a cosine over the outer
-    part ``taper`` of each half width: an edge would be an echo that moves with the vehicle. ``taper`` 0 is a hard edge.
+    Shapes: ``rectangular``, ``across_deg`` wide across a vertical plane and ``along_deg`` in it; ``circular``, a cone of
+    ``across_deg``; ``all``, every direction. The middle points ``tilt_deg`` away from straight down, to ``heading_deg``.
+
+    Sensitivity (of amplitudes) is 1 in the middle and 0 at the edges. It falls as half a period of a cosine over the outer
+    part ``taper`` of each half width. ``taper`` 0 is a hard edge; such an edge acts as an echo that moves with the vehicle.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -56,15 +60,15 @@ class FieldOfView(BaseModel):
 
     @property
     def axes(self) -> NDArray[np.float64]:
-        """Its middle, to the side (clockwise seen from above), and upwards: rows of ``(3, 3)`` in the vehicle's axes."""
+        """Return its axes in the vehicle's, rows of ``(3, 3)``: the middle, the side (clockwise from above), upwards."""
         turn, tilt = math.radians(self.heading_deg), math.radians(self.tilt_deg)
         level = np.array([math.sin(turn), math.cos(turn), 0.0])
         side = np.array([math.cos(turn), -math.sin(turn), 0.0])
         up = np.array([0.0, 0.0, 1.0])
         return np.stack([math.sin(tilt) * level - math.cos(tilt) * up, side, math.cos(tilt) * level + math.sin(tilt) * up])
 
-    def sensitivity(self, ahead: Any, aside: Any, above: Any, maths: Maths = NUMPY) -> Any:
-        """Sensitivity 0..1 to sound from a unit direction, given along :attr:`axes`."""
+    def sensitivity(self, ahead: AnyArray, aside: AnyArray, above: AnyArray, maths: Maths = NUMPY) -> AnyArray:
+        """Return the sensitivity 0..1 to sound from a unit direction, given along :attr:`axes`."""
         if self.shape == "all":
             return ahead * 0 + 1
         half_across = math.radians(self.across_deg) / 2
@@ -77,36 +81,36 @@ class FieldOfView(BaseModel):
             abs(along) / (math.radians(self.along_deg) / 2), maths
         )
 
-    def may_see(self, ahead: Any, aside: Any, above: Any, margin: Any) -> NDArray[np.bool_]:
-        """Whether anything within ``margin`` [rad] of a unit direction, given along :attr:`axes`, may lie in it."""
+    def may_see(self, ahead: AnyArray, aside: AnyArray, above: AnyArray, margin: AnyArray) -> NDArray[np.bool_]:
+        """Return whether a point within ``margin`` [rad] of a unit direction, given along :attr:`axes`, may lie in it."""
         if self.shape == "all":
             return np.ones(np.shape(ahead), dtype=bool)
         half_across = math.radians(self.across_deg) / 2
         if self.shape == "circular":
             return np.asarray(np.arctan2(np.hypot(aside, above), ahead) <= half_across + margin)
         across = np.abs(np.arcsin(np.clip(aside, -1, 1)))
-        # a degree sideways counts for more degrees along, the farther aside it is
+        # far aside, one degree of direction is more than one degree of the angle along
         level = np.cos(np.minimum(across + margin, np.pi / 2))
         wider = np.where(level > np.sin(margin), np.arcsin(np.minimum(np.sin(margin) / np.maximum(level, 1e-9), 1)), np.pi)
         along = np.abs(np.arctan2(above, ahead))
         return np.asarray((across <= half_across + margin) & (along <= math.radians(self.along_deg) / 2 + wider))
 
-    def _fall(self, place: Any, maths: Maths) -> Any:
-        """From 1 to 0 at ``place`` 1, the half width."""
+    def _fall(self, angle: AnyArray, maths: Maths) -> AnyArray:
+        """Return the taper at an angle in half widths: 1 in the middle, 0 from 1 on."""
         if self.taper == 0:
-            return maths.where(place <= 1, place * 0 + 1, 0)
-        ramp = maths.clip((place - (1 - self.taper)) * (1 / self.taper), 0, 1)
+            return maths.where(angle <= 1, angle * 0 + 1, 0)
+        ramp = maths.clip((angle - (1 - self.taper)) * (1 / self.taper), 0, 1)
         return 0.5 + 0.5 * maths.cos(ramp * math.pi)
 
 
 class Hydrophone(BaseModel):
-    """A receiver: its name, its place from the transmitter in the vehicle's axes, and where it looks."""
+    """A receiver: its name, its position from the transmitter in the vehicle's axes, and its field of view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(min_length=1, description="of the receiver")
     position: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="starboard, forward, up [m]")
-    field: FieldOfView = Field(default_factory=FieldOfView, description="where it looks")
+    field: FieldOfView = Field(default_factory=FieldOfView, description="its field of view")
 
     @model_validator(mode="after")
     def _near(self) -> Self:
@@ -118,21 +122,26 @@ class Hydrophone(BaseModel):
 
 
 LOOKS = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
-"""Receivers 1 to 4 of Almanza-Medina, 5.4, and where they look [deg]."""
+"""Receivers 1 to 4 of Almanza-Medina, 5.4, and their headings [deg]."""
 
 
-def four_receivers(distance_m: float = 0.1, **field: Any) -> tuple[Hydrophone, ...]:
-    """The thesis's receivers (5.4): forward, left, back and right of the transmitter, each looking away from it."""
+def four_receivers(distance_m: float = 0.1, **field: FieldValue) -> tuple[Hydrophone, ...]:
+    """Create Almanza-Medina's receivers (5.4): forward, left, back and right of the transmitter, each pointing away from it.
+
+    Args:
+        distance_m: from the transmitter [m].
+        field: fields of :class:`FieldOfView`, the same for all.
+    """
     made = []
     for name, heading in LOOKS.items():
         turn = math.radians(heading)
-        place = (round(distance_m * math.sin(turn), 12), round(distance_m * math.cos(turn), 12), 0.0)
-        made.append(Hydrophone(name=name, position=place, field=FieldOfView(heading_deg=heading, **field)))
+        position = (round(distance_m * math.sin(turn), 12), round(distance_m * math.cos(turn), 12), 0.0)
+        made.append(Hydrophone(name=name, position=position, field=FieldOfView(heading_deg=heading, **field)))
     return tuple(made)
 
 
 def _few_digits(sampling_hz: float, taps: int) -> int:
-    """So many taps or some more that their frequency step is written in few digits."""
+    """Return ``taps`` or slightly more, such that the frequency step has few digits."""
     for digits in (1, 2, 3):
         for more in range(taps, taps + taps // 3 + 1):
             step = sampling_hz / more
@@ -142,9 +151,9 @@ def _few_digits(sampling_hz: float, taps: int) -> int:
 
 
 class ChannelSonar(Instrument):
-    """A transmitter that sends all the time, and receivers whose channels are measured all the time (Almanza-Medina, ch. 5).
+    """A transmitter that sends continuously, and receivers whose channels are measured continuously (Almanza-Medina, ch. 5).
 
-    All SI but for angles in degrees (the edge of the program). The same names are the XML properties of the sensor
+    Angles in degrees (the edge of the program), all else SI. The same names are the XML properties of the sensor
     ``channel_sonar`` (docs/guides/impulse-responses.md).
 
     Raises:
@@ -162,14 +171,16 @@ class ChannelSonar(Instrument):
     range_max: float = Field(25.0, gt=0, le=1e5, description="echoes from farther away are dropped and counted [m]")
     sound_speed: float = Field(1500.0, ge=100, le=1e4, description="sound speed [m/s]")
     frame_rate_hz: float = Field(20.0, gt=0, le=1e6, description="responses a second [Hz]")
-    model: ChannelModel = Field("scatterers", description="scatterers of the world, or rays of the vehicle (the thesis's)")
+    model: ChannelModel = Field(
+        "scatterers", description="scatterers of the world, or rays of the vehicle (Almanza-Medina's)"
+    )
     spreading: bool | None = Field(None, description="amplitudes fall with distance; default: scatterers yes, rays no")
     points_per_m2: float = Field(
         1700.0, gt=0, le=1e7, description="scatterers of surfaces without cells of their own [1/m2]"
     )
     rays: int = Field(50_000, ge=1, le=10**8, description="rays within each receiver's field of view, model rays")
-    seed: int = Field(0, ge=0, lt=2**31, description="of where scatterers lie")
-    transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="where it sends")
+    seed: int = Field(0, ge=0, lt=2**31, description="of the positions of scatterers")
+    transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="its field of view")
     receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
 
     @model_validator(mode="after")
@@ -208,38 +219,40 @@ class ChannelSonar(Instrument):
 
     @property
     def taps(self) -> int:
-        """Length of a response."""
+        """Return the number of taps of a response."""
         return round(self.sampling_hz / self.frequency_step_hz)
 
     @property
     def delay_s(self) -> NDArray[np.float64]:
-        """Delay of each tap ``(taps,)`` [s]."""
+        """Return the delay of each tap ``(taps,)`` [s]."""
         return np.arange(self.taps) / self.sampling_hz
 
     @property
     def wavelength_m(self) -> float:
-        """Of the carrier [m]."""
+        """Return the wavelength of the carrier [m]."""
         return self.sound_speed / self.carrier_hz
 
     @property
     def spreads(self) -> bool:
-        """Whether amplitudes fall with distance."""
+        """Return whether amplitudes fall with distance."""
         return self.model == "scatterers" if self.spreading is None else self.spreading
 
     @property
     def field_of_view(self) -> dict[str, FieldOfView]:
-        """Where each receiver looks; in ``rays`` without taper, as the thesis has it."""
+        """Return the field of view of each receiver by name. In ``rays`` it has no taper, as in Almanza-Medina."""
         hard = {"taper": 0.0} if self.model == "rays" else {}
         return {one.name: one.field.model_copy(update=hard) for one in self.receivers}
 
     @property
     def offsets(self) -> NDArray[np.float64]:
-        """Places of the receivers in the vehicle's axes ``(receivers, 3)`` [m]."""
+        """Return the positions of the receivers in the vehicle's axes ``(receivers, 3)`` [m]."""
         return np.array([receiver.position for receiver in self.receivers], dtype=float)
 
-    def raised_cosine(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X_R at baseband frequencies (Almanza-Medina, eq. 5.16, mended): 1 to c = (1 - alpha) F_d / 2, 0 from
-        a = (1 + alpha) F_d / 2 on, half a period of a cosine between."""
+    def raised_cosine(self, frequency_hz: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Compute the raised cosine X_R at baseband frequencies [Hz] (Almanza-Medina, eq. 5.16, corrected).
+
+        X_R is 1 up to c = (1 - alpha) F_d / 2, 0 from a = (1 + alpha) F_d / 2 on, and half a period of a cosine between.
+        """
         flat = (1 - self.rolloff) * self.bandwidth_hz / 2
         width = self.rolloff * self.bandwidth_hz
         beyond = np.abs(np.asarray(frequency_hz, dtype=float)) - flat
@@ -247,8 +260,12 @@ class ChannelSonar(Instrument):
             return np.where(beyond <= 0, 1.0, 0.0)
         return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip(beyond / width, 0, 1)))
 
-    def pulse(self, delay_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What one echo of amplitude 1 at delay 0 gives at these delays: the transform of X_R, over the sampling rate."""
+    def pulse(self, delay_s: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Compute the response to one echo of amplitude 1 at delay 0: the transform of X_R over the sampling rate.
+
+        Args:
+            delay_s: at which the response is taken [s].
+        """
         t = np.asarray(delay_s, dtype=float) * self.bandwidth_hz
         edge = 1 - (2 * self.rolloff * t) ** 2
         near = np.abs(edge) < 1e-9

@@ -1,9 +1,9 @@
-"""What the instrument is: field of view, beams, rays, window, and which model of it is computed."""
+"""The imaging sonar: field of view, beams, rays, window, and the model that is computed."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
 
-__all__ = ["RAYS", "Bearing", "Instrument", "Model", "Sonar"]
+__all__ = ["RAYS", "Bearing", "FieldValue", "Instrument", "Model", "Sonar"]
+
+FieldValue: TypeAlias = Any
+"""The value of an instrument's field, before pydantic checks it."""
 
 Model = Literal["physical", "thesis"]
 Bearing = Literal["azimuth", "cone"]
@@ -21,18 +24,18 @@ RAYS = ("rays_per_beam", "rays_across")
 """Fields that follow from ``quality`` where they are not given."""
 
 THESIS_ACROSS = 4
-"""What ``rays_across`` says in the thesis model, which traces one."""
+"""Value of ``rays_across`` in the model ``thesis``, which traces one ray."""
 
 
-def _rays_over_elevation(given: dict[str, Any]) -> int:
-    """Rays over elevation that follow from the other fields."""
+def _rays_over_elevation(given: dict[str, FieldValue]) -> int:
+    """Derive the rays over elevation from the other fields."""
     if given["model"] == "thesis":
         return int(given["thesis_rays"])
     return rays_over_elevation(given["quality"], math.radians(given["elevation_fov_deg"]))
 
 
-def _rays_across(given: dict[str, Any]) -> int:
-    """Rays across a beam that follow from the other fields."""
+def _rays_across(given: dict[str, FieldValue]) -> int:
+    """Derive the rays across a beam from the other fields."""
     if given["model"] == "thesis":
         return THESIS_ACROSS
     fov = math.radians(given["azimuth_fov_deg"])
@@ -41,7 +44,7 @@ def _rays_across(given: dict[str, Any]) -> int:
 
 
 class Instrument(BaseModel):
-    """What all instruments have, and how one is made so that a mistake is answered by one sentence."""
+    """Base of all instruments. :meth:`create` answers a mistake with one sentence."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,13 +53,13 @@ class Instrument(BaseModel):
 
     name: str = Field("custom", description="what the instrument is called")
 
-    if TYPE_CHECKING:  # each has its own, where it stands among its keys
-        model: Any
+    if TYPE_CHECKING:  # each has its own, at its own position among the keys
+        model: str
         frame_rate_hz: float
 
     @classmethod
-    def create(cls, **fields: Any) -> Self:
-        """The instrument with these fields.
+    def create(cls, **fields: FieldValue) -> Self:
+        """Create an instrument with these fields.
 
         Raises:
             MitsonarError: an unknown key, a value outside its limits.
@@ -66,8 +69,12 @@ class Instrument(BaseModel):
         except ValidationError as error:
             raise MitsonarError(complaint(error, cls, cls.called, cls.see)) from None
 
-    def replace(self, **fields: Any) -> Self:
-        """This instrument with some fields changed, checked again."""
+    def replace(self, **fields: FieldValue) -> Self:
+        """Return a copy with some fields changed; all fields are checked.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits.
+        """
         return self.create(**{**self.model_dump(), **fields})
 
 
@@ -77,8 +84,8 @@ class Sonar(Instrument):
     The same names are the XML properties of the sensor ``imaging_sonar`` and the keys of a sonar's YAML file
     (``docs/guides/sonars.md``).
 
-    ``rays_per_beam`` and ``rays_across`` follow from ``quality`` in the physical model, and are ``thesis_rays`` and one in
-    the thesis model; numbers that are given win.
+    In the physical model ``rays_per_beam`` and ``rays_across`` follow from ``quality``. In the model ``thesis`` they are
+    ``thesis_rays`` and one. Numbers that are given take precedence.
 
     Raises:
         MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
@@ -155,11 +162,11 @@ class Sonar(Instrument):
             raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower quality, beams or numbers of rays")
         return self
 
-    def replace(self, **fields: Any) -> Self:
-        """This sonar with some fields changed, checked again.
+    def replace(self, **fields: FieldValue) -> Self:
+        """Return a copy with some fields changed; all fields are checked.
 
-        Numbers of rays that follow from other fields follow again. A ``quality`` takes the place of numbers of rays that
-        were given before, in the physical model; numbers given beside it win.
+        Numbers of rays that follow from other fields are derived anew. In the physical model a ``quality`` replaces numbers
+        of rays that were given before. Numbers given together with it take precedence.
         """
         kept = self.model_dump()
         renewed = "quality" in fields and fields.get("model", self.model) != "thesis"
@@ -173,50 +180,50 @@ class Sonar(Instrument):
 
     @property
     def across(self) -> int:
-        """Rays across a beam that are traced: ``rays_across``, or the thesis's one."""
+        """Return the rays across a beam that are traced: ``rays_across``, or one in the model ``thesis``."""
         return 1 if self.model == "thesis" else self.rays_across
 
     @property
     def jittered(self) -> bool:
-        """Whether rays move within their cells."""
+        """Return whether rays move within their cells."""
         return self.model == "physical" if self.jitter is None else self.jitter
 
     @property
     def columns(self) -> int:
-        """Rays side by side: the width of the film."""
+        """Return the number of rays side by side: the width of the film."""
         return self.beams * self.across
 
     @property
     def rays(self) -> int:
-        """Rays a ping."""
+        """Return the number of rays of a ping."""
         return self.columns * self.rays_per_beam
 
     @property
     def beam_spacing_rad(self) -> float:
-        """Field of view over beams [rad]: the angle from one beam's axis to the next where they are even."""
+        """Return the field of view over the beams [rad]: the angle from one beam's axis to the next where they are even."""
         return math.radians(self.azimuth_fov_deg) / self.beams
 
     @property
     def beam_width_rad(self) -> float:
-        """Width of the fan of rays that make one beam [rad]; the thesis's single ray stands for its spacing."""
+        """Return the width of the fan of rays of one beam [rad]. In the model ``thesis`` it is the spacing of the beams."""
         if self.beam_width_deg is None or self.model == "thesis":
             return self.beam_spacing_rad
         return math.radians(self.beam_width_deg)
 
     @property
     def bin_m(self) -> float:
-        """Length of a range bin [m]."""
+        """Return the length of a range bin [m]."""
         return (self.range_max - self.range_min) / self.range_bins
 
     @property
     def range_m(self) -> NDArray[np.float64]:
-        """Centres of the range bins ``(bins,)`` [m], nearest first."""
+        """Return the centres of the range bins ``(bins,)`` [m], nearest first."""
         return np.asarray(self.range_min + (np.arange(self.range_bins) + 0.5) * self.bin_m, dtype=np.float64)
 
     @property
     def bearing_rad(self) -> NDArray[np.float64]:
-        """Bearings of the beams' axes ``(beams,)`` [rad], most to port first."""
-        place = (np.arange(self.beams) + 0.5) / self.beams * 2 - 1
+        """Return the bearings of the beams' axes ``(beams,)`` [rad], most to port first."""
+        part = (np.arange(self.beams) + 0.5) / self.beams * 2 - 1  # -1..1 across the fan
         half = math.radians(self.azimuth_fov_deg) / 2
-        axes = place * half if self.beam_layout == "even" else np.arcsin(place * math.sin(half))
+        axes = part * half if self.beam_layout == "even" else np.arcsin(part * math.sin(half))
         return np.asarray(axes, dtype=np.float64)

@@ -1,15 +1,15 @@
-"""How many rays an accuracy needs, and what each quality was measured to err by.
+"""Number of rays for an accuracy, and the measured error of each quality.
 
-The law of the physical model, from ``benchmarks/bench_quality.py``:
+Errors of the physical model, from ``benchmarks/bench_quality.py``:
 
-Plain ground: a ray spreads its level evenly over the ranges that its cell of elevation covers, and cells join without gap,
-so only the slope of the level within a cell is lost. The error grows with the cell's length along range as a part of the
+Plain ground: a ray spreads its level evenly over the ranges that its cell of elevation covers. Cells join without gap, so
+only the slope of the level within a cell is lost. The error grows with the cell's length along range as a part of the
 range, ``dR / R = de / tan(grazing angle)``, whatever the range bins are. It falls faster than 1 / rays, and more rays
-across lower the part that is jitter.
+across lower the part of the error that is jitter.
 
-Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random, so the error is
-the texture's contrast over the root of the rays that meet in one bin, which is ``rays_across`` until an elevation cell is
-shorter than a bin. It falls as 1 / sqrt(rays), and faster once rays are denser than the texture.
+Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random. The error is
+the texture's contrast over the square root of the rays in one bin. These are ``rays_across`` until an elevation cell is
+shorter than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the texture.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from mitsonar.errors import nearest_names
 __all__ = ["FAR_GRAZING_RAD", "QUALITIES", "Measured", "Quality", "measured_errors", "rays_across", "rays_over_elevation"]
 
 FAR_GRAZING_RAD = math.asin(0.2)
-"""Angle at which the reference ground is met at the window's far end [rad]: the sonar is a fifth of that range above it."""
+"""Grazing angle on the reference ground at the window's far end [rad]; the sonar is a fifth of that range above it."""
 
 STEEPEST_RAD = math.radians(75)
-"""Bearing beyond which a beam's width counts no more [rad]: the ground leaves the window there."""
+"""Bearing beyond which a beam's width has no effect [rad]: the ground leaves the window there."""
 
 MOST_ACROSS = 4096
 
 
 class RayCounts(NamedTuple):
-    """What a quality asks of the rays.
+    """Requirements of a quality on the rays.
 
     Attributes:
         reach: longest range interval of one ray's cell on the reference ground, as a part of the range.
@@ -54,7 +54,7 @@ QUALITIES: dict[str, RayCounts] = {
     "standard": RayCounts(0.01, 0.0075, 4),
     "fine": RayCounts(0.0025, 0.00375, 8),
 }
-"""What each quality asks, coarsest first."""
+"""Requirements of each quality, coarsest first."""
 
 
 def _known(name: object) -> object:
@@ -67,19 +67,19 @@ Quality = Annotated[Literal["draft", "standard", "fine"], BeforeValidator(_known
 
 
 def rays_over_elevation(quality: str, elevation_fov_rad: float) -> int:
-    """Rays over a beam's elevation, an even number: segments halve the field of view.
+    """Compute the number of rays over a beam's elevation. It is even, since segments halve the field of view.
 
-    A cell of height ``de`` covers ``de / tan(grazing)`` of the range; at the far end of the window it may cover ``reach``.
+    A cell of height ``de`` covers ``de / tan(grazing)`` of the range. At the far end of the window it may cover ``reach``.
     """
     needed = elevation_fov_rad / (math.tan(FAR_GRAZING_RAD) * QUALITIES[quality].reach)
     return 2 * math.ceil(needed / 2)
 
 
 def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, range_max: float) -> int:
-    """Rays across a beam's width.
+    """Compute the number of rays across a beam's width.
 
-    Texture wants rays ``apart_m`` apart at the far end. At the edge of a wide fan the ground's range changes across a beam,
-    by ``tan(bearing)`` times the beam's width of the range, of which each ray may stand for twice ``reach``.
+    Texture needs rays ``apart_m`` apart at the far end. At the edge of a wide fan the ground's range changes across a beam
+    by the part ``tan(bearing)`` times the beam's width. Each ray may cover twice ``reach`` of it.
     """
     wanted = QUALITIES[quality]
     texture = min(wanted.across, math.ceil(beam_width_rad * range_max / wanted.apart_m))
@@ -88,7 +88,7 @@ def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, ran
 
 
 class Measured(NamedTuple):
-    """What a quality of a preset was measured to err by.
+    """Measured errors of a quality of a preset.
 
     Attributes:
         rays_per_beam: over elevation.
@@ -106,7 +106,7 @@ class Measured(NamedTuple):
 
 @cache
 def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
-    """The machine and date of the measurement, and what was measured by preset and quality."""
+    """Read the machine and date of the measurement, and the measured errors by preset and quality."""
     table = yaml.safe_load(files("mitsonar.instruments").joinpath("quality.yaml").read_text(encoding="utf-8"))
     found = {
         preset: {quality: Measured(**numbers) for quality, numbers in rows.items()}

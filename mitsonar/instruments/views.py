@@ -1,6 +1,6 @@
-"""Views: which image is made of a ping, of its whole field of view, of a portion of it, or at a receiver elsewhere.
+"""Views of a ping: an image of its whole field of view, of a portion of it, or at a receiver elsewhere.
 
-Portions (Almanza-Medina, 4.3) are those of a sonar that looks straight down. Its bearing runs fore-aft (positive forward),
+Portions (Almanza-Medina, 4.3) are those of a sonar that points straight down. Its bearing runs fore-aft (positive forward),
 its elevation across (negative to starboard): a mount of pitch 90 and heading -90 deg.
 """
 
@@ -33,10 +33,10 @@ SEGMENTS = {
     "c3": (-1, +1),
     "c4": (+1, +1),
 }
-"""Signs of bearing and elevation. Quadrants from fore-starboard clockwise; c1 to c4, the cone inscribed in each."""
+"""Signs of bearing and elevation. Quadrants run from fore-starboard clockwise; c1 to c4 are the cones inscribed in them."""
 
 FEWEST_ACROSS = 8
-"""Jittered rays of the transmitter across a receiver's beam, below which images have stripes."""
+"""Jittered rays of the transmitter across a receiver's beam; with fewer, images have stripes."""
 
 
 class View(Protocol):
@@ -44,7 +44,7 @@ class View(Protocol):
 
     Attributes:
         name: of the view.
-        sonar: whose range bins, model and gain law the image has.
+        sonar: gives the image its range bins, model and gain.
         bearing_rad: axes of its beams ``(beams,)`` [rad].
     """
 
@@ -54,7 +54,7 @@ class View(Protocol):
 
     @property
     def rays_a_beam(self) -> NDArray[np.int64] | None:
-        """Rays that belong to each beam ``(beams,)``; None where that differs from ping to ping."""
+        """Return the number of rays of each beam ``(beams,)``; None where it differs from ping to ping."""
 
 
 class Whole:
@@ -69,7 +69,7 @@ class Whole:
 
 
 class Segment:
-    """One portion; rays belong to it by the middle of their cell, so that it is the same in every ping.
+    """One portion of the field of view. A ray belongs to it by the middle of its cell, so it is the same in every ping.
 
     Args:
         sonar: the looking-down sonar, with an even number of beams and of rays a beam.
@@ -96,14 +96,15 @@ class Segment:
 
     @cached_property
     def rays_a_beam(self) -> NDArray[np.int64] | None:
-        """How many rays of each beam belong to it ``(beams,)``."""
+        """Return the number of its rays in each beam ``(beams,)``."""
         sonar = self.sonar
         counts = self.member.reshape(sonar.rays_per_beam, sonar.beams, sonar.across).sum(axis=(0, 2))
-        return counts[self.beams].astype(np.int64)
+        own: NDArray[np.int64] = counts[self.beams].astype(np.int64)
+        return own
 
     @cached_property
     def member(self) -> NDArray[np.bool_]:
-        """Which pixels of the film belong to it ``(rays_per_beam * columns,)``; no recipe asks."""
+        """Return which pixels of the film belong to it ``(rays_per_beam * columns,)``."""
         sonar = self.sonar
         beam = np.repeat(np.arange(sonar.beams), sonar.across)[None, :]
         row = np.arange(sonar.rays_per_beam)[:, None]
@@ -117,7 +118,7 @@ class Segment:
         return member.ravel()
 
     def _inside_cone(self, fore: int, up: int) -> NDArray[np.bool_]:
-        """Directions no farther from the quadrant's middle than its nearest border."""
+        """Return the directions that are no farther from the quadrant's middle than its nearest border."""
         sonar = self.sonar
         inner = (np.arange(sonar.across) + 0.5) / sonar.across - 0.5
         bearing = (sonar.bearing_rad[:, None] + inner * sonar.beam_width_rad).ravel()[None, :]
@@ -136,14 +137,16 @@ class Segment:
 class Receiver:
     """One receiver of a bistatic sonar.
 
-    A ray of the transmitter A hits P. The image's range is half of |P - A| + |B - P|, its beam the bearing of P in B's
-    frame; P outside B's field of view, hidden from B, or lit on its other side does not count. Level, ``thesis``: C times
-    the transmitter's cosine, as its rays know it. ``physical``: C cos(theta_B) dOmega r^g / R_B^2, the cosine the
-    receiver's, since the transmitter's cancels in the lit area dA = R_A^2 dOmega / cos(theta_A); it becomes the monostatic
-    law where B is A. The ground point of a cell lies on an ellipsoid with A and B as its foci.
+    A ray of the transmitter A hits P. The image's range is half of |P - A| + |B - P|; its beam is the bearing of P in B's
+    frame. P does not count outside B's field of view, hidden from B, or lit on its other side. The ground point of a cell
+    lies on an ellipsoid with foci A and B.
+
+    Level, ``thesis``: C times the transmitter's cosine. ``physical``: C cos(theta_B) dOmega r^g / R_B^2. The cosine is the
+    receiver's, since the transmitter's cancels in the lit area dA = R_A^2 dOmega / cos(theta_A). Where B is A this is the
+    monostatic level.
 
     Args:
-        transmitter: whose rays are traced: at least eight jittered columns across one of the receiver's beams.
+        transmitter: its rays are traced. It needs at least eight jittered columns across one of the receiver's beams.
         sonar: of the receiver: its field of view, beams and range bins; model and gain as the transmitter's.
         offset: pose of the receiver in the transmitter's axes (starboard, forward, up).
         name: of the view.

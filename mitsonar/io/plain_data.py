@@ -1,4 +1,4 @@
-"""What JSON and YAML files hold: tables, lists, texts and numbers, of a size that can be, nothing that refers to itself."""
+"""Contents of JSON and YAML files: tables, lists, texts and numbers of a plausible size, without circular references."""
 
 from __future__ import annotations
 
@@ -7,35 +7,38 @@ import itertools
 import json
 import math
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 import yaml
 
 from mitsonar.errors import MitsonarError, shortened
 
-__all__ = ["check_plain", "finite_number", "parse_json", "parse_yaml", "whole_number"]
+__all__ = ["PlainValue", "check_plain", "finite_number", "parse_json", "parse_yaml", "whole_number"]
+
+PlainValue: TypeAlias = Any
+"""A value of a file: a table, list, text, number, date or None. Its reader checks which."""
 
 DEEPEST = 40
-"""Lists and tables within each other."""
+"""Levels of lists and tables within each other, at most."""
 
 MOST_VALUES = 2_000_000
-"""Values of a file, those that are referred to counted each time."""
+"""Values of a file, at most. A value that is referred to counts each time."""
 
 MOST_OF_YAML = 100_000
-"""Values of a YAML file, which people write."""
+"""Values of a YAML file, at most; people write these files."""
 
 MOST_BRACKETS = 200
-"""Open ones in a YAML text, in comments too."""
+"""Open brackets in a YAML text, at most; those in comments count too."""
 
 LARGEST_INTEGER = 2**64
-"""Beyond it there is no seed and no count."""
+"""No seed and no count is larger."""
 
 LARGEST_COUNT = 2**63 - 1
 """What NumPy can count to."""
 
 
-def parse_json(text: str | bytes, source: str, *, check: bool = True) -> Any:
-    """The value of a JSON text.
+def parse_json(text: str | bytes, source: str, *, check: bool = True) -> PlainValue:
+    """Parse a JSON text.
 
     Args:
         text: of the file.
@@ -43,7 +46,7 @@ def parse_json(text: str | bytes, source: str, *, check: bool = True) -> Any:
         check: its depth, size and integers; without, :func:`check_plain` is the caller's to call.
 
     Raises:
-        MitsonarError: not JSON, or of a depth, a size or with integers that cannot be.
+        MitsonarError: not JSON, or a depth, size or integer beyond the limits of this module.
     """
     try:
         value = json.loads(text)
@@ -56,17 +59,17 @@ def parse_json(text: str | bytes, source: str, *, check: bool = True) -> Any:
     return value
 
 
-def parse_yaml(text: str, source: str) -> Any:
-    """The value of a YAML text; nothing in it is executed.
+def parse_yaml(text: str, source: str) -> PlainValue:
+    """Parse a YAML text; nothing in it is executed.
 
     Args:
         text: of the file.
         source: is named in errors.
 
     Raises:
-        MitsonarError: not YAML, something that refers to itself, or of a depth, a size or with integers that cannot be.
+        MitsonarError: not YAML, a circular reference, or a depth, size or integer beyond the limits of this module.
     """
-    if _brackets(text) > MOST_BRACKETS:  # the reader would take seconds to find out
+    if _brackets(text) > MOST_BRACKETS:  # PyYAML would need seconds to reject it
         raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep")
     loader: yaml.SafeLoader | None = None
     try:
@@ -80,7 +83,7 @@ def parse_yaml(text: str, source: str) -> Any:
         raise
     except RecursionError:
         raise MitsonarError(f"{source} is not YAML: it nests more than {DEEPEST} deep") from None
-    except Exception as error:  # constructors of numbers and dates raise whatever the text leads to
+    except Exception as error:  # constructors of numbers and dates raise errors of many kinds
         raise MitsonarError(f"{source} is not YAML: {' '.join(str(error).split())[:300] or type(error).__name__}") from None
     finally:
         if loader is not None:
@@ -89,18 +92,19 @@ def parse_yaml(text: str, source: str) -> Any:
     return value
 
 
-def check_plain(value: Any, source: str, most: int = MOST_VALUES) -> None:
-    """Check that a value is tables, lists, texts, numbers and dates only, of a depth and size that can be.
+def check_plain(value: object, source: str, most: int = MOST_VALUES) -> None:
+    """Check that a value holds only tables, lists, texts, numbers and dates, within limits of depth and size.
 
     Args:
-        value: as a reader of JSON, YAML or pickles gave it.
+        value: from a reader of JSON, YAML or pickles.
         source: is named in errors.
-        most: values that it may hold.
+        most: largest number of values that it may hold.
 
     Raises:
         MitsonarError: it is not.
     """
-    rest, count = [(value, 0)], 0
+    rest: list[tuple[object, int]] = [(value, 0)]
+    count = 0
     while rest:
         one, depth = rest.pop()
         count += 1
@@ -118,11 +122,11 @@ def check_plain(value: Any, source: str, most: int = MOST_VALUES) -> None:
             raise MitsonarError(f"{source} holds a {type(one).__name__}: only tables, lists, texts and numbers are known")
 
 
-def whole_number(value: Any, name: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
-    """A number of a file as an integer.
+def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
+    """Check that a value of a file is an integer within limits, and return it.
 
     Raises:
-        MitsonarError: it is none, or outside ``low`` .. ``high``.
+        MitsonarError: it is no integer, or outside ``low`` .. ``high``.
     """
     if type(value) is not int or not low <= value <= high:
         top = "2^63" if high == LARGEST_COUNT else f"{high:,}"
@@ -144,12 +148,12 @@ def finite_number(value: Any, name: str, above: float = -math.inf, below: float 
 
 
 def _brackets(text: str) -> int:
-    """How many brackets are open at most, those in texts and comments too."""
+    """Return how many brackets are open at most; those in texts and comments count too."""
     return max(itertools.accumulate((one in "[{") - (one in "]}") for one in text if one in "[]{}"), default=0)
 
 
 def _check_nodes(node: yaml.Node, source: str) -> None:
-    """Depth and size of a YAML document before its values are made: an alias counts as all that it stands for."""
+    """Check depth and size of a YAML document before its values are made. An alias counts as all that it refers to."""
     rest, count = [(node, 0)], 0
     while rest:
         one, depth = rest.pop()

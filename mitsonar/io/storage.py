@@ -1,4 +1,4 @@
-"""Where a store lies: a folder, or an object storage by its URL (``s3://bucket/data.zarr``), through fsspec."""
+"""Storage of a data set: a folder, or an object storage by its URL (``s3://bucket/data.zarr``), through fsspec."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ __all__ = ["Storage"]
 
 LOCK = "writer.json"
 LOCK_FILE = "writer.lock"
-"""The file whose lock is held on a file system; not the folder's own, since network file systems lock only files."""
+"""The file whose lock is held on a file system. A folder cannot be locked on network file systems."""
 
 HEARTBEAT_S = 20.0
-"""An object storage has no locks that end with their owner: its writer says every so often that it lives."""
+"""Period at which the writer to an object storage renews its file; such a storage has no locks that end with their owner."""
 
 STALE_S = 90.0
-"""A writer that was silent for so long is gone."""
+"""A writer whose file is older has ended."""
 
 
 class Storage:
-    """A folder of a file system.
+    """A folder of a local or remote file system.
 
     Args:
         url: path or URL.
 
     Raises:
-        MitsonarError: no such kind of storage, or the package for it is not installed.
+        MitsonarError: unknown kind of storage, or its package is not installed.
     """
 
     def __init__(self, url: str | Path) -> None:
@@ -55,16 +55,16 @@ class Storage:
         self.local = isinstance(self.fs, LocalFileSystem)
 
     def store(self, *, write: bool = False) -> Store:
-        """The Zarr store here."""
+        """Open the Zarr store here."""
         if self.local:
             return zarr.storage.LocalStore(self.root, read_only=not write)
         return zarr.storage.FsspecStore.from_url(self.url, read_only=not write)
 
     def sizes(self) -> dict[str, int]:
-        """Sizes in bytes of all files, by their path here; without those that say who writes.
+        """List the sizes in bytes of all files, by their path here, without the files of the lock.
 
         Raises:
-            MitsonarError: the storage does not answer, or not to us.
+            MitsonarError: the storage does not answer, or refuses access.
         """
         if self.local and os.path.isfile(self.root):
             raise MitsonarError(f"{self.url} is a file: give a folder, or a URL")
@@ -73,7 +73,7 @@ class Storage:
             found = self.fs.find(self.root, detail=True)
         except FileNotFoundError:
             return {}
-        except Exception as error:  # whatever a storage's library raises
+        except Exception as error:  # libraries of storages raise errors of many kinds
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise MitsonarError(
                 f"cannot list {self.url}: {reason}; check the address, and for object storage its endpoint and credentials"
@@ -82,7 +82,7 @@ class Storage:
         return {name: size for name, size in files.items() if name not in (LOCK, LOCK_FILE)}
 
     def read(self, name: str) -> bytes:
-        """The bytes of a file."""
+        """Read the bytes of a file."""
         return bytes(self.fs.cat_file(f"{self.root}/{name}"))
 
     def write(self, name: str, content: bytes) -> None:
@@ -90,23 +90,23 @@ class Storage:
         self.fs.pipe_file(f"{self.root}/{name}", content)
 
     def remove(self, name: str) -> None:
-        """Remove a file; it may be gone already."""
+        """Remove a file; one that is absent is no error."""
         with contextlib.suppress(FileNotFoundError):
             self.fs.rm_file(f"{self.root}/{name}")
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[Callable[[], None]]:
-        """Be the only one who writes here; yields what to call now and then: it raises when that is no longer so.
+        """Hold the lock of the only writer. Yield a function that raises once the lock is lost; call it now and then.
 
         Raises:
-            MitsonarError: somebody else writes.
+            MitsonarError: another process holds the lock.
         """
         with self._locked_folder() if self.local else self._locked_objects() as still_ours:
             yield still_ours
 
     @contextlib.contextmanager
     def _locked_folder(self) -> Iterator[Callable[[], None]]:
-        """The kernel's lock on a file: it ends with the process, however that ends."""
+        """Hold the kernel's lock on a file. It ends with the process, however that ends."""
         new = not os.path.exists(self.root)
         os.makedirs(self.root, exist_ok=True)
         path = os.path.join(self.root, LOCK_FILE)
@@ -115,7 +115,7 @@ class Storage:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 if not (os.path.exists(path) and os.path.samestat(os.fstat(handle), os.stat(path))):
-                    raise BlockingIOError  # its last owner has just removed it, or another has made a new one
+                    raise BlockingIOError  # its last owner has just removed it, or another process has made a new one
             except BlockingIOError:
                 raise MitsonarError(
                     f"another process is writing {self.url}: wait for it to end, or choose another -o; nothing was changed"
@@ -132,11 +132,11 @@ class Storage:
 
     @contextlib.contextmanager
     def _locked_objects(self) -> Iterator[Callable[[], None]]:
-        """A file that its owner renews; whoever finds a silent one takes it over."""
+        """Hold a file that its owner renews. Another process takes over a file that is not renewed."""
         owner = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex}"
         self._refuse_if_written()
-        self._say(owner)
-        time.sleep(0.5)  # two that began at the same moment: the one that wrote last stays
+        self._renew(owner)
+        time.sleep(0.5)  # of two that began at the same moment, the last writer keeps the lock
         self._refuse_if_written(besides=owner)
         done = threading.Event()
         lost = threading.Event()
@@ -146,7 +146,7 @@ class Storage:
                 with contextlib.suppress(Exception):  # the storage may be away for a while
                     if self._owner() != owner:
                         return lost.set()
-                    self._say(owner)
+                    self._renew(owner)
 
         def still_ours() -> None:
             if lost.is_set():
@@ -167,10 +167,11 @@ class Storage:
                     self.remove(LOCK)
 
     def _owner(self) -> str:
-        """Who says that it writes here."""
+        """Read the name of the writer."""
         return str(parse_json(self.read(LOCK), LOCK)["owner"])
 
-    def _say(self, owner: str) -> None:
+    def _renew(self, owner: str) -> None:
+        """Write the owner and the time."""
         self.write(LOCK, json.dumps({"owner": owner, "time": time.time()}).encode())
 
     def _refuse_if_written(self, besides: str = "") -> None:

@@ -1,4 +1,4 @@
-"""Files that are whole or absent."""
+"""Files that are whole or absent, and readers that check sizes before they allocate."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import math
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import parse_json, parse_yaml
+from mitsonar.io.plain_data import PlainValue, parse_json, parse_yaml
 
 __all__ = [
+    "FileArray",
     "at_most",
     "read_bytes",
     "read_json",
@@ -28,20 +29,24 @@ __all__ = [
 ]
 
 LARGEST_JSON = 2**27
-"""Bytes of a JSON file."""
+"""Bytes of a JSON file, at most."""
 
 LARGEST_YAML = 2**20
-"""Bytes of a YAML file; people write them."""
+"""Bytes of a YAML file, at most; people write these files."""
 
 INFLATION = 1032
-"""Deflated data can grow by no more."""
+"""Largest factor by which deflated data can grow."""
 
 MOST_PARTS = 10_000
-"""Arrays of an npz file."""
+"""Arrays of an npz file, at most."""
+
+
+FileArray: TypeAlias = NDArray[Any]
+"""An array of a file: numbers of any type, or texts. Its reader checks which."""
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
-    """Write a file under another name and rename it: whoever looks finds the old one, or the whole new one."""
+    """Write a file under another name and rename it. A reader finds the old file, or the whole new one."""
     path = Path(path)
     part = path.with_name(f".{path.name}.part")
     with part.open("wb") as file:
@@ -51,13 +56,13 @@ def write_whole(path: str | Path, content: bytes) -> None:
     part.replace(path)
 
 
-def write_json(path: str | Path, value: dict[str, Any]) -> None:
-    """A JSON file, whole or absent."""
+def write_json(path: str | Path, value: dict[str, PlainValue]) -> None:
+    """Write a JSON file, whole or absent."""
     write_whole(path, (json.dumps(value, indent=2) + "\n").encode())
 
 
 def at_most(path: str | Path, limit: int) -> bytes:
-    """The bytes of a file, or the first ``limit`` + 1 of them; devices that never end are no exception.
+    """Read the bytes of a file, or the first ``limit`` + 1 of them; so also of a device that never ends.
 
     Raises:
         OSError, ValueError: as :func:`open` does.
@@ -70,15 +75,15 @@ def at_most(path: str | Path, limit: int) -> bytes:
 
 
 def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
-    """The bytes of a file that is not larger than it can be.
+    """Read the bytes of a file up to a limit.
 
     Args:
         path: of the file.
-        what: it is, for errors.
-        limit: bytes.
+        what: kind of file, for errors.
+        limit: largest size in bytes.
 
     Raises:
-        MitsonarError: no such file, not readable, or larger.
+        MitsonarError: no such file, not readable, or larger than the limit.
     """
     try:
         content = at_most(path, limit)
@@ -92,15 +97,15 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
     return content
 
 
-def read_json(path: str | Path, *, check: bool = True) -> dict[str, Any]:
-    """The object in a JSON file.
+def read_json(path: str | Path, *, check: bool = True) -> dict[str, PlainValue]:
+    """Read the object in a JSON file.
 
     Args:
         path: of the file.
         check: see :func:`~mitsonar.io.plain_data.parse_json`.
 
     Raises:
-        MitsonarError: no such file, not JSON, not an object, or of a size that cannot be.
+        MitsonarError: no such file, not JSON, not an object, or beyond the limits of size.
     """
     value = parse_json(read_bytes(path, "file", LARGEST_JSON), str(path), check=check)
     if not isinstance(value, dict):
@@ -108,16 +113,16 @@ def read_json(path: str | Path, *, check: bool = True) -> dict[str, Any]:
     return value
 
 
-def read_yaml(path: str | Path, what: str, also: str = "") -> Any:
-    """The value in a YAML file.
+def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
+    """Read the value in a YAML file.
 
     Args:
         path: of the file.
-        what: it is, for errors.
-        also: what may be given besides a file, for errors.
+        what: kind of file, for errors.
+        also: alternatives to a file, for errors.
 
     Raises:
-        MitsonarError: no such file, not YAML, or of a size that cannot be.
+        MitsonarError: no such file, not YAML, or beyond the limits of size.
     """
     try:
         content = at_most(path, LARGEST_YAML)
@@ -132,14 +137,16 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> Any:
         raise MitsonarError(f"{path} is not YAML: {error}") from None
 
 
-def read_npz(path: str | Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file by name: numbers and texts, each checked against its size in the file before it is made.
+def read_npz(path: str | Path) -> dict[str, FileArray]:
+    """Read the arrays of an npz file by name: numbers and texts. Each is checked against its size in the file first.
 
-    What bytes lead to where they are damaged is the caller's to answer; errors of ours are ``ValueError``.
+    Raises:
+        ValueError: a list of parts, a size or a type that cannot be.
+        Exception: damaged bytes raise errors of many kinds. The caller puts them into words.
     """
-    with zipfile.ZipFile(path) as file:  # read to the end, or NumPy would not see each part's checksum
+    with zipfile.ZipFile(path) as file:  # read each part to its end: only then is its checksum tested
         parts = file.infolist()
-        if any(entry.comment for entry in parts):  # a damaged length there swallows other parts
+        if any(entry.comment for entry in parts):  # a damaged length of a comment hides other parts
             raise ValueError("its list of parts is damaged")
         if len(parts) > MOST_PARTS or len({entry.filename for entry in parts}) < len(parts):
             raise ValueError("its list of parts holds a name twice, or too many")
@@ -155,14 +162,14 @@ def read_npz(path: str | Path) -> dict[str, NDArray[Any]]:
 
 
 def refuse_beyond_memory(size: int, source: str) -> None:
-    """Refuse what this machine cannot hold.
+    """Refuse an array that this machine cannot hold.
 
     Args:
-        size: bytes.
+        size: of the array in bytes.
         source: is named in errors.
 
     Raises:
-        MitsonarError: more than half of the machine's memory.
+        MitsonarError: it exceeds half of the machine's memory.
     """
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     if size > there // 2:
@@ -172,8 +179,8 @@ def refuse_beyond_memory(size: int, source: str) -> None:
         )
 
 
-def _array_in(content: bytes, name: str) -> NDArray[Any]:
-    """An array of an npz file; its header is checked before anything is made of it."""
+def _array_in(content: bytes, name: str) -> FileArray:
+    """Read one array of an npz file, after a check of its header."""
     part = io.BytesIO(content)
     versions = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     found = np.lib.format.read_magic(part)
@@ -186,4 +193,4 @@ def _array_in(content: bytes, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} says that its shape is {str(shape)[:60]}, its bytes are {len(content) - part.tell():,}")
     values = np.frombuffer(content, kind, math.prod(shape), part.tell()) if kind.itemsize and math.prod(shape) else None
     made = np.zeros(shape, kind) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
-    return np.array(made)  # writable, as others expect it
+    return np.array(made)  # writable

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.arrays import AnyArray
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
@@ -15,7 +16,7 @@ __all__ = ["Motion", "compose", "inverse", "motions", "steady"]
 
 
 class Motion(NamedTuple):
-    """Between two pings: sideways [m], forward [m], yaw [rad], in the frame of the second heading (eq. 3.4)."""
+    """Motion between two pings: sideways [m], forward [m], yaw [rad], in axes of the second heading (eq. 3.4)."""
 
     sideways: float
     forward: float
@@ -23,7 +24,7 @@ class Motion(NamedTuple):
 
 
 def compose(pose: Pose, motion: Motion) -> Pose:
-    """The pose after a motion (Almanza-Medina, eq. 3.4): along the *new* heading."""
+    """Compute the pose after a motion along the *new* heading (Almanza-Medina, eq. 3.4)."""
     heading = pose.heading + motion.yaw
     sin, cos = np.sin(heading), np.cos(heading)
     x = pose.x + motion.forward * sin + motion.sideways * cos
@@ -31,8 +32,8 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
 
 
-def inverse(motion: Any) -> Any:
-    """The motions that undo motions ``(..., 3)`` (sideways, forward, yaw; eq. 3.4), NumPy or torch."""
+def inverse(motion: AnyArray) -> AnyArray:
+    """Invert motions ``(..., 3)`` (sideways, forward [m], yaw [rad]; eq. 3.4), of NumPy or torch."""
     xp = array_namespace(motion)
     sideways, forward, yaw = (motion[..., k] for k in range(3))
     cos, sin = xp.cos(yaw), xp.sin(yaw)
@@ -40,8 +41,14 @@ def inverse(motion: Any) -> Any:
 
 
 def motions(poses: ArrayLike) -> NDArray[np.float64]:
-    """What :func:`compose` needs from each pose ``(frames, 6)`` to the next: ``(frames - 1, 3)`` sideways, forward [m], yaw
-    [rad] within -pi..pi (Almanza-Medina, eq. 3.4)."""
+    """Compute the motion from each pose to the next, as :func:`compose` applies it (Almanza-Medina, eq. 3.4).
+
+    Args:
+        poses: x, y, z [m], pitch, roll, heading [rad] ``(frames, 6)``.
+
+    Returns:
+        Sideways, forward [m], yaw [rad] within -pi..pi ``(frames - 1, 3)``.
+    """
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     (x, y), heading = np.diff(table[:, :2], axis=0).T, table[1:, 5]
     sin, cos = np.sin(heading), np.cos(heading)
@@ -53,8 +60,17 @@ def motions(poses: ArrayLike) -> NDArray[np.float64]:
 def steady(
     start: Pose, velocity: tuple[float, float, float], frames: int, rate_hz: float
 ) -> tuple[Trajectory, NDArray[np.float64]]:
-    """``frames`` poses of a level vehicle that keeps its velocity, starboard and forward [m/s] and turn [rad/s] in its own
-    axes, along an arc; and that velocity as :func:`velocities` has it ``(frames, 4)``."""
+    """Simulate a level vehicle that keeps its velocity in its own axes, and so drives along an arc.
+
+    Args:
+        start: first pose.
+        velocity: to starboard, forward [m/s], and turn [rad/s].
+        frames: number of poses.
+        rate_hz: poses a second.
+
+    Returns:
+        The trajectory, and its velocities ``(frames, 4)`` as :func:`velocities` returns them.
+    """
     sideways, forward, turn = velocity
     time = np.arange(frames) / rate_hz
     angle = turn * time

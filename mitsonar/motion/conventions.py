@@ -6,7 +6,7 @@
 | ``ros-enu`` | east, north, up | forward, left, up | looks down | starboard down | yaw, anticlockwise from east |
 | ``ned`` | north, east, down | forward, right, down | looks up | starboard down | heading, clockwise from north |
 
-East and north are names of the world's first two axes: which way they lie on the earth is the user's choice.
+East and north are names of the world's first two axes. The user chooses their directions on the earth.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ Table = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Convention:
-    """How a file tells poses.
+    """A convention for the poses of a file.
 
     Attributes:
-        name: as it is asked for.
+        name: for the user, ``ros-enu``.
         axes: of world and body, in words.
-        world: its world axes in mitsonar's ``(3, 3)``: columns.
-        body: (starboard, forward, up) in its body axes ``(3, 3)``: columns.
-        signs: of pitch, roll and the turn about the vertical, against mitsonar's.
-        north: its turn about the vertical where the heading is 0 [rad].
-        turn: what it calls that turn in a table's column; the first is written.
+        world: its world axes in mitsonar's world, as columns ``(3, 3)``.
+        body: starboard, forward and up in its body axes, as columns ``(3, 3)``.
+        signs: of pitch, roll and the turn about the vertical, relative to mitsonar's.
+        north: its turn about the vertical at heading 0 [rad].
+        turn: names of that turn in a table's column; the first is written.
     """
 
     name: str
@@ -48,30 +48,34 @@ class Convention:
     turn: tuple[str, ...]
 
     def to_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
-        """Positions ``(n, 3)`` in mitsonar's world, and the rotations of (starboard, forward, up) to it.
+        """Convert positions and attitudes to mitsonar's convention.
 
         Args:
-            position: in this convention's world [m].
+            position: in this convention's world ``(n, 3)`` [m].
             rotation: of its body to its world.
+
+        Returns:
+            Positions ``(n, 3)`` in mitsonar's world [m], and the rotations of (starboard, forward, up) to it.
         """
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.apply(position), world * rotation * body
 
     def from_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
-        """The inverse of :meth:`to_ours`."""
+        """Convert positions and attitudes from mitsonar's convention, the inverse of :meth:`to_ours`."""
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.inv().apply(position), world.inv() * rotation * body.inv()
 
     def angles_to_ours(self, angles: Table) -> Table:
-        """Pitch, roll, heading ``(n, 3)`` [rad] as mitsonar has them.
+        """Convert angles to mitsonar's pitch, roll, heading ``(n, 3)`` [rad].
 
         Args:
-            angles: pitch, roll and turn about the vertical ``(n, 3)`` [rad]; that turn first, then pitch, then roll.
+            angles: pitch, roll and turn about the vertical ``(n, 3)`` [rad]; the rotation takes the turn first,
+                then pitch, then roll.
         """
         return np.asarray((angles - (0, 0, self.north)) * self.signs)
 
     def angles_from_ours(self, angles: Table) -> Table:
-        """The inverse of :meth:`angles_to_ours`."""
+        """Convert angles from mitsonar's convention: the inverse of :meth:`angles_to_ours`."""
         return np.asarray(angles * self.signs + (0, 0, self.north))
 
 
@@ -111,7 +115,7 @@ CONVENTIONS = {
 
 
 def convention_named(name: str) -> Convention:
-    """The convention of that name.
+    """Return the convention of a name.
 
     Raises:
         MitsonarError: unknown name.
@@ -122,28 +126,28 @@ def convention_named(name: str) -> Convention:
 
 
 LEVEL = math.sin(math.radians(10))
-"""An axis whose vertical part is smaller lies level."""
+"""An axis is level where its vertical part is smaller."""
 
 ON_ITS_SIDE = math.sin(math.radians(45))
-"""A starboard axis whose vertical part is larger does not lie beside the sonar."""
+"""A sonar lies on its side where the vertical part of its starboard axis is larger."""
 
 ALONG = math.cos(math.radians(60))
-"""A sonar whose axis lies farther from the way it goes, ahead and astern, looks across it."""
+"""A sonar points across its course where the part of its axis along the course, ahead or astern, is smaller."""
 
 
 def sideways_or_up(poses: Table, *, looks_ahead: bool = True) -> NDArray[np.bool_]:
-    """In which frames a sonar would look at the sky or sideways, as it does when a file is read in a wrong convention.
+    """Detect the frames in which a sonar points at the sky or sideways. A file read in a wrong convention has many.
 
     At the sky: its axis rises by more than 10 deg. Sideways: its starboard axis is 45 deg off the level or more; or its own
     axis is level to 10 deg while its starboard axis is not, or while it moves across that axis (60..120 deg).
 
     Args:
         poses: x, y, z [m], pitch, roll, heading [rad] ``(frames, 6)``.
-        looks_ahead: False where it looks down from a level vehicle, as hydrophones do: then it looks sideways where the
-            vehicle's own axes are 45 deg off the level, and at the sky where the vehicle lies upside down.
+        looks_ahead: False for a sonar that points down from a level vehicle, as hydrophones do. It points sideways where the
+            vehicle's own axes are 45 deg off the level, and at the sky where the vehicle is upside down.
 
     Returns:
-        ``(frames,)``.
+        True for these frames ``(frames,)``.
     """
     pitch, roll, heading = poses[:, 3:].T
     rises, leans, up = -np.sin(pitch), np.abs(np.sin(roll) * np.cos(pitch)), np.cos(roll) * np.cos(pitch)

@@ -1,6 +1,6 @@
 """The six courses of Almanza-Medina, 5.4.5, by name: a vehicle that keeps its heading, a position every 50 ms.
 
-The text's lists are garbled in places; what holds here is :data:`LEGS` and the formulas below. Each keeps the text's number
+Some of the text's lists are garbled. :data:`LEGS` and the formulas below replace them. Each course keeps the text's number
 of positions and its speeds.
 """
 
@@ -20,7 +20,7 @@ from mitsonar.motion.trajectory import Trajectory
 __all__ = ["COURSES", "LEGS", "course"]
 
 STEP_S = 0.05
-"""Between positions."""
+"""Time between positions."""
 
 AHEAD, BACK, LEFT, RIGHT = (0.0, 1.0), (0.0, -1.0), (-1.0, 0.0), (1.0, 0.0)
 """Directions as (starboard, forward)."""
@@ -31,7 +31,7 @@ LEGS: dict[str, tuple[Leg, ...]] = {
     # 5 m a side; one displacement short of the start, since 400 positions make 399 displacements
     "square": ((100, LEFT, 1.0), (100, AHEAD, 1.0), (50, RIGHT, 1.5), (50, RIGHT, 0.5), (50, BACK, 1.5), (49, BACK, 0.5)),
     "stairs": ((100, AHEAD, 1.0), (100, RIGHT, 1.0), (50, AHEAD, 1.5), (50, AHEAD, 0.5), (50, RIGHT, 1.5), (49, RIGHT, 0.5)),
-    # the list of the text up to where it begins to repeat itself, and ahead again to 340 positions
+    # the list of the text up to its first repetition, then ahead up to 340 positions
     "zigzag": (
         (80, BACK, 1.0),
         (50, LEFT, 1.0),
@@ -47,19 +47,19 @@ LEGS: dict[str, tuple[Leg, ...]] = {
 
 
 def _legs(name: str) -> NDArray[np.float64]:
-    """Positions ``(n, 2)`` along straight legs, starboard and forward [m]."""
+    """Return positions ``(n, 2)`` along straight legs, starboard and forward [m]."""
     steps = [np.tile(np.array(way) * speed * STEP_S, (count, 1)) for count, way, speed in LEGS[name]]
     return np.concatenate([np.zeros((1, 2)), np.cumsum(np.concatenate(steps), axis=0)])
 
 
 def _circle() -> NDArray[np.float64]:
-    """A circle of 5 m radius, 400 positions: 1.57 m/s."""
+    """Return a circle of 5 m radius, 400 positions: 1.57 m/s."""
     angle = 2 * math.pi * np.arange(400) / 399
     return 5.0 * np.column_stack([np.cos(angle) - 1, np.sin(angle)])
 
 
 def _sinusoid() -> NDArray[np.float64]:
-    """0.6 m/s to starboard, and three waves ahead and back at up to 1.908 m/s: 0.6 to 2 m/s, 400 positions."""
+    """Return 0.6 m/s to starboard, and three waves ahead and back at up to 1.908 m/s: 0.6 to 2 m/s, 400 positions."""
     time = STEP_S * np.arange(400)
     pulsation = 2 * math.pi * 3 / time[-1]
     return np.column_stack([0.6 * time, math.sqrt(2.0**2 - 0.6**2) / pulsation * np.sin(pulsation * time)])
@@ -73,11 +73,11 @@ COURSES: dict[str, Callable[[], NDArray[np.float64]]] = {
     "sinusoid": _sinusoid,
     "diagonal": partial(_legs, "diagonal"),
 }
-"""Trajectories 1 to 6 of the thesis, in its order."""
+"""Almanza-Medina's trajectories 1 to 6, in that order."""
 
 
 def course(name: str, around: Pose) -> Trajectory:
-    """A course, flown so that the middle of its extent lies at ``around``, with its height, attitude and heading.
+    """Return a course whose middle lies at ``around``, with the height, attitude and heading of that pose.
 
     Raises:
         MitsonarError: unknown name.

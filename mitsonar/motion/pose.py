@@ -1,4 +1,4 @@
-"""Pose: place and attitude of a sonar or vehicle, as six numbers, rotations and matrices."""
+"""Pose: position and attitude of a sonar or vehicle, as six numbers, rotations and matrices."""
 
 from __future__ import annotations
 
@@ -15,16 +15,8 @@ __all__ = ["Pose", "mounted", "pose_from_to_world", "poses_from", "to_world_matr
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
-LARGEST_TUM = 2**30
-"""Bytes of a trajectory."""
-
-
-FARTHEST = 1e12
-"""Of places [m], times [s] and numbers of a quaternion in a file."""
-
-
 class Pose(NamedTuple):
-    """Where the sonar is: x, y, z [m], pitch, roll, heading [rad]."""
+    """Position and attitude of the sonar: x, y, z [m], pitch, roll, heading [rad]."""
 
     x: float
     y: float
@@ -35,7 +27,7 @@ class Pose(NamedTuple):
 
     @classmethod
     def from_degrees(cls, numbers: ArrayLike) -> Self:
-        """The pose of ``x, y, z, pitch, roll, heading`` with metres and degrees.
+        """Make a pose from ``x, y, z, pitch, roll, heading`` in metres and degrees.
 
         Raises:
             MitsonarError: not six finite numbers.
@@ -49,37 +41,42 @@ class Pose(NamedTuple):
 
 
 def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
-    """Poses ``(frames, 6)`` of a sonar on a vehicle at ``poses``; ``mount`` is the sonar's pose in the vehicle's axes.
+    """Compute the poses ``(frames, 6)`` of a sonar on a vehicle.
 
-    A mount that only pitches keeps position, heading and roll of a level vehicle as they are, to the bit.
+    A mount that only pitches keeps position, heading and roll of a level vehicle to the bit.
+
+    Args:
+        poses: of the vehicle ``(frames, 6)`` [m, rad].
+        mount: pose of the sonar in the vehicle's axes.
     """
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     if not any((*mount[:3], mount.roll, mount.heading)) and not table[:, 3:5].any():
-        return table + np.array([0, 0, 0, mount.pitch, 0, 0])
+        pitched: NDArray[np.float64] = table + np.array([0, 0, 0, mount.pitch, 0, 0])
+        return pitched
     turn = vehicle_rotation(table)
     return poses_from(table[:, :3] + turn.apply(mount[:3]), turn * vehicle_rotation(mount))
 
 
 def vehicle_rotation(poses: ArrayLike) -> Rotation:
-    """Rotations from (starboard, forward, up) to the world for poses ``(frames, 6)``."""
+    """Return the rotations from (starboard, forward, up) to the world for poses ``(frames, 6)`` [m, rad]."""
     pitch, roll, heading = np.atleast_2d(np.asarray(poses, dtype=float))[:, 3:].T
     return Rotation.from_euler("ZXY", np.column_stack([-heading, -pitch, roll]))
 
 
 def poses_from(position: ArrayLike, rotation: Rotation) -> NDArray[np.float64]:
-    """Poses ``(frames, 6)`` of positions ``(frames, 3)`` and the rotations of (starboard, forward, up) to the world."""
+    """Make poses ``(frames, 6)`` from positions ``(frames, 3)`` and rotations of (starboard, forward, up) to the world."""
     matrix = np.atleast_3d(rotation.as_matrix().reshape(-1, 3, 3))
     starboard, forward, up = matrix[:, :, 0], matrix[:, :, 1], matrix[:, :, 2]
     pitch = np.arcsin(np.clip(-forward[:, 2], -1, 1))
     level = np.hypot(forward[:, 0], forward[:, 1]) > 1e-9
-    # looking straight up or down, heading and roll are one angle: it is given to the heading
+    # straight up or down, heading and roll are one angle: the heading takes it
     heading = np.where(level, np.arctan2(forward[:, 0], forward[:, 1]), np.arctan2(-starboard[:, 1], starboard[:, 0]))
     roll = np.where(level, np.arctan2(-starboard[:, 2], up[:, 2]), 0.0)
     return np.column_stack([np.asarray(position, dtype=float).reshape(-1, 3), pitch, roll, heading])
 
 
 def to_world_matrices(poses: ArrayLike) -> NDArray[np.float64]:
-    """Mitsuba's ``to_world`` of each pose ``(frames, 4, 4)``: local +z the acoustic axis, +y up, +x port."""
+    """Return Mitsuba's ``to_world`` of poses ``(frames, 4, 4)``: local +z the acoustic axis, +y up, +x port."""
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     matrices = np.tile(np.eye(4), (len(table), 1, 1))
     matrices[:, :3, :3] = vehicle_rotation(table).as_matrix() @ SENSOR_IN_VEHICLE
@@ -88,7 +85,7 @@ def to_world_matrices(poses: ArrayLike) -> NDArray[np.float64]:
 
 
 def pose_from_to_world(matrix: ArrayLike) -> Pose:
-    """The pose behind a sensor's ``to_world`` ``(4, 4)``.
+    """Recover the pose from a sensor's ``to_world`` ``(4, 4)``.
 
     Raises:
         MitsonarError: the matrix is not finite, scales, shears or mirrors.

@@ -20,11 +20,14 @@ __all__ = ["Trajectory", "velocities"]
 
 
 def velocities(flown: Trajectory) -> NDArray[np.float64]:
-    """Velocity along a trajectory in the vehicle's own axes: starboard, forward, up [m/s], turn to starboard [rad/s]
-    ``(frames, 4)``; of each step, the last again (one pose: zero).
+    """Compute the velocities along a trajectory in the vehicle's own axes.
 
-    A velocity that is kept leads along an arc; its chord lies half a turn off the first heading, shorter by the sinc of half
-    a turn: exact for level vehicles, as :func:`steady` drives them.
+    A constant velocity leads along an arc. Its chord lies half a turn off the first heading, and is shorter by the sinc of
+    half a turn. This is exact for level vehicles, as :func:`steady` drives them.
+
+    Returns:
+        To starboard, forward, up [m/s], and turn to starboard [rad/s] ``(frames, 4)``. Each row holds for the step after its
+        pose; the last row repeats the one before. A single pose has velocity 0.
     """
     if len(flown) == 1:
         return np.zeros((1, 4))
@@ -57,16 +60,23 @@ class Trajectory:
 
     @classmethod
     def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
-        """``frames`` poses equally spaced from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
+        """Space ``frames`` poses equally from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
 
-        The six numbers run linearly, as they are given: heading 350 to 370 deg turns 20 deg to starboard.
+        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard.
+
+        Raises:
+            MitsonarError: no frames.
         """
         if frames < 1:
             raise MitsonarError(f"frames must be at least 1: got {frames}")
         return cls(np.linspace(start, end, frames), np.arange(frames) / rate_hz)
 
     def resample(self, frames: int) -> Trajectory:
-        """``frames`` poses equally spaced in time; straight lines and shortest turns between the given ones."""
+        """Interpolate ``frames`` poses equally spaced in time, along straight lines and shortest turns.
+
+        Raises:
+            MitsonarError: no frames.
+        """
         if frames < 1:
             raise MitsonarError(f"frames must be at least 1: got {frames}")
         if len(self) == 1:
@@ -86,13 +96,13 @@ class Trajectory:
         Args:
             path: of the file.
             frame: its convention: ``mitsonar``, ``ros-enu`` or ``ned`` (:mod:`mitsonar.motion.conventions`).
-            looks_ahead: False where the sonar looks down from a level vehicle; only decides what is warned of.
+            looks_ahead: False where the sonar points down from a level vehicle; decides only on the warning.
 
         Raises:
             MitsonarError: unknown convention; unreadable file, or a broken line, with its number.
 
         Warns:
-            MitsonarWarning: in most frames the sonar would look sideways or at the sky, as in a wrong convention.
+            MitsonarWarning: in most frames the sonar points sideways or at the sky. The convention is probably wrong.
         """
         convention = convention_named(frame)
         if Path(path).suffix.lower() != ".csv":
@@ -101,16 +111,16 @@ class Trajectory:
         else:
             placed, attitude, angles = read_csv(path, convention)
             table = np.column_stack([placed, attitude])
-            told = _posed if angles is None else _posed_by_angles
-            read = {name: told(table, one) for name, one in CONVENTIONS.items()}
+            to_poses = _posed if angles is None else _posed_by_angles
+            read = {name: to_poses(table, one) for name, one in CONVENTIONS.items()}
         _warn_of_attitude(path, read, frame, looks_ahead)
         return cls(read[frame], table[:, 0])
 
     def save(self, path: str | Path, frame: str = "mitsonar") -> None:
-        """Write a TUM file, or a CSV file where the name ends with ``.csv``; :meth:`load` reads it back to 1e-9 m and deg.
+        """Write a TUM file, or a CSV file where the name ends with ``.csv``. :meth:`load` reads it back to 1e-9 m and deg.
 
         Args:
-            path: is replaced.
+            path: of the file, which is replaced.
             frame: the file's convention: ``mitsonar``, ``ros-enu`` or ``ned``.
 
         Raises:
@@ -118,7 +128,7 @@ class Trajectory:
         """
         convention = convention_named(frame)
         position, rotation = self.poses[:, :3], vehicle_rotation(self.poses)
-        if frame != "mitsonar":  # whose numbers stay as they are, to the bit
+        if frame != "mitsonar":  # whose numbers keep their bits
             position, rotation = convention.from_ours(position, rotation)
         if Path(path).suffix.lower() == ".csv":
             angles = convention.angles_from_ours(self.poses[:, 3:])
@@ -129,7 +139,7 @@ class Trajectory:
 
     @classmethod
     def load_tum(cls, path: str | Path) -> Self:
-        """A TUM file in mitsonar's convention: the quaternion turns (starboard, forward, up) to the world.
+        """Read a TUM file in mitsonar's convention: the quaternion turns (starboard, forward, up) to the world.
 
         Raises:
             MitsonarError: unreadable file, or a broken line, with its number.
@@ -138,26 +148,26 @@ class Trajectory:
         return cls(_posed(table, CONVENTIONS["mitsonar"]), table[:, 0])
 
     def save_tum(self, path: str | Path) -> None:
-        """Write a TUM file in mitsonar's convention; :meth:`load_tum` reads it back to 1e-9."""
+        """Write a TUM file in mitsonar's convention. :meth:`load_tum` reads it back to 1e-9."""
         quaternions = vehicle_rotation(self.poses).as_quat(canonical=True)
         write_tum(path, np.column_stack([self.time_s, self.poses[:, :3], quaternions]), CONVENTIONS["mitsonar"])
 
 
 def _posed(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
-    """Poses ``(n, 6)`` of times, positions and quaternions ``(n, 8)`` in a convention."""
+    """Make poses ``(n, 6)`` from times, positions and quaternions ``(n, 8)`` in a convention."""
     if convention.name == "mitsonar":
         return poses_from(table[:, 1:4], Rotation.from_quat(table[:, 4:]))
     return poses_from(*convention.to_ours(table[:, 1:4], Rotation.from_quat(table[:, 4:])))
 
 
 def _posed_by_angles(table: NDArray[np.float64], convention: Convention) -> NDArray[np.float64]:
-    """Poses ``(n, 6)`` of times, positions, pitch, roll and turn about the vertical ``(n, 7)`` in a convention."""
+    """Make poses ``(n, 6)`` from times, positions, pitch, roll and turn about the vertical ``(n, 7)`` in a convention."""
     position, _ = convention.to_ours(table[:, 1:4], Rotation.identity(len(table)))
     return np.column_stack([position, convention.angles_to_ours(table[:, 4:])])
 
 
 def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], frame: str, looks_ahead: bool) -> None:
-    """Warn where most frames would look sideways or at the sky; ``read`` has the poses by convention."""
+    """Warn where most frames point sideways or at the sky; ``read`` has the poses by convention."""
     share = {name: sideways_or_up(poses, looks_ahead=looks_ahead).mean() for name, poses in read.items()}
     if share[frame] <= 0.5:
         return

@@ -1,4 +1,4 @@
-"""How far an estimated path is from the true one: absolute and relative errors as `evo` defines them, drift at the end."""
+"""Errors of an estimated path: absolute and relative errors as `evo` defines them, and drift at the end."""
 
 from __future__ import annotations
 
@@ -26,8 +26,11 @@ __all__ = [
 ]
 
 Alignment = Literal["none", "first", "plane", "space"]
-"""How an estimated path is laid on the true one: not at all; by its first pose; by the rotation about the vertical and the
-shift in the plane, or the rotation and shift in space, that bring all positions nearest (Umeyama, 1991, without scale)."""
+"""Alignment of an estimated path with the true one.
+
+``none``: no alignment. ``first``: by the first pose. ``plane``: by the rotation about the vertical and the shift in the
+plane that fit all positions best. ``space``: by the rotation and shift in space that do so (Umeyama, 1991, without scale).
+"""
 
 DeltaUnit = Literal["frames", "metres"]
 
@@ -35,7 +38,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SHORTEST_PATH_M = 1e-3
-"""On a shorter path, drift per length says nothing."""
+"""Shortest path for which drift per length is defined."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +46,20 @@ class PathErrors:
     """Errors of an estimated path; angles are those of the rotation between the attitudes.
 
     Attributes:
-        frames: how many poses were compared.
-        alignment: how the paths were laid on each other for the absolute errors.
+        frames: number of poses compared.
+        alignment: of the paths, for the absolute errors.
         path_m: length of the true path [m].
         estimated_path_m: length of the estimated path [m].
         absolute_rmse_m: absolute trajectory error, root of the mean square [m].
         absolute_max_m: the largest [m].
         absolute_angle_rmse_rad: the same for the attitude [rad].
-        delta: over what the relative errors are taken,
-        unit: and in what: frames, or metres of the true path.
-        pairs: how many relative errors there are.
+        delta: length over which the relative errors are taken.
+        unit: of ``delta``: frames, or metres of the true path.
+        pairs: number of relative errors.
         relative_rmse_m: relative pose error, translation [m].
         relative_angle_rmse_rad: relative pose error, rotation [rad].
-        end_error_m: at the last pose, with the first poses laid on each other [m].
-        end_heading_rad: heading error gathered from the first to the last pose [rad], clockwise positive, not wrapped.
+        end_error_m: at the last pose, with the first poses aligned [m].
+        end_heading_rad: heading error accumulated from the first to the last pose [rad], clockwise positive, not wrapped.
     """
 
     frames: int
@@ -76,16 +79,16 @@ class PathErrors:
 
     @property
     def end_drift(self) -> float:
-        """Error at the end as a fraction of the path's length (Almanza-Medina, 5.4.5); nan for a path below 1 mm."""
+        """Return the end error as a fraction of the path's length (Almanza-Medina, 5.4.5); nan for a path below 1 mm."""
         return self.end_error_m / self.path_m if self.path_m > SHORTEST_PATH_M else np.nan
 
     @property
     def heading_drift_rad_per_m(self) -> float:
-        """Heading error gathered by metre of path, clockwise positive; nan for a path below 1 mm."""
+        """Return the heading error per metre of path [rad/m], clockwise positive; nan for a path below 1 mm."""
         return self.end_heading_rad / self.path_m if self.path_m > SHORTEST_PATH_M else np.nan
 
     def rows(self) -> list[tuple[str, float, str]]:
-        """Name, value and unit of every error: the one table for console, log and README."""
+        """Return name, value and unit of every error: the one table for console, log and README."""
         laid = {"none": "as they lie", "first": "first pose aligned", "plane": "aligned in the plane", "space": "aligned"}
         unit = {"frames": "frame", "metres": "m"}[self.unit] + ("s" if self.unit == "frames" and self.delta != 1 else "")
         each = f"over {self.delta:g} {unit}"
@@ -118,15 +121,15 @@ def assess(
     unit: DeltaUnit = "frames",
     tolerance_s: float = 0.01,
 ) -> PathErrors:
-    """All errors of an estimated path.
+    """Compute all errors of an estimated path.
 
     Args:
         estimated: the path to judge.
-        true: the path it should be; its length is taken with all its poses between the first and the last compared.
-        align: how the paths are laid on each other for the absolute errors; drift always counts from the first pose.
-        delta: relative errors are taken over so many
-        unit: frames, or metres of the true path, one after another without overlap.
-        tolerance_s: poses are compared that are no further apart in time.
+        true: the true path. Its length counts all its poses between the first and the last compared.
+        align: alignment of the paths for the absolute errors; drift always counts from the first pose.
+        delta: length over which relative errors are taken, one after another without overlap.
+        unit: of ``delta``: frames, or metres of the true path.
+        tolerance_s: largest difference in time of the poses that are compared [s].
 
     Raises:
         MitsonarError: fewer than two poses at equal times, a path too short for ``delta``, or one that cannot be aligned.
@@ -159,10 +162,13 @@ def assess(
 
 
 def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> tuple[Index, Index]:
-    """Which poses belong together ``(matches,)`` in both: each the nearest in time of the other, within the tolerance.
+    """Match poses by time: each is the nearest of the other, within the tolerance.
+
+    Returns:
+        Indices ``(matches,)`` into both paths.
 
     Raises:
-        MitsonarError: times that do not increase, or nothing within the tolerance.
+        MitsonarError: times that do not increase, or no match within the tolerance.
     """
     for name, time in (("estimated", estimated_s), ("true", true_s)):
         if not (np.diff(time) > 0).all():
@@ -170,7 +176,7 @@ def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> 
     theirs = _nearest(true_s, estimated_s)
     mine = np.arange(len(estimated_s))
     apart = np.abs(true_s[theirs] - estimated_s)
-    # times that went through a file differ in their last digit
+    # times read from a file differ in their last digit
     keep = (_nearest(estimated_s, true_s)[theirs] == mine) & (apart <= tolerance_s + 1e-9)
     if not keep.any():
         raise MitsonarError(
@@ -182,15 +188,15 @@ def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> 
 
 
 def path_length(path: Trajectory) -> float:
-    """Sum of the distances from pose to pose [m]."""
+    """Sum the distances from pose to pose [m]."""
     return float(_driven(path)[-1])
 
 
 def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajectory:
-    """The estimated path laid on the true one, pose by pose the same frames.
+    """Align an estimated path with the true one; both have the same frames.
 
     Raises:
-        MitsonarError: another number of poses, an unknown alignment, or positions that leave the rotation open.
+        MitsonarError: another number of poses, an unknown alignment, or positions that do not determine the rotation.
     """
     if len(estimated) != len(true):
         raise MitsonarError(
@@ -214,17 +220,26 @@ def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajec
 
 
 def absolute_errors(estimated: Trajectory, true: Trajectory, align: Alignment = "first") -> tuple[Array, Array]:
-    """Distance [m] and angle [rad] between the poses ``(frames,)`` of two paths, once they are aligned."""
-    laid = aligned(estimated, true, align)
-    angle = (vehicle_rotation(true.poses).inv() * vehicle_rotation(laid.poses)).magnitude()
-    return np.linalg.norm(laid.poses[:, :3] - true.poses[:, :3], axis=1), np.asarray(angle)
+    """Compute distance [m] and angle [rad] between the poses ``(frames,)`` of two paths after alignment."""
+    fitted = aligned(estimated, true, align)
+    angle = (vehicle_rotation(true.poses).inv() * vehicle_rotation(fitted.poses)).magnitude()
+    return np.linalg.norm(fitted.poses[:, :3] - true.poses[:, :3], axis=1), np.asarray(angle)
 
 
 def relative_errors(
     estimated: Trajectory, true: Trajectory, delta: float = 1, unit: DeltaUnit = "frames", *, overlapping: bool = False
 ) -> tuple[Array, Array]:
-    """Distance [m] and angle [rad] ``(pairs,)`` by which the motion over ``delta`` frames, or the frames that it takes to
-    drive so many metres of the true path, is wrong; one pair after another, or ``overlapping``, from every frame on.
+    """Compute the errors of motions over ``delta`` frames, or over so many metres of the true path.
+
+    Args:
+        estimated: the path to judge.
+        true: the true path, with the same frames.
+        delta: length of each motion.
+        unit: of ``delta``: frames or metres.
+        overlapping: whether a motion begins at every frame, or each where the one before ends.
+
+    Returns:
+        Distance [m] and angle [rad] ``(pairs,)``.
 
     Raises:
         MitsonarError: another number of poses, or a path that is shorter than ``delta``.
@@ -234,19 +249,19 @@ def relative_errors(
             f"as many estimated as true poses are needed: got {len(estimated)} and {len(true)}; associate them"
         )
     first, second = _pairs(true, delta, unit, overlapping)
-    place, turn = _between(true, first, second)
+    position, turn = _between(true, first, second)
     got, turned = _between(estimated, first, second)
-    return np.linalg.norm(got - place, axis=1), np.asarray((turn.inv() * turned).magnitude())
+    return np.linalg.norm(got - position, axis=1), np.asarray((turn.inv() * turned).magnitude())
 
 
 def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -> tuple[Index, Index]:
-    """First and second frame of each relative error."""
+    """Return the first and second frame of each relative error."""
     index = np.arange(len(true))
     if unit == "frames" and delta >= 1 and float(delta).is_integer():
         ends = index + int(delta)
     elif unit == "metres" and delta > 0:
         driven = _driven(true)
-        ends = np.searchsorted(driven, driven + delta * (1 - 1e-9))  # equal steps that should just reach it
+        ends = np.searchsorted(driven, driven + delta * (1 - 1e-9))  # rounding must not lengthen equal steps
     else:
         raise MitsonarError(f"delta must be 1, 2, ... frames or a positive number of metres: got {delta:g} {unit}")
     starts = index[ends < len(true)]
@@ -261,7 +276,7 @@ def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -
 
 
 def _between(path: Trajectory, first: Index, second: Index) -> tuple[Array, Rotation]:
-    """Positions ``(pairs, 3)`` and attitudes of the second poses, seen from the first."""
+    """Return positions ``(pairs, 3)`` and attitudes of the second poses, in axes of the first."""
     turn = vehicle_rotation(path.poses)
     back = turn[first].inv()
     return back.apply(path.poses[second, :3] - path.poses[first, :3]), back * turn[second]
@@ -271,7 +286,7 @@ def _turn_in_the_plane(here: Array, there: Array) -> Rotation:
     a, b = (points[:, :2] - points[:, :2].mean(axis=0) for points in (here, there))
     along, across = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
     if np.hypot(along, across) <= 1e-12 * np.linalg.norm(a) * np.linalg.norm(b) or not (a.any() and b.any()):
-        raise MitsonarError("a path that stays at one place cannot be aligned by its positions: align by the first pose")
+        raise MitsonarError("a path without motion cannot be aligned by its positions: align by the first pose")
     return Rotation.from_euler("z", np.arctan2(across, along))
 
 
@@ -279,12 +294,14 @@ def _turn_in_space(here: Array, there: Array) -> Rotation:
     a, b = (points - points.mean(axis=0) for points in (here, there))
     spread = np.linalg.svd(b.T @ a, compute_uv=False)
     if spread[1] <= 1e-9 * spread[0]:
-        raise MitsonarError("a straight path leaves the rotation about itself open: align in the plane or by the first pose")
+        raise MitsonarError(
+            "a straight path does not determine the rotation about itself: align in the plane or by the first pose"
+        )
     return Rotation.align_vectors(b, a)[0]
 
 
 def _driven(path: Trajectory) -> Array:
-    """Distance driven at each pose ``(frames,)`` [m]."""
+    """Return the distance driven up to each pose ``(frames,)`` [m]."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.poses[:, :3], axis=0), axis=1))])
 
 
@@ -293,7 +310,7 @@ def _picked(path: Trajectory, index: Index) -> Trajectory:
 
 
 def _nearest(among: Array, wanted: Array) -> Index:
-    """Index of the nearest of rising values for each wanted one."""
+    """Return the index of the nearest of rising values for each wanted one."""
     after = np.clip(np.searchsorted(among, wanted), 1, max(len(among) - 1, 1))
     after = np.minimum(after, len(among) - 1)
     before = np.maximum(after - 1, 0)

@@ -21,7 +21,7 @@ __all__ = ["read_csv", "read_tum", "write_csv", "write_tum"]
 Table = NDArray[np.float64]
 
 OURS = "(starboard, forward, up to world)"
-"""How the first line of a TUM file in mitsonar's own convention ends."""
+"""End of the first line of a TUM file in mitsonar's own convention."""
 
 ALIASES = {
     "time": ("time_s", "time", "timestamp"),
@@ -37,10 +37,10 @@ COLUMNS = (
 
 
 def read_tum(path: str | Path, convention: Convention) -> Table:
-    """The numbers of a TUM file as they stand ``(poses, 8)``: time, position, quaternion (x, y, z, w).
+    """Read the numbers of a TUM file ``(poses, 8)``: time [s], position [m], quaternion (x, y, z, w).
 
     Raises:
-        MitsonarError: unreadable file, a broken line, with its number, or a file that says that it has another convention.
+        MitsonarError: unreadable file, a broken line, with its number, or a file that names another convention.
     """
     rows: list[list[float]] = []
     for number, line in enumerate(_text(path).splitlines(), start=1):
@@ -58,7 +58,7 @@ def write_tum(path: str | Path, table: Table, convention: Convention) -> None:
     """Write a TUM file.
 
     Args:
-        path: is replaced.
+        path: of the file, which is replaced.
         table: time, position, quaternion ``(poses, 8)``, in the convention.
         convention: named in the first line.
     """
@@ -67,32 +67,32 @@ def write_tum(path: str | Path, table: Table, convention: Convention) -> None:
 
 
 LARGEST = 2**30
-"""Bytes of a trajectory."""
+"""Bytes of a trajectory, at most."""
 
 FARTHEST = 1e12
-"""Of places [m], times [s] and numbers of a quaternion in a file."""
+"""Largest position [m], time [s] and number of a quaternion in a file."""
 
 
 def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Table | None]:
-    """The numbers of a CSV file: times and positions ``(poses, 4)``, then either quaternions ``(poses, 4)`` or, with None
-    beside, pitch, roll and turn about the vertical ``(poses, 3)`` [rad].
+    """Read the numbers of a CSV file.
 
     Returns:
-        Times and positions; quaternions or angles; None where they are quaternions, the angles where they are.
+        Times [s] and positions [m] ``(poses, 4)``; then quaternions ``(poses, 4)`` and None, or twice the angles pitch, roll
+        and turn about the vertical ``(poses, 3)`` [rad].
 
     Raises:
-        MitsonarError: unreadable file, columns that are missing or told twice, a broken line, with its number.
+        MitsonarError: unreadable file, columns that are missing or double, a broken line, with its number.
     """
     lines = list(csv.reader(io.StringIO(_text(path))))
     if not lines or not any(word.strip() for word in lines[0]):
         raise MitsonarError(f"trajectory {path} holds no pose: its first line must name the columns, {COLUMNS}")
     names = [word.strip().lower() for word in lines[0]]
-    places = [_place(path, names, key) for key in ("time", "x", "y", "z")]
+    columns = [_column(path, names, key) for key in ("time", "x", "y", "z")]
     attitude, units = _attitude(path, names, convention)
     rows: list[list[float]] = []
     for number, words in enumerate(lines[1:], start=2):
         if any(word.strip() for word in words):
-            rows.append(_csv_row(path, number, words, [*places, *attitude]))
+            rows.append(_csv_row(path, number, words, [*columns, *attitude]))
             _refuse_disorder(path, number, rows)
     if not rows:
         raise MitsonarError(f"trajectory {path} holds no pose: there is no line below the names of its columns")
@@ -107,9 +107,9 @@ def write_csv(path: str | Path, table: Table, convention: Convention) -> None:
     """Write a CSV file: ``time_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg`` (``yaw_deg`` in ros-enu), whole or absent.
 
     Args:
-        path: is replaced.
+        path: of the file, which is replaced.
         table: time, position [m], pitch, roll, turn about the vertical [rad] ``(poses, 7)``, in the convention.
-        convention: tells what that turn is called.
+        convention: has the name of that turn.
     """
     names = ["time_s", "x_m", "y_m", "z_m", "roll_deg", "pitch_deg", f"{convention.turn[0]}_deg"]
     shown = np.column_stack([table[:, :4], np.degrees(table[:, [5, 4, 6]])])
@@ -131,9 +131,9 @@ def _text(path: str | Path) -> str:
 
 
 def _refuse_another(path: str | Path, line: str, convention: Convention) -> None:
-    """A file that mitsonar wrote says its convention."""
-    said = re.search(r"\(frame ([\w-]+):", line)
-    name = said.group(1) if said else "mitsonar" if OURS in line else convention.name
+    """Refuse a file of mitsonar that names another convention."""
+    named = re.search(r"\(frame ([\w-]+):", line)
+    name = named.group(1) if named else "mitsonar" if OURS in line else convention.name
     if name != convention.name:
         raise MitsonarError(f"trajectory {path} says that it is {name}, and --frame {convention.name} is asked: give {name}")
 
@@ -160,11 +160,11 @@ def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
     return row
 
 
-def _place(path: str | Path, names: list[str], key: str) -> int:
-    """The column of a key."""
+def _column(path: str | Path, names: list[str], key: str) -> int:
+    """Return the column of a key."""
     found = [number for number, name in enumerate(names) if name in ALIASES[key]]
     if len(found) > 1:
-        raise MitsonarError(f"trajectory {path} tells {key} in {len(found)} columns: leave all but one out")
+        raise MitsonarError(f"trajectory {path} has {key} in {len(found)} columns: leave all but one out")
     if not found:
         raise MitsonarError(
             f"trajectory {path} has no column {key} ({', '.join(names)[:80]}): its columns must be {COLUMNS}"
@@ -173,24 +173,24 @@ def _place(path: str | Path, names: list[str], key: str) -> int:
 
 
 def _attitude(path: str | Path, names: list[str], convention: Convention) -> tuple[list[int], Table | None]:
-    """Columns of the attitude: a quaternion, with None, or pitch, roll and turn with what makes each radians."""
+    """Return the columns of the attitude: a quaternion and None, or pitch, roll, turn and the factors to radians."""
     quaternion = [name for name in names if name in ("qx", "qy", "qz", "qw")]
     angles = [name for name in names if name.rsplit("_", 1)[0] in ("roll", "pitch", "heading", "yaw")]
     if quaternion and angles:
-        raise MitsonarError(f"trajectory {path} tells the attitude twice, {quaternion[0]} and {angles[0]}: leave one out")
+        raise MitsonarError(f"trajectory {path} has the attitude twice, {quaternion[0]} and {angles[0]}: leave one out")
     if quaternion:
-        return [_place(path, names, f"q{axis}") for axis in "xyzw"], None
+        return [_column(path, names, f"q{axis}") for axis in "xyzw"], None
     found = [_angle(path, names, wanted, convention) for wanted in (("pitch",), ("roll",), convention.turn)]
-    return [place for place, _ in found], np.array([unit for _, unit in found])
+    return [column for column, _ in found], np.array([unit for _, unit in found])
 
 
 def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention: Convention) -> tuple[int, float]:
-    """The column of an angle, and what makes it radians."""
+    """Return the column of an angle, and its factor to radians."""
     units = {"_deg": math.radians(1), "_rad": 1.0}
     known = {f"{name}{ending}": unit for name in wanted for ending, unit in units.items()}
     found = [number for number, name in enumerate(names) if name in known]
     if len(found) > 1:
-        raise MitsonarError(f"trajectory {path} tells {wanted[0]} in {len(found)} columns: leave all but one out")
+        raise MitsonarError(f"trajectory {path} has {wanted[0]} in {len(found)} columns: leave all but one out")
     if found:
         return found[0], known[names[found[0]]]
     if set(wanted) & set(names):
@@ -207,12 +207,12 @@ def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention
     )
 
 
-def _csv_row(path: str | Path, number: int, words: list[str], places: list[int]) -> list[float]:
+def _csv_row(path: str | Path, number: int, words: list[str], columns: list[int]) -> list[float]:
     try:
-        row = [] if "_" in "".join(words) else [float(words[place]) for place in places]
+        row = [] if "_" in "".join(words) else [float(words[column]) for column in columns]
     except (ValueError, IndexError):
         row = []
-    zero = len(places) == 8 and bool(row) and not np.linalg.norm(row[4:]) >= 1e-6
+    zero = len(columns) == 8 and bool(row) and not np.linalg.norm(row[4:]) >= 1e-6
     if not row or not (np.abs(row) <= FARTHEST).all() or zero:
         raise MitsonarError(
             f"trajectory {path}, line {number}: expected finite numbers in the columns that its first line names, and no "

@@ -1,1 +1,1 @@
-"""What a ray or a ping brought back, in the one form that everything downstream reads."""
+"""Records of rays and pings, in the one form that all later stages read."""

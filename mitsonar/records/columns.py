@@ -1,4 +1,4 @@
-"""What the arrays of a file must be: type, shape and values, checked before anybody computes with them."""
+"""Checks of the arrays of a file: type, shape and values, before anything is computed from them."""
 
 from __future__ import annotations
 
@@ -6,18 +6,21 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import finite_number, parse_json, whole_number
-from mitsonar.io.whole_files import read_json, refuse_beyond_memory
+from mitsonar.io.plain_data import PlainValue, finite_number, parse_json, whole_number
+from mitsonar.io.whole_files import FileArray, read_json, refuse_beyond_memory
+
+if TYPE_CHECKING:
+    import zarr
 
 __all__ = [
     "FEW_ROWS",
     "Column",
+    "StoredArray",
     "arrays_in",
     "check_column",
     "number_of",
@@ -27,20 +30,23 @@ __all__ = [
     "text_of",
 ]
 
+StoredArray: TypeAlias = Any
+"""An array of NumPy or Zarr, with dtype, shape and ndim."""
+
 MOST_DIMENSIONS = 4
 PIECES_A_ROW = 64
-"""Chunks that a row of an array may be cut into."""
+"""Chunks of a row of an array, at most."""
 
 ROWS_A_BYTE = 200
-"""Rows that a byte of a compressed array may stand for: times and poses differ from row to row."""
+"""Rows of a byte of a compressed array, at most: times and poses differ from row to row."""
 
 FEW_ROWS = 100_000
-"""Rows that any file may promise."""
+"""Rows that a file of any size may have."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """What an array must be.
+    """Required type, shape and values of an array.
 
     Attributes:
         dims: names of its dimensions; the same name has the same length everywhere.
@@ -59,18 +65,18 @@ class Column:
     order: Literal["strict", "same", "any"] = "any"
 
 
-def check_column(values: Any, name: str, column: Column, sizes: Mapping[str, int], source: str) -> None:
+def check_column(values: StoredArray, name: str, column: Column, sizes: Mapping[str, int], source: str) -> None:
     """Check an array.
 
     Args:
-        values: the array, or an array of Zarr, of which only type and shape are looked at.
-        name: of it, for errors.
-        column: what it must be.
-        sizes: lengths of dimensions that are known.
+        values: the array. Of an array of Zarr only type and shape are checked.
+        name: of the array, for errors.
+        column: requirements on it.
+        sizes: known lengths of dimensions.
         source: is named in errors.
 
     Raises:
-        MitsonarError: it is something else.
+        MitsonarError: it does not meet them.
     """
     wanted = tuple(sizes.get(dim, length) for dim, length in zip(column.dims, values.shape, strict=False))
     if values.dtype.kind not in column.kinds or values.ndim != len(column.dims) or values.shape != wanted:
@@ -83,7 +89,7 @@ def check_column(values: Any, name: str, column: Column, sizes: Mapping[str, int
         _check_values(values, name, column, source)
 
 
-def _check_values(values: NDArray[Any], name: str, column: Column, source: str) -> None:
+def _check_values(values: FileArray, name: str, column: Column, source: str) -> None:
     if values.dtype.kind in "fc" and not np.isfinite(values).all():
         if not column.nan or np.isinf(values).any():
             raise MitsonarError(f"{source}: {name} holds nan or inf; the file is damaged, or was written by something else")
@@ -100,8 +106,8 @@ def _check_values(values: NDArray[Any], name: str, column: Column, source: str) 
             raise MitsonarError(f"{source}: {name} must {wanted} from row to row")
 
 
-def text_of(table: Mapping[str, Any], name: str, default: str | None = None) -> str:
-    """A text of a table of arrays.
+def text_of(table: Mapping[str, StoredArray], name: str, default: str | None = None) -> str:
+    """Return a text of a table of arrays.
 
     Raises:
         MitsonarError: it is no text.
@@ -112,22 +118,22 @@ def text_of(table: Mapping[str, Any], name: str, default: str | None = None) -> 
     return str(value)
 
 
-def number_of(table: Mapping[str, Any], name: str, default: float) -> float:
-    """A finite number above 0 of a table of arrays.
+def number_of(table: Mapping[str, StoredArray], name: str, default: float) -> float:
+    """Return a finite number above 0 of a table of arrays.
 
     Raises:
-        MitsonarError: it is none.
+        MitsonarError: it is something else.
     """
     value = np.asarray(table.get(name, default))
     single = value.ndim == 0 and value.dtype.kind in "fiu"
     return finite_number(float(value) if single else str(value), name, above=0)
 
 
-def table_in(table: Mapping[str, Any], name: str, source: str, default: str | None = None) -> dict[str, Any]:
-    """The JSON object in a text of a table of arrays, with texts as keys.
+def table_in(table: Mapping[str, StoredArray], name: str, source: str, default: str | None = None) -> dict[str, PlainValue]:
+    """Parse the JSON object in a text of a table of arrays.
 
     Raises:
-        MitsonarError: it is none.
+        MitsonarError: the text is no JSON object.
     """
     try:
         value = parse_json(text_of(table, name, default), f"the field {name}")
@@ -141,22 +147,24 @@ def table_in(table: Mapping[str, Any], name: str, source: str, default: str | No
 # ---------------------------------------------------------------- Zarr
 
 
-def open_group(path: Path, columns: Mapping[str, Column], rows: str, done: str | None = None) -> tuple[dict[str, Any], int]:
-    """The arrays of a Zarr group, not read yet but for those that tell how many rows there are, and its attributes.
+def open_group(
+    path: Path, columns: Mapping[str, Column], rows: str, done: str | None = None
+) -> tuple[dict[str, StoredArray], int]:
+    """Open the arrays and attributes of a Zarr group. Their values are not read yet.
 
-    Types, shapes and pieces of all arrays are checked against each other and against the bytes of the rows' own array.
+    Types, shapes and chunks of all arrays are checked against each other and against the bytes of the array ``rows``.
 
     Args:
         path: of the group.
-        columns: what its arrays must be; others may be there.
-        rows: name of the array that has a number for each row, and is read.
-        done: name of the attribute that says how many rows are written, if there is one.
+        columns: requirements on its arrays; other arrays may be present.
+        rows: name of the array that has a number for each row.
+        done: name of the attribute with the number of rows that are written, if there is one.
 
     Returns:
         Arrays of Zarr and attributes (as arrays of NumPy) by name, and the number of rows that are written.
 
     Raises:
-        Exception: whatever a damaged group leads to, for the caller to put into words.
+        Exception: a damaged group raises errors of many kinds. The caller puts them into words.
     """
     group, arrays = arrays_in(path, "r")
     if rows not in arrays or arrays[rows].ndim not in (1, 2) or arrays[rows].dtype.kind != "f":
@@ -171,17 +179,17 @@ def open_group(path: Path, columns: Mapping[str, Column], rows: str, done: str |
             check_column(array, name, columns[name], {columns[rows].dims[0]: count}, "it")
     attributes = dict(group.attrs)
     written = count if done is None else attributes.pop(done, count)
-    whole_number(written, str(done), 0, count)
+    written = whole_number(written, str(done), 0, count)
     return {**arrays, **{name: np.array(value) for name, value in attributes.items()}}, written
 
 
-def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[Any, dict[str, Any]]:
-    """A Zarr group in a folder, and its arrays by name; their metadata are checked before Zarr reads them.
+def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[str, StoredArray]]:
+    """Open a Zarr group in a folder, and its arrays by name. Their metadata are checked before Zarr reads them.
 
     Arrays are opened one by one: of several at once Zarr would print the errors of all.
 
     Raises:
-        Exception: whatever a damaged group leads to, for the caller to put into words.
+        Exception: a damaged group raises errors of many kinds. The caller puts them into words.
     """
     import zarr
 
@@ -198,12 +206,12 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[Any, dict[str, Any]
 
 
 def rows_that_fit(stored: int) -> int:
-    """The most rows that so many compressed bytes may stand for."""
+    """Return the largest number of rows that so many compressed bytes may hold."""
     return max(FEW_ROWS, ROWS_A_BYTE * stored)
 
 
-def _check_pieces(name: str, array: Any) -> None:
-    """That reading an array takes neither for ever nor more memory than there is."""
+def _check_pieces(name: str, array: StoredArray) -> None:
+    """Check that an array can be read in finite time and memory."""
     if array.ndim > MOST_DIMENSIONS or array.dtype.kind not in "biufc":
         raise ValueError(f"{name} holds no numbers, or has more than {MOST_DIMENSIONS} dimensions")
     if any(piece < 1 for piece in array.chunks):

@@ -1,23 +1,24 @@
-"""Echoes: the record of every ray, the one currency between tracing and whatever is computed from it; EXR in and out."""
+"""Echoes: the record of every ray, between tracing and all that is computed from it; EXR in and out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.plain_data import PlainValue
 
 __all__ = ["CHANNELS", "Echoes", "load_exr", "save_exr"]
 
 
 @dataclass
 class Echoes:
-    """One value a ray, Dr.Jit arrays that are not evaluated yet, or NumPy arrays.
+    """Echoes of rays, one value a ray: Dr.Jit arrays that are not evaluated yet, or NumPy arrays.
 
     Attributes:
         hit: 1 where the ray met a surface, else 0 and all else 0 (``shape_id`` -1).
@@ -29,28 +30,28 @@ class Echoes:
         solid_angle_sr: of the ray's cell [sr].
         x, y, z: point hit in the world [m].
         nx, ny, nz: geometric normal there.
-        shape_id: place of the shape in the scene.
+        shape_id: index of the shape in the scene.
         object_id: number of the object within its mesh (the mesh's attribute ``face_id``), 0 where it has none.
     """
 
-    hit: Any
-    range_m: Any
-    near_m: Any
-    far_m: Any
-    reflectivity: Any
-    cosine: Any
-    solid_angle_sr: Any
-    x: Any
-    y: Any
-    z: Any
-    nx: Any
-    ny: Any
-    nz: Any
-    shape_id: Any
-    object_id: Any
+    hit: AnyArray
+    range_m: AnyArray
+    near_m: AnyArray
+    far_m: AnyArray
+    reflectivity: AnyArray
+    cosine: AnyArray
+    solid_angle_sr: AnyArray
+    x: AnyArray
+    y: AnyArray
+    z: AnyArray
+    nx: AnyArray
+    ny: AnyArray
+    nz: AnyArray
+    shape_id: AnyArray
+    object_id: AnyArray
 
     def outside(self, sonar: Sonar) -> tuple[float, float] | None:
-        """Nearest and farthest return outside the sonar's window [m]; None where all lie inside. NumPy arrays only."""
+        """Return the nearest and farthest echo outside the window [m]; None where all lie inside. NumPy arrays only."""
         near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)
         missed = (far < sonar.range_min) | (near >= sonar.range_max)
         found = self.range_m[(self.hit > 0) & missed]
@@ -65,10 +66,10 @@ LIMITS = (
     *(("hit", 0, 1), ("reflectivity", 0, 1), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13), ("range_m", 0, 1e9)),
     *(("shape_id", -1, 2**24), ("nx", -1.001, 1.001), ("ny", -1.001, 1.001), ("nz", -1.001, 1.001)),
 )
-"""Least and greatest values of channels."""
+"""Channels with their least and greatest values."""
 
 INFLATION = 1032
-"""Deflated pixels can grow by no more."""
+"""Largest factor by which deflated pixels can grow."""
 
 
 def save_exr(path: str | Path, echoes: Echoes, sonar: Sonar) -> None:
@@ -117,8 +118,8 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
     return Echoes(**values)
 
 
-def _check_header(header: dict[str, Any], names: list[str], shape: tuple[int, int], size: int) -> None:
-    """What a file promises, before its pixels are read.
+def _check_header(header: dict[str, PlainValue], names: list[str], shape: tuple[int, int], size: int) -> None:
+    """Check a file's header before its pixels are read.
 
     Raises:
         MitsonarError: another size than the sonar's, or more pixels than its bytes can hold.

@@ -1,4 +1,4 @@
-"""Frames written as they are made, in constant memory: a Zarr group while a run goes on, ``frames.npz`` when it is short."""
+"""Frames on disk, written as they are made, in constant memory: a Zarr group, at the end of a short run ``frames.npz``."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ import shutil
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO
 
 import numpy as np
 import zarr
-from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.plain_data import whole_number
-from mitsonar.records.columns import arrays_in, check_column
+from mitsonar.io.whole_files import FileArray
+from mitsonar.records.columns import StoredArray, arrays_in, check_column
 from mitsonar.records.sonar_frames import COLUMNS, PER_FRAME, SonarFrames
 
 __all__ = ["LONGEST_NPZ", "FrameStore"]
 
 LONGEST_NPZ = 1000
-"""Frames up to which a run ends as one ``frames.npz``; longer ones stay ``frames.zarr``."""
+"""Most frames of a run that ends as one ``frames.npz``. Longer runs keep ``frames.zarr``."""
 
 
 class FrameStore:
     """The frames of one run, on disk as ``frames.zarr`` (Zarr v3, one chunk a frame).
 
-    The group holds what ``frames.npz`` holds, by the same names. ``sonar``, ``level``, ``level_scale``, ``about`` and
-    ``names`` are attributes, and so is ``frames_done``: frames from there on are not written yet.
+    The group holds the arrays of ``frames.npz`` by the same names. ``sonar``, ``level``, ``level_scale``, ``about`` and
+    ``names`` are attributes. So is ``frames_done``, the number of frames that are written.
     """
 
     def __init__(self, group: zarr.Group, path: Path) -> None:
@@ -37,7 +37,7 @@ class FrameStore:
 
     @classmethod
     def create(cls, path: Path, frames: int, like: SonarFrames) -> FrameStore:
-        """An empty store for ``frames`` frames that look like the ones in ``like``."""
+        """Create an empty store for ``frames`` frames with the arrays and attributes of ``like``."""
         group = zarr.open_group(path, mode="w", zarr_format=3)
         table = like.arrays()
         for name in ("level", "level_scale", "sonar", "about", "names"):
@@ -55,7 +55,7 @@ class FrameStore:
 
     @classmethod
     def open(cls, path: Path) -> FrameStore:
-        """A store that was begun.
+        """Open a store that was begun.
 
         Raises:
             MitsonarError: there is none, or it is damaged.
@@ -63,7 +63,7 @@ class FrameStore:
         try:
             store = cls(arrays_in(path, "r+")[0], path)
             store.frames, store.done  # noqa: B018
-        except Exception as error:  # a damaged Zarr raises whatever its bytes lead to
+        except Exception as error:  # a damaged Zarr raises errors of many kinds
             raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
         return store
 
@@ -73,10 +73,10 @@ class FrameStore:
         Args:
             frames: of the whole run.
             sonar: its instrument.
-            done: frames that the run says are written.
+            done: frames that are written, according to the run.
 
         Raises:
-            MitsonarError: arrays are missing, of other shapes or cut otherwise, or fewer frames are written.
+            MitsonarError: arrays are missing, have other shapes or chunks, or fewer frames are written.
         """
         cells = (sonar.range_bins, sonar.beams)
         sizes = {"frames": frames, "bins": cells[0], "beams": cells[1], "six": 6}
@@ -99,16 +99,16 @@ class FrameStore:
 
     @property
     def frames(self) -> int:
-        """Frames of the whole run."""
+        """Return the number of frames of the whole run."""
         return int(self.group["image"].shape[0])  # type: ignore[union-attr]
 
     @property
     def done(self) -> int:
-        """Frames that are written."""
+        """Return the number of frames that are written."""
         return int(self.group.attrs["frames_done"])  # type: ignore[arg-type]
 
     def write(self, first: int, frames: SonarFrames) -> None:
-        """Write consecutive frames; they count as done once all of them are on disk."""
+        """Write consecutive frames. They count as done once all of them are on disk."""
         table = frames.arrays()
         for name in [*PER_FRAME, "pitch_rad"]:
             if name in table:
@@ -131,15 +131,16 @@ class FrameStore:
         shutil.rmtree(self.path)
 
 
-def _write_npy(entry: Any, array: zarr.Array) -> None:
-    """An array as .npy, a frame at a time."""
+def _write_npy(entry: IO[bytes], array: StoredArray) -> None:
+    """Write an array as .npy, one frame at a time."""
     header = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
     np.lib.format.write_array_header_2_0(entry, header)
     for piece in _pieces(array):
         entry.write(np.ascontiguousarray(piece).tobytes())
 
 
-def _pieces(array: zarr.Array) -> Iterator[NDArray[Any]]:
+def _pieces(array: StoredArray) -> Iterator[FileArray]:
+    """Yield an array frame by frame, or whole where it has no frames."""
     if array.ndim < 3:
         yield np.asarray(array[...])
         return

@@ -1,4 +1,4 @@
-"""Complex channel impulse responses in the one form that everything downstream reads; ``responses.npz`` holds exactly it."""
+"""Complex channel impulse responses in the one form that all later stages read, and the file ``responses.npz``."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import io
 import json
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.io.whole_files import read_npz, refuse_beyond_memory, write_whole
-from mitsonar.records.columns import Column, check_column, open_group, table_in
+from mitsonar.io.plain_data import PlainValue
+from mitsonar.io.whole_files import FileArray, read_npz, refuse_beyond_memory, write_whole
+from mitsonar.records.columns import Column, StoredArray, check_column, open_group, table_in
 
 __all__ = ["ImpulseResponses"]
 
@@ -29,7 +29,7 @@ COLUMNS = {
     "echoes": Column(("pings", "receivers"), "i", low=0),
     "dropped": Column(("pings", "receivers"), "i", low=0),
 }
-"""What the arrays of a file must be."""
+"""Requirements on the arrays of a file."""
 
 
 @dataclass
@@ -44,9 +44,9 @@ class ImpulseResponses:
         velocity: of the vehicle in its own axes, starboard, forward, up [m/s], and its turn to starboard [rad/s]
             ``(pings, 4)``, where known.
         height_m: of the transmitter over the ground below ``(pings,)``, where known.
-        echoes: how many made each response ``(pings, receivers)``, where known.
-        dropped: how many more came from beyond ``range_max`` ``(pings, receivers)``, where known.
-        about: what else a file should say.
+        echoes: number of echoes in each response ``(pings, receivers)``, where known.
+        dropped: number of echoes from beyond ``range_max`` ``(pings, receivers)``, where known.
+        about: further notes for the file.
     """
 
     response: NDArray[np.complex64]
@@ -57,7 +57,7 @@ class ImpulseResponses:
     height_m: NDArray[np.float64] | None = None
     echoes: NDArray[np.int64] | None = None
     dropped: NDArray[np.int64] | None = None
-    about: dict[str, Any] = field(default_factory=dict)
+    about: dict[str, PlainValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         wanted = (len(self.time_s), len(self.sonar.receivers), self.sonar.taps)
@@ -83,18 +83,18 @@ class ImpulseResponses:
 
     @property
     def delay_s(self) -> NDArray[np.float64]:
-        """Delay of each tap ``(taps,)`` [s]."""
+        """Return the delay of each tap ``(taps,)`` [s]."""
         return self.sonar.delay_s
 
-    def select(self, index: slice | NDArray[Any]) -> ImpulseResponses:
-        """Some of the pings."""
+    def select(self, index: slice | NDArray[np.integer] | NDArray[np.bool_]) -> ImpulseResponses:
+        """Select some of the pings."""
         picked = {name: getattr(self, name)[index] for name in PER_PING if getattr(self, name) is not None}
         rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
         return ImpulseResponses(**picked, **rest)
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """What ``responses.npz`` holds, by name; ``sonar`` and ``about`` are JSON texts."""
-        table: dict[str, NDArray[Any]] = {"delay_s": self.delay_s}
+    def arrays(self) -> dict[str, FileArray]:
+        """Return the arrays of ``responses.npz`` by name; ``sonar`` and ``about`` are JSON texts."""
+        table: dict[str, FileArray] = {"delay_s": self.delay_s}
         table |= {name: getattr(self, name) for name in PER_PING if getattr(self, name) is not None}
         return table | {
             "sonar": np.array(self.sonar.model_dump_json()),
@@ -102,7 +102,7 @@ class ImpulseResponses:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write ``.npz``, or a Zarr v3 group where the name ends with ``.zarr``; the npz is whole or absent."""
+        """Write ``.npz``, or a Zarr v3 group where the name ends with ``.zarr``. The npz is whole or absent."""
         path = Path(path)
         if path.suffix == ".zarr":
             import zarr
@@ -115,13 +115,13 @@ class ImpulseResponses:
                     group.attrs[name] = values.item()
         else:
             buffer = io.BytesIO()
-            table: dict[str, Any] = self.arrays()
+            table: dict[str, StoredArray] = self.arrays()
             np.savez_compressed(buffer, **table)
             write_whole(path, buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> ImpulseResponses:
-        """Read what :meth:`save` wrote, or the folder that ``mitsonar impulse`` made.
+        """Read a file of :meth:`save`, or a folder of ``mitsonar impulse``.
 
         Raises:
             MitsonarError: no such file, damaged, or not responses.
@@ -136,7 +136,7 @@ class ImpulseResponses:
                 table |= {name: one[...] for name, one in table.items() if not isinstance(one, np.ndarray)}
             else:
                 table = read_npz(path)
-        except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
+        except Exception as error:  # a damaged zip or Zarr raises errors of many kinds
             reason = " ".join(str(error).split())[:300] or type(error).__name__
             raise MitsonarError(f"cannot read responses {path}: {reason}; give what `mitsonar impulse` wrote") from None
         missing = [name for name in ("response", "time_s", "sonar") if name not in table]

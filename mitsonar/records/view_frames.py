@@ -1,15 +1,16 @@
-"""Frames of several views of the same pings, or their vectors: what a looking-down sonar hears in portions of its view."""
+"""Frames of several views of the same pings, or their vectors: the portions of a downward-looking sonar's field of view."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.whole_files import FileArray
 
 __all__ = ["ViewFrames"]
 
@@ -32,7 +33,7 @@ class ViewFrames:
     """
 
     kind: str
-    values: dict[str, NDArray[Any]]
+    values: dict[str, FileArray]
     sonars: dict[str, Sonar]
     bearing_rad: dict[str, NDArray[np.float64]]
     time_s: NDArray[np.float64]
@@ -50,7 +51,7 @@ class ViewFrames:
         return len(self.time_s)
 
     def select(self, which: slice) -> Self:
-        """Some of the pings."""
+        """Select some of the pings."""
         return replace(
             self,
             values={view: values[which] for view, values in self.values.items()},
@@ -60,7 +61,7 @@ class ViewFrames:
         )
 
     def profiles(self) -> NDArray[np.float32]:
-        """Sums over the beams ``(views, n, bins)`` float32, in pixels' maxima."""
+        """Sum the images over the beams: ``(views, n, bins)`` float32, in pixels' maxima."""
         scale = {np.dtype(np.uint8): np.float32(1 / 255)}
         whole = [values * scale.get(values.dtype, np.float32(1)) for values in self.values.values()]
         return np.stack([one if self.kind == "vector" else one.sum(axis=-1) for one in whole]).astype(np.float32)

@@ -91,7 +91,8 @@ def test_cells_are_seen_where_they_lie(bearing: str, tilt: tuple[float, float]) 
     radius, b = ground.to_polar(ground.points)
     np.testing.assert_allclose(radius, np.broadcast_to(ground.range_m[:, None], radius.shape), rtol=1e-12)
     np.testing.assert_allclose(b, np.broadcast_to(ground.bearing_rad, b.shape), atol=1e-12)
-    pose = Pose(0, 0, 2.5, *np.radians(tilt), 0.0)
+    pitch, roll = np.radians(tilt)
+    pose = Pose(0, 0, 2.5, pitch, roll, 0.0)
     level = np.concatenate([ground.points, np.full((*radius.shape, 1), -2.5)], axis=-1).reshape(-1, 3)
     s, f, _ = vehicle_rotation(pose).inv().apply(level).T
     wanted = np.arctan2(s, f) if bearing == "azimuth" else np.arcsin(s / np.linalg.norm(level, axis=1))
@@ -113,7 +114,7 @@ def test_a_point_moves_as_poses_do(bearing: str) -> None:
     second = compose(first, motion)
 
     def level(pose: Pose, points: np.ndarray) -> np.ndarray:
-        return vehicle_rotation(pose).inv().apply(points - np.array(pose[:3]))
+        return np.asarray(vehicle_rotation(pose).inv().apply(points - np.array(pose[:3])))
 
     flat = ground.points.reshape(-1, 2)
     world = vehicle_rotation(first).apply(np.column_stack([flat, np.full(len(flat), -2.5)])) + np.array(first[:3])

@@ -1,4 +1,4 @@
-"""Rays by the accuracy wanted: promises hold in closed form, explicit numbers win, the thesis model keeps its own."""
+"""Rays by the accuracy wanted: promises hold in closed form, explicit numbers win, the model thesis keeps its own."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_plain_floor_errs_by_what_is_printed(variant: str, name: str, quality:
 
 
 def test_the_table_is_of_these_presets_and_these_rays() -> None:
-    """Change the law or a preset, and `python benchmarks/bench_quality.py --write` is to be run again."""
+    """After a change of the rule or a preset, run `python benchmarks/bench_quality.py --write`."""
     about, measured = measured_errors()
     assert about.strip()
     assert list(measured) == list(named_sonars())
@@ -140,7 +140,7 @@ def test_rays_follow_again_where_the_geometry_changes() -> None:
 
 
 def test_a_record_keeps_the_numbers_that_it_was_made_with() -> None:
-    """What is stored says all numbers: another law of a later version does not change it."""
+    """A stored sonar has all numbers: another rule of a later version does not change it."""
     stored = Sonar.create(**preset("aris3000").model_dump())
     assert stored == preset("aris3000")
     assert set(RAYS) <= stored.model_fields_set
@@ -192,7 +192,7 @@ def test_an_unknown_quality_in_xml_names_the_nearest(variant: str) -> None:
         mi.load_dict({"type": "imaging_sonar", "quality": "fien"})
 
 
-# ---------------------------------------------------------------- the thesis model
+# ---------------------------------------------------------------- the model thesis
 
 
 @pytest.mark.parametrize("quality", QUALITIES)

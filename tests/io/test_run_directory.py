@@ -26,11 +26,14 @@ KIND = RunKind(
     packages=("numpy", "no-such-package"),
     deciding=("numpy",),
 )
-ASKED = {"sonar": {"beams": 16, "window": (1.0, 2.5)}, "path": Path("a/b"), "poses": np.arange(3)}
+WAYS = ((False, False), (True, False), (False, True))
+"""(resume, overwrite): a run that is there is refused, resumed or replaced."""
+
+ASKED: dict[str, object] = {"sonar": {"beams": 16, "window": (1.0, 2.5)}, "path": Path("a/b"), "poses": np.arange(3)}
 
 
-def begun(path: Path, asked: dict[str, Any] = ASKED, **words: bool) -> RunDirectory:
-    run = RunDirectory.begin(path, KIND, asked, **words)
+def begun(path: Path, asked: dict[str, object] = ASKED, *, resume: bool = False, overwrite: bool = False) -> RunDirectory:
+    run = RunDirectory.begin(path, KIND, asked, resume=resume, overwrite=overwrite)
     run.start(done=0)
     return run
 
@@ -122,11 +125,11 @@ def test_what_a_kill_leaves_before_a_run_has_begun_is_free(tmp_path: Path) -> No
 
 def test_other_things_are_kept(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    for words in ({}, {"resume": True}, {"overwrite": True}):
+    for resume, overwrite in WAYS:
         with pytest.raises(MitsonarError, match=r"holds other things \(thesis.tex\) and is kept as it is: choose"):
-            begun(tmp_path, **words)
+            begun(tmp_path, resume=resume, overwrite=overwrite)
         with pytest.raises(MitsonarError, match="is a file and is kept as it is"):
-            begun(tmp_path / "thesis.tex", **words)
+            begun(tmp_path / "thesis.tex", resume=resume, overwrite=overwrite)
     assert os.listdir(tmp_path) == ["thesis.tex"]
 
 
@@ -134,9 +137,9 @@ def test_runs_of_another_kind_are_kept(tmp_path: Path) -> None:
     other = RunDirectory.begin(tmp_path, RunKind("odometry", outputs=("table.md",), notes={}), {})
     other.start()
     before = (tmp_path / RUN_FILE).read_bytes()
-    for words in ({}, {"resume": True}, {"overwrite": True}):
+    for resume, overwrite in WAYS:
         with pytest.raises(MitsonarError, match="holds no experiment of mitsonar and is kept as it is"):
-            begun(tmp_path, **words)
+            begun(tmp_path, resume=resume, overwrite=overwrite)
     with pytest.raises(MitsonarError, match="holds no experiment"):
         RunDirectory.open(tmp_path, KIND)
     assert (tmp_path / RUN_FILE).read_bytes() == before
@@ -219,9 +222,9 @@ def test_a_count_beyond_what_is_possible_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "[]", "{", "[" * 200_000, '{"kind": ' + "9" * 5000 + "}", "\ufeff{}", "null"])
 def test_text_that_is_no_run_is_one_sentence(tmp_path: Path, text: str) -> None:
     (tmp_path / RUN_FILE).write_text(text)
-    for words in ({}, {"resume": True}, {"overwrite": True}):
+    for resume, overwrite in WAYS:
         with pytest.raises(MitsonarError):
-            begun(tmp_path, **words)
+            begun(tmp_path, resume=resume, overwrite=overwrite)
     assert (tmp_path / RUN_FILE).read_text() == text
 
 

@@ -1,4 +1,4 @@
-"""Poses of ROS, of NED and of mitsonar tell the same: closed forms, round trips, the same picture, and what is warned of."""
+"""Poses of ROS, of NED and of mitsonar agree: closed forms, round trips, the same picture, and what is warned of."""
 
 from __future__ import annotations
 
@@ -216,15 +216,15 @@ def test_hydrophones_may_go_where_they_like_but_not_upside_down(tmp_path: Path) 
         ("mitsonar", "", r"holds no pose: its first line must name the columns"),
         ("mitsonar", "time,x,y,z,qx,qy,qz,qw\n", r"there is no line below the names"),
         ("mitsonar", "x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n", r"has no column time .*its columns must be time_s"),
-        ("mitsonar", "time,x,x_m,y,z,qx,qy,qz,qw\n0,1,1,2,3,0,0,0,1\n", "tells x in 2 columns"),
+        ("mitsonar", "time,x,x_m,y,z,qx,qy,qz,qw\n0,1,1,2,3,0,0,0,1\n", "has x in 2 columns"),
         (
             "mitsonar",
             "time,x,y,z,roll,pitch,heading\n0,1,2,3,0,0,0\n",
             "the column pitch has no unit; name it pitch_deg",
         ),
         ("mitsonar", "time,x,y,z,roll_deg,pitch_deg\n0,1,2,3,0,0\n", r"has no column heading .*heading_deg"),
-        ("mitsonar", "time,x,y,z,roll_deg,roll_rad,pitch_deg,yaw_deg\n0,1,2,3,0,0,0,0\n", "tells roll in 2 columns"),
-        ("mitsonar", "time,x,y,z,qx,qy,qz,qw,yaw_deg\n0,1,2,3,0,0,0,1,0\n", "tells the attitude twice, qx and yaw_deg"),
+        ("mitsonar", "time,x,y,z,roll_deg,roll_rad,pitch_deg,yaw_deg\n0,1,2,3,0,0,0,0\n", "has roll in 2 columns"),
+        ("mitsonar", "time,x,y,z,qx,qy,qz,qw,yaw_deg\n0,1,2,3,0,0,0,1,0\n", "has the attitude twice, qx and yaw_deg"),
         ("mitsonar", "time,x,y,z,qx,qy,qz\n0,1,2,3,0,0,0\n", "has no column qw"),
         ("mitsonar", "time,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,0\n", r"line 2: expected finite numbers .*quaternion of zero"),
         ("mitsonar", "time,x,y,z,qx,qy,qz,qw\n0,1,2,nan,0,0,0,1\n", "line 2: expected finite numbers"),

@@ -1,4 +1,4 @@
-"""Pose, motion and trajectory: the conventions of SPEC.md section 1, eq. 3.4, and TUM files."""
+"""Pose, motion and trajectory: their conventions, eq. 3.4, and TUM files."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_compose_is_equation_3_4() -> None:
 
 
 def test_old_and_new_heading_differ_by_less_than_a_fifth_of_a_millimetre() -> None:
-    """SPEC.md, section 1: by up to 0.16 mm at 20 mm and 0.45 deg a frame."""
+    """By up to 0.16 mm at 20 mm and 0.45 deg a frame."""
     turn = np.radians(0.45)
     new = np.array(compose(Pose(0, 0, 0), Motion(0, 0.02, turn))[:2])
     assert np.linalg.norm(new - [0, 0.02]) == pytest.approx(0.157e-3, rel=0.01)
@@ -235,7 +235,8 @@ def test_motions_invert_compose() -> None:
     pose, poses, driven = Pose(3.0, -2.0, 2.5, 0.6, 0.1, np.pi - 0.01), [], []
     poses.append(pose)
     for _ in range(60):
-        motion = Motion(*rng.uniform(-0.02, 0.02, 2), rng.uniform(-0.02, 0.05))
+        sideways, forward = rng.uniform(-0.02, 0.02, 2)
+        motion = Motion(sideways, forward, rng.uniform(-0.02, 0.05))
         pose = compose(pose, motion)
         pose = pose._replace(heading=(pose.heading + np.pi) % (2 * np.pi) - np.pi)
         poses.append(pose)
@@ -253,7 +254,7 @@ def test_a_mount_is_a_pose_in_the_vehicles_axes() -> None:
     sideways = Pose(*mounted(vehicle, Pose(0, 0, 0, np.radians(35), 0, RIGHT_ANGLE))[0])
     np.testing.assert_allclose(np.degrees([sideways.pitch, sideways.heading]), [35, 120], atol=1e-9)
     np.testing.assert_allclose(axes(sideways)[1] @ starboard, np.cos(np.radians(35)), atol=1e-12)
-    # straight down with its azimuth fore-aft: bearing grows forward, elevation to port (SPEC.md, section 2)
+    # straight down with its azimuth fore-aft: bearing grows forward, elevation to port
     down = Pose(*mounted(vehicle, Pose(0, 0, 0, RIGHT_ANGLE, 0, -RIGHT_ANGLE))[0])
     got = sensor_axes(down)
     np.testing.assert_allclose(got[0], forward, atol=1e-9)

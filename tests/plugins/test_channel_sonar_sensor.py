@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import MitsubaDict
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, four_receivers
@@ -22,7 +23,7 @@ def test_taps_of_the_thesis(band: tuple[float, float], taps: int) -> None:
 
 @pytest.mark.parametrize("rolloff", [0.0, 0.25, 0.5, 1.0])
 def test_raised_cosine_and_pulse_are_one(rolloff: float) -> None:
-    """Eq. 5.16 as mended, and its inverse transform in closed form; at alpha = 0 the sum over frequencies ends abruptly."""
+    """Eq. 5.16, corrected, and its inverse transform in closed form; at alpha = 0 the sum over frequencies ends abruptly."""
     sonar = ChannelSonar(bandwidth_hz=4e3, rolloff=rolloff)
     frequency = np.fft.fftfreq(160_000, 1 / 8000)
     shape = sonar.raised_cosine(frequency)
@@ -68,7 +69,7 @@ def test_sensitivity_falls_smoothly_to_the_edges() -> None:
     assert at(FieldOfView(shape="all"), 170, 80) == 1
 
 
-BAD: list[tuple[dict[str, Any], str]] = [
+BAD: list[tuple[MitsubaDict, str]] = [
     ({"carrier_hz": 0}, "carrier_hz must exceed half the band"),
     ({"carrier_hz": 3000}, "carrier_hz must exceed half the band"),
     ({"bandwidth_hz": 9.6e3}, r"sampling_hz must be at least \(1 \+ rolloff\) bandwidth_hz = 14400 Hz"),
@@ -86,7 +87,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("fields", "said"), BAD)
-def test_bad_values_are_one_sentence(fields: dict[str, Any], said: str) -> None:
+def test_bad_values_are_one_sentence(fields: MitsubaDict, said: str) -> None:
     with pytest.raises(MitsonarError, match=said) as error:
         ChannelSonar.create(**fields)
     assert "\n" not in str(error.value).strip()

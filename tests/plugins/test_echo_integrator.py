@@ -8,21 +8,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import box, diffuse, floor, sphere
+from helpers import MitsubaDict, box, diffuse, floor, sphere
 
 from mitsonar.records.echoes import CHANNELS
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def camera(origin: tuple[float, ...] = (0, 0, 3), target: tuple[float, ...] = (0, 3, 0), **more: Any) -> dict[str, Any]:
+def camera(origin: tuple[float, ...] = (0, 0, 3), target: tuple[float, ...] = (0, 3, 0), **more: Any) -> MitsubaDict:
     """A perspective camera of 24 x 16 pixels."""
     film = {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     look = mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 0, 1])
     return {"type": "perspective", "fov": 60, "to_world": look, "film": film, **more}
 
 
-def channels(sensor: dict[str, Any], **shapes: dict[str, Any]) -> dict[str, np.ndarray]:
+def channels(sensor: MitsubaDict, **shapes: MitsubaDict) -> dict[str, np.ndarray]:
     """What `echo` records, by name, each ``(height, width)``; ``film`` is the film's own channel."""
     loaded = mi.load_dict({"type": "scene", "integrator": {"type": "echo"}, "sensor": sensor, **shapes})
     assert tuple(loaded.integrator().aov_names()) == CHANNELS

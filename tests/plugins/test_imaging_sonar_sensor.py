@@ -1,25 +1,29 @@
-"""The sensor `imaging_sonar`: its film, the law of its rays against plain NumPy, its jitter, its solid angles."""
+"""The sensor `imaging_sonar`: its film, the directions of its rays against plain NumPy, its jitter, its solid angles."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import angles, axes, cells, direction
+from helpers import MitsubaDict, angles, axes, cells, direction
 from scipy import stats
 
+from mitsonar.arrays import DeviceArray
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import preset
 from mitsonar.motion.pose import Pose, to_world_matrices
+
+if TYPE_CHECKING:
+    from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 POSE = Pose(1.0, -2.0, 3.0, 0.4, -0.2, 2.1)
 
-KINDS = {
+KINDS: dict[str, MitsubaDict] = {
     "azimuth": {"bearing": "azimuth"},
     "cone": {"bearing": "cone"},
     "azimuth, narrow beams": {"bearing": "azimuth", "beam_width_deg": 1.1},
@@ -29,11 +33,12 @@ KINDS = {
 }
 
 
-def sensor(pose: Pose = POSE, **fields: Any) -> mi.Sensor:
+def sensor(pose: Pose = POSE, **fields: Any) -> ImagingSonar:
     """A sensor of 8 beams, 100 x 60 deg, at a pose."""
     given = {"azimuth_fov_deg": 100.0, "elevation_fov_deg": 60.0, "beams": 8, "rays_per_beam": 12}
     given |= {"rays_across": 4, **fields}
-    return mi.load_dict({"type": "imaging_sonar", "to_world": mi.ScalarTransform4f(to_world_matrices(pose)[0]), **given})
+    to_world = mi.ScalarTransform4f(to_world_matrices(pose)[0])
+    return cast("ImagingSonar", mi.load_dict({"type": "imaging_sonar", "to_world": to_world, **given}))
 
 
 def rays(source: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +46,9 @@ def rays(source: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     width, height = source.film().size()
     index = dr.arange(mi.UInt32, width * height)
     place = mi.Point2f((mi.Float(index % width) + 0.5) / width, (mi.Float(index // width) + 0.5) / height)
-    ray, weight = source.sample_ray_differential(0, 0.5, place, mi.Point2f(0.5))
+    time: DeviceArray = 0
+    half: DeviceArray = 0.5
+    ray, weight = source.sample_ray_differential(time, half, place, mi.Point2f(0.5))
     assert (np.array(weight) == 1).all()
     return np.broadcast_to(np.array(ray.o).T, (width * height, 3)), np.array(ray.d).T
 
@@ -51,7 +58,7 @@ def local(world: np.ndarray, pose: Pose = POSE) -> np.ndarray:
     return np.asarray(world @ np.array(axes(pose)).T)
 
 
-def fan(source: mi.Sensor) -> Any:
+def fan(source: ImagingSonar) -> Fan:
     """The sensor's own record of all its rays."""
     width, height = source.film().size()
     index = dr.arange(mi.UInt32, width * height)
@@ -62,7 +69,7 @@ def fan(source: mi.Sensor) -> Any:
 
 
 def test_properties_are_those_of_a_sonar() -> None:
-    fields: dict[str, Any] = {
+    fields: MitsubaDict = {
         **{"azimuth_fov_deg": 33.0, "elevation_fov_deg": 9.0, "beams": 5, "rays_per_beam": 7, "range_min": 1.5},
         **{"range_max": 2.5, "range_bins": 11, "sound_speed": 1480.0, "bearing": "cone", "beam_layout": "sine"},
         **{"beam_width_deg": 0.7, "rays_across": 3, "jitter": False, "seed": 4, "model": "thesis"},
@@ -92,7 +99,7 @@ def test_film_follows_from_beams_and_rays(model: str, size: tuple[int, int]) -> 
     assert film.rfilter().is_box_filter()
 
 
-def film(width: int, height: int, rfilter: str = "box", **more: Any) -> dict[str, Any]:
+def film(width: int, height: int, rfilter: str = "box", **more: Any) -> MitsubaDict:
     return {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": rfilter}, **more}
 
 
@@ -100,7 +107,7 @@ def test_film_that_agrees_is_taken() -> None:
     assert tuple(sensor(film=film(32, 12)).film().size()) == (32, 12)
 
 
-CROP = {"crop_width": 8, "crop_height": 12, "crop_offset_x": 0, "crop_offset_y": 0}
+CROP: MitsubaDict = {"crop_width": 8, "crop_height": 12, "crop_offset_x": 0, "crop_offset_y": 0}
 
 
 @pytest.mark.parametrize(
@@ -117,19 +124,19 @@ CROP = {"crop_width": 8, "crop_height": 12, "crop_offset_x": 0, "crop_offset_y":
         ({"to_world": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}, r"only turn and move"),
     ],
 )
-def test_contradictions_are_errors_that_say_so(fields: dict[str, Any], message: str) -> None:
+def test_contradictions_are_errors_that_say_so(fields: MitsubaDict, message: str) -> None:
     if "to_world" in fields:
         fields = {"to_world": mi.ScalarTransform4f(fields["to_world"])}
     with pytest.raises(RuntimeError, match=message):
         sensor(**fields)
 
 
-# ---------------------------------------------------------------- the law of the rays
+# ---------------------------------------------------------------- directions of the rays
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_directions_follow_the_law(kind: str) -> None:
-    """SPEC.md, section 1: d by azimuth or cone, rays at the middle of their cells, row 0 highest, column 0 most to port."""
+def test_directions_follow_the_formulas(kind: str) -> None:
+    """The direction d follows azimuth or cone, rays at the middle of their cells, row 0 highest, column 0 most to port."""
     source = sensor(**KINDS[kind], jitter=False)
     bearing, elevation = cells(source.sonar)
     _, d = rays(source)
@@ -144,7 +151,7 @@ def test_port_is_left_and_up_is_above() -> None:
     assert (np.diff(d[:, :, 2], axis=0) < 0).all()  # down with the row
 
 
-def place_in_cell(source: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
+def place_in_cell(source: ImagingSonar) -> tuple[np.ndarray, np.ndarray]:
     """Where each ray is in its cell, 0..1 across and along, ``(rays over elevation, rays across)``."""
     sonar = source.sonar
     size = (sonar.beam_width_rad / sonar.across, np.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam)
@@ -191,7 +198,7 @@ def test_jitter_is_another_draw_each_ping_and_repeats_with_the_seed() -> None:
 
 @pytest.mark.parametrize("jitter", [True, False])
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
-def test_edges_and_middle_of_the_cell_are_told_from_the_ray(bearing: str, jitter: bool) -> None:
+def test_edges_and_middle_of_the_cell_follow_from_the_ray(bearing: str, jitter: bool) -> None:
     source = sensor(bearing=bearing, jitter=jitter)
     bearing_of_cell, elevation_of_cell = cells(source.sonar)
     got = fan(source)
@@ -213,18 +220,18 @@ def test_solid_angles_add_up_to_that_of_the_field_of_view(bearing: str, jitter: 
     cell = np.array(fan(source).solid_angle) + np.zeros(source.sonar.rays)
     assert cell.sum(dtype=float) == pytest.approx(total, rel=1e-6)
     b, e = cells(source.sonar)
-    law = np.cos(e) if bearing == "azimuth" else np.cos(b)
-    np.testing.assert_allclose(cell / cell.max(), law / law.max(), rtol=1e-6)
+    factor = np.cos(e) if bearing == "azimuth" else np.cos(b)
+    np.testing.assert_allclose(cell / cell.max(), factor / factor.max(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("jitter", [True, False])
 @pytest.mark.parametrize("kind", ["azimuth", "cone", "cone, sine layout"])
 def test_lift_and_side_are_the_derivatives(kind: str, jitter: bool) -> None:
-    """Against central differences of the law in float64, at the rays' own angles."""
+    """Against central differences of the formulas in float64, at the rays' own angles."""
     source = sensor(**KINDS[kind], jitter=jitter)
     got, sonar, step = fan(source), source.sonar, 1e-4
 
-    def seen(vector: Any) -> np.ndarray:  # sensor axes (port, up, forward) to (starboard, forward, up)
+    def seen(vector: DeviceArray) -> np.ndarray:  # sensor axes (port, up, forward) to (starboard, forward, up)
         port, up, forward = (np.array(axis) + np.zeros(sonar.rays) for axis in vector)
         return np.stack([-port, forward, up], axis=1)
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import box, diffuse, floor, place_of, scene, sphere
+from helpers import MitsubaDict, box, diffuse, floor, place_of, scene, sphere
+
+if TYPE_CHECKING:
+    from mitsonar.plugins.surfaces import Surfaces
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 
-def surfaces(loaded: mi.Scene) -> Any:
+def surfaces(loaded: mi.Scene) -> Surfaces:
     from mitsonar.plugins.surfaces import Surfaces
 
     return Surfaces.of(loaded)
@@ -44,13 +47,13 @@ def assert_same_as_mitsuba(loaded: mi.Scene, ray: mi.Ray3f | None = None, least:
         if shape.bsdf() is not None:
             seen = np.array(si.shape == mi.ShapePtr(shape)) & valid
             assert (np.array(hit.shape_id)[seen] == number).all(), shape.id()
-    return reflectivity
+    return np.asarray(reflectivity)
 
 
 # ---------------------------------------------------------------- the rule for BSDFs
 
 DIELECTRIC = {"type": "dielectric"}
-RULE: dict[str, tuple[dict[str, Any], float, str]] = {
+RULE: dict[str, tuple[MitsubaDict, float, str]] = {
     "diffuse": (diffuse(0.3), 0.3, ""),
     "twosided": ({"type": "twosided", "b": diffuse(0.35)}, 0.35, ""),
     "plastic": ({"type": "plastic", "diffuse_reflectance": 0.25}, 0.25, ""),
@@ -103,7 +106,7 @@ def test_reflectivity_stays_within_0_and_1() -> None:
 # ---------------------------------------------------------------- the same as Mitsuba
 
 
-def smooth_bitmap() -> dict[str, Any]:
+def smooth_bitmap() -> MitsubaDict:
     values = np.random.default_rng(5).random((8, 8, 1), dtype=np.float32)
     return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "wrap_mode": "mirror"}
 
@@ -138,7 +141,7 @@ def sheet(attribute: str, centre: float = 0.0) -> mi.Mesh:
     properties["bsdf"] = mi.load_dict(diffuse({"type": "mesh_attribute", "name": attribute}))
     mesh = mi.Mesh("sheet", vertex_count=x.size, face_count=len(faces), has_vertex_normals=True, props=properties)
     values = np.random.default_rng(6).random(len(faces) if attribute.startswith("face") else x.size, dtype=np.float32)
-    mesh.add_attribute(attribute, 1, values)
+    mesh.add_attribute(attribute, 1, values)  # type: ignore[arg-type]  # the stubs know no NumPy arrays here
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.column_stack([x.ravel() + centre, y.ravel(), z.ravel()]).astype(np.float32).ravel()
     parameters["faces"] = faces.astype(np.uint32).ravel()

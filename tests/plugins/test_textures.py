@@ -8,18 +8,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import diffuse, scene
+from helpers import MitsubaDict, diffuse, scene
+from numpy.typing import ArrayLike
 from scipy import stats
+
+from mitsonar.arrays import DeviceArray
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 Z = 4.5
-"""Bound of all z-tests: seeds are fixed, so a right law fails never or always; one in 150,000 seeds."""
+"""Bound of all z-tests: seeds are fixed, so a right distribution fails never or always; one in 150,000 seeds."""
 
 
-def at(texture: mi.Texture, *, uv: Any = None, p: Any = None, active: Any = True) -> np.ndarray:
+def at(
+    texture: mi.Texture, *, uv: ArrayLike | None = None, p: ArrayLike | None = None, active: DeviceArray = True
+) -> np.ndarray:
     """Values at uv ``(n, 2)`` or positions ``(n, 3)``."""
-    si = dr.zeros(mi.SurfaceInteraction3f, len(uv if uv is not None else p))
+    si = dr.zeros(mi.SurfaceInteraction3f, len(np.asarray(uv if uv is not None else p)))
     if uv is not None:
         si.uv = mi.Point2f(*np.asarray(uv, np.float32).T)
     if p is not None:
@@ -28,7 +33,9 @@ def at(texture: mi.Texture, *, uv: Any = None, p: Any = None, active: Any = True
 
 
 def texture(kind: str, **properties: Any) -> mi.Texture:
-    return mi.load_dict({"type": kind, **properties})
+    loaded = mi.load_dict({"type": kind, **properties})
+    assert isinstance(loaded, mi.Texture)
+    return loaded
 
 
 def grid(count: int, step: float, start: float = 0.5) -> np.ndarray:
@@ -234,7 +241,7 @@ def test_all_ways_to_ask_agree(kind: str) -> None:
     one = np.array(source.eval_1(si))
     np.testing.assert_array_equal(np.array(source.eval(si)).ravel(), one)
     np.testing.assert_array_equal(np.array(source.eval_3(si)), np.tile(one, (3, 1)))
-    active = mi.Bool(np.arange(100) % 2 == 0)
+    active: DeviceArray = mi.Bool(np.arange(100) % 2 == 0)
     np.testing.assert_array_equal(np.array(source.eval_1(si, active)), np.where(np.arange(100) % 2 == 0, one, 0))
     assert source.is_spatially_varying()
 
@@ -255,7 +262,7 @@ def test_all_ways_to_ask_agree(kind: str) -> None:
         ("perlin", {"low": -0.1}, r"low -0\.1"),
     ],
 )
-def test_bad_properties(kind: str, properties: dict[str, Any], message: str) -> None:
+def test_bad_properties(kind: str, properties: MitsubaDict, message: str) -> None:
     with pytest.raises(RuntimeError, match=message):
         texture(kind, **properties)
 

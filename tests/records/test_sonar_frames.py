@@ -99,7 +99,7 @@ def test_select_takes_frames_from_every_field() -> None:
 
 
 def test_pitch_is_known_where_poses_are() -> None:
-    np.testing.assert_array_equal(frames().pitch_rad, frames().poses[:, 3])  # type: ignore[arg-type, index]
+    np.testing.assert_array_equal(frames().pitch_rad, frames().poses[:, 3])  # type: ignore[index]
     assert frames(poses=None).pitch_rad is None
 
 
