@@ -83,8 +83,10 @@ class ReceiverTracer:
             place = bearing * (sonar.beams / (2 * half)) + sonar.beams / 2
         else:
             place = dr.sin(bearing) * (sonar.beams / (2 * math.sin(half))) + sonar.beams / 2
-        inside = (place >= 0) & (place < sonar.beams) & (dr.abs(bearing) <= half)
-        inside &= dr.abs(elevation) <= math.radians(sonar.elevation_fov_deg) / 2
+        aside: DeviceArray = dr.abs(bearing)
+        lift: DeviceArray = dr.abs(elevation)
+        inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
+        inside &= lift <= math.radians(sonar.elevation_fov_deg) / 2
         beam = mi.UInt32(dr.select(inside, place, 0))
         if sonar.beam_width_deg is not None and sonar.model == "physical":
             axes = mi.Float(sonar.bearing_rad.tolist())

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,7 +166,7 @@ def _check(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
     """
     sizes = {"pings": pings, "receivers": len(sonar.receivers), "taps": sonar.taps, "four": 4, "six": 6}
     for name, column in COLUMNS.items():
-        array = group[name]
+        array = cast("zarr.Array[Any]", group[name])
         check_column(array, name, column, sizes, str(group.store_path))
         if array.chunks != ((1, *array.shape[1:]) if array.ndim > 2 else array.shape):
             raise ValueError(f"{name} is cut into pieces of {array.chunks}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,16 +44,14 @@ def box() -> trimesh.Trimesh:
     """Return a cube of 48 triangles, eight a side."""
     import trimesh
 
-    cube: trimesh.Trimesh = trimesh.creation.box().subdivide()
-    return cube
+    return cast("trimesh.Trimesh", trimesh.creation.box().subdivide())
 
 
 def slab() -> trimesh.Trimesh:
     """Return a cube of 12 triangles."""
     import trimesh
 
-    cube: trimesh.Trimesh = trimesh.creation.box()
-    return cube
+    return cast("trimesh.Trimesh", trimesh.creation.box())
 
 
 def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:

@@ -28,8 +28,8 @@ __all__ = ["ShipHull"]
 class ShipHull(Family):
     """The bottom of a ship, laid flat (Almanza-Medina, 3.2.2).
 
-    It has groups of elliptical tubes side by side, and sacrificial anodes. The anodes are elliptical too; their cross-section
-    faces the sonar. Both are attached to the plate z = 0.
+    It has groups of elliptical tubes side by side, and sacrificial anodes. The anodes are elliptical too, with their
+    cross-section towards the sonar. Both are attached to the plate z = 0.
     """
 
     size_m: float = Field(20.0, gt=0, le=10_000, description="edge of the square plate [m] (ours)")
