@@ -245,8 +245,8 @@ class Recipe(_Part):
         other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []
         if other:
             raise MitsonarError(
-                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers say where they are "
-                "and look themselves"
+                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers have their own "
+                "positions and fields of view"
             )
 
     @cached_property

@@ -51,7 +51,7 @@ def empty_frames(
 
 
 def view_of(pose: NDArray[np.float64]) -> str:
-    """Where a sonar is and where it looks, in words."""
+    """Describe position and view direction of a sonar in words."""
     forward = vehicle_rotation(pose).apply([0.0, 1.0, 0.0])[0]
     below = math.degrees(math.asin(float(np.clip(-forward[2], -1, 1))))
     level = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -73,7 +73,7 @@ def run_impulse(
     velocity: NDArray[np.float64],
     folder: str | Path,
     *,
-    origin: dict[str, Any],
+    origin: Mapping[str, object],
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[int], None] = lambda pings: None,
@@ -152,7 +152,7 @@ def _make(
             progress(len(part))
     except MitsonarError:
         raise
-    except Exception as error:  # a damaged Zarr raises whatever its bytes lead to
+    except Exception as error:  # a damaged Zarr store raises errors of any type
         raise MitsonarError(f"cannot go on with {url}: {error}; make it again with --overwrite") from None
     return ImpulseResponses.load(url)
 

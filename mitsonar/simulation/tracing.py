@@ -52,7 +52,7 @@ class Rays:
     def numbered(sonar: Sonar, pings: int) -> mi.UInt32:
         """Return 0, 1, 2 ... for all rays of a launch, evaluated: the width of a frozen launch follows from its inputs.
 
-        Without an input as wide as the launch, Dr.Jit 1.5 infers the width from whatever input divides it, the
+        Without an input as wide as the launch, Dr.Jit 1.5 infers the width from any input that divides it, the
         data of virtual calls too, and a replay can lose rays.
         """
         index = dr.arange(mi.UInt32, pings * sonar.rays)

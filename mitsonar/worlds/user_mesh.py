@@ -167,7 +167,7 @@ def _pieces(path: Path, value: str | float) -> list[_Piece]:
     geometries = _geometries(path)
     try:
         return [_piece(geometry, value) for geometry in geometries]
-    except Exception as error:  # colours and pictures lead to whatever their bytes do
+    except Exception as error:  # damaged colours and pictures raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read the colours of {path}: {reason}; export the model again") from None
 
@@ -195,7 +195,7 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
                 raise ValueError("a vertex or a triangle has not three numbers")
             if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
                 raise ValueError("a triangle names a vertex that is not there")
-    except Exception as error:  # readers raise whatever the bytes lead them to
+    except Exception as error:  # readers of damaged files raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
     if not found:

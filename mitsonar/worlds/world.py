@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import Annotated, overload
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -132,7 +132,7 @@ class Mesh:
         vertex = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
         if self.uv is not None:
             vertex |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
-        face: dict[str, NDArray[Any]] = {}
+        face: dict[str, NDArray[np.number]] = {}
         if self.reflectivity is not None:
             face["reflectivity_0"] = self.reflectivity
         if self.object_id is not None:
@@ -146,8 +146,8 @@ class Mesh:
             points[name] = values
         corners = np.empty(len(self.faces), [("count", "u1"), ("corners", "<i4", 3), *((name, "<f4") for name in face)])
         corners["count"], corners["corners"] = 3, self.faces
-        for name, values in face.items():
-            corners[name] = values
+        for name, column in face.items():
+            corners[name] = column
         return "\n".join([*head, "end_header", ""]).encode() + points.tobytes() + corners.tobytes()
 
     def xml(self) -> str:
