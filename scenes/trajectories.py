@@ -1,6 +1,6 @@
 """Make the trajectories to fly in the shipped scenes (TUM files); each begins where its scene's own sonar is.
 
-Run `python trajectories.py .` in this folder after a change; `--quick` only tells whether they are what is shipped.
+Run `python trajectories.py .` in this folder after a change; `--quick` only compares them with the shipped ones.
 """
 
 import argparse
@@ -14,12 +14,12 @@ from mitsonar import Pose, Trajectory
 
 
 def pose(x: float, y: float, z: float, pitch_deg: float, heading_deg: float = 0.0) -> Pose:
-    """A pose without roll [m, deg]."""
+    """Return a pose without roll [m, deg]."""
     return Pose.from_degrees((x, y, z, pitch_deg, 0, heading_deg))
 
 
 def arc(centre: tuple[float, float], start: Pose, turn_deg: float, frames: int, rate_hz: float) -> Trajectory:
-    """Around a point [m], clockwise seen from above for a turn above 0, with an unchanged view of it."""
+    """Return an arc around a point [m], clockwise from above for a turn above 0, with the point always ahead."""
     turn = np.radians(np.linspace(0, turn_deg, frames))
     x, y = start.x - centre[0], start.y - centre[1]
     poses = np.tile(start, (frames, 1))
@@ -30,32 +30,32 @@ def arc(centre: tuple[float, float], start: Pose, turn_deg: float, frames: int, 
 
 
 def flat_floor() -> Trajectory:
-    """0.8 m ahead and 0.3 m down."""
+    """Return a path 0.8 m ahead and 0.3 m down."""
     return Trajectory.between(pose(0, 0, 2.5, 35), pose(0, 0.8, 2.2, 35), 30, 10)
 
 
 def pattern() -> Trajectory:
-    """Run 2 of Almanza-Medina, section 2.3: 5 m sideways and 2.3 m forward; about every fifth of its 300 frames."""
+    """Return run 2 of Almanza-Medina, 2.3: 5 m sideways and 2.3 m forward; about every fifth of its 300 frames."""
     return Trajectory.between(pose(-2.5, -4.85, 2.5, 35), pose(2.5, -2.55, 2.5, 35), 60, 21 / 5)
 
 
 def objects() -> Trajectory:
-    """Sideways along the row: cannon, barrel, boat."""
+    """Return a path sideways along the row: cannon, barrel, boat."""
     return Trajectory.between(pose(-3.4, -4.6, 2.2, 25), pose(3.4, -4.6, 2.2, 25), 60, 21 / 5)
 
 
 def sunken_ship() -> Trajectory:
-    """An eighth of a circle from the ship's port side to its bow."""
+    """Return an eighth of a circle from the ship's port side to its bow."""
     return arc((0.7, -1.0), pose(2.2, 20.45, 14, 34, 184), 45, 45, 2)
 
 
 def observatory() -> Trajectory:
-    """A sixth of a circle around the node."""
+    """Return a sixth of a circle around the node."""
     return arc((0.0, 0.0), pose(0, -13.5, 7, 32), 60, 45, 2)
 
 
 def hydrophones() -> Trajectory:
-    """1 m ahead and 0.5 m to starboard, for the imaging sonar; hydrophones fly courses (`mitsonar impulse`)."""
+    """Return a path 1 m ahead and 0.5 m to starboard, for the imaging sonar; `mitsonar impulse` flies courses."""
     return Trajectory.between(pose(0, 0, 2.5, 35), pose(0.5, 1.0, 2.5, 35), 45, 10)
 
 

@@ -1,1 +1,1 @@
-"""What a recipe may say, of data sets and of trainings; pure data."""
+"""Keys of recipes of data sets and trainings, checked; pure data."""

@@ -1,4 +1,4 @@
-"""What a data set is: a small YAML file, checked; the thesis's own are shipped."""
+"""Recipes of data sets: small YAML files, checked. Those of Almanza-Medina's data sets are shipped."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import math
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
+from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
 from mitsonar.io.provenance import digest
-from mitsonar.io.whole_files import read_yaml
 from mitsonar.motion.pose import Pose
 from mitsonar.worlds.families import create_family
 from mitsonar.worlds.world import Family, Interval
@@ -30,8 +30,6 @@ __all__ = [
     "Split",
     "array_names",
     "load_recipe",
-    "recipe_fields",
-    "set_key",
     "shipped_recipes",
     "split_from",
 ]
@@ -45,11 +43,11 @@ _Made = TypeVar("_Made", bound=_Part)
 
 
 class Scenes(_Part):
-    """Some scenes of one kind, each drawn from a seed of its own."""
+    """A group of scenes of one kind; each has its own seed."""
 
     count: int = Field(1, ge=1, le=100_000, description="how many scenes")
     sequences: int = Field(ge=1, le=10**7, description="sequences in each")
-    world: dict[str, Any] = Field(default_factory=dict, description="numbers of the world that are these scenes' own")
+    world: Keys = Field(default_factory=dict, description="numbers of the world that differ in these scenes")
 
 
 class Mount(_Part):
@@ -64,7 +62,7 @@ class Mount(_Part):
 
     @property
     def pose(self) -> Pose:
-        """In metres and radians."""
+        """Return the pose in metres and radians."""
         return Pose(
             self.starboard_m,
             self.forward_m,
@@ -74,7 +72,7 @@ class Mount(_Part):
 
 
 RESERVED = ("frames", "label")
-"""What samples hold beside their views."""
+"""Names that samples use beside those of their views."""
 
 
 def _fits_name(name: str) -> str:
@@ -86,10 +84,10 @@ def _fits_name(name: str) -> str:
 
 
 class ReceiverSpec(Mount):
-    """A receiver beside the transmitter: its pose in the transmitter's axes, and what differs from its sonar."""
+    """A receiver beside the transmitter: its pose in the transmitter's axes, and keys of its sonar that differ."""
 
     name: Annotated[str, AfterValidator(_fits_name)]
-    sonar: dict[str, Any] = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
+    sonar: Keys = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
 
 
 def _from_0(pair: tuple[float, float]) -> tuple[float, float]:
@@ -103,7 +101,7 @@ _Angle = Annotated[float, Field(gt=0, le=180)]
 
 
 class Flight(_Part):
-    """How the vehicle moves: sequences of pings at a constant rate, with jumps between, or named runs."""
+    """Motion of the vehicle: sequences of pings at a constant rate with jumps between them, or named runs."""
 
     kind: Literal["random", "runs"] = Field("random", description="random sequences, or the runs of chapters 2 and 4")
     height_m: Interval | float = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
@@ -121,12 +119,12 @@ class Flight(_Part):
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Lowest and highest [m]."""
+        """Return lowest and highest height [m]."""
         return (self.height_m, self.height_m) if isinstance(self.height_m, float | int) else self.height_m
 
 
 class Split(_Part):
-    """Which frames are for training, validation and test, unless a reader asks for others."""
+    """Division of the frames into training, validation and test, unless a reader asks for another."""
 
     by: Literal["sequence", "scene", "sample"] = Field(
         "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks: to show it only"
@@ -146,26 +144,26 @@ class Split(_Part):
 
     @property
     def unseen(self) -> str:
-        """The part that is neither learnt from nor, where there is another, chosen by."""
+        """Return the part for evaluation: test where there is one, else validation."""
         return "test" if self.test > 0 else "validation"
 
 
 class Recipe(_Part):
-    """A data set. Angles in degrees and motions in millimetres (the edge of the program), all else SI.
+    """A data set. Angles are in degrees and motions in millimetres; all other values are SI.
 
-    Keys: docs/guides/data-sets.md.
+    The keys are documented in docs/guides/data-sets.md.
 
     Raises:
-        MitsonarError: through :func:`load_recipe`, for an unknown key or a value outside its limits.
+        MitsonarError: through :func:`load_recipe`, an unknown key or a value outside its limits.
     """
 
     name: str = Field("custom", description="what the data set is called")
     about: str = Field("", description="a sentence on it")
     seed: int = Field(0, ge=0, lt=2**31, description="of worlds, flights and jitter")
-    world: dict[str, Any] = Field(description="family of the world, and numbers of it")
+    world: Keys = Field(description="family of the world, and numbers of it")
     scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
-    sonar: dict[str, Any] | None = Field(None, description="preset and keys of docs/guides/sonars.md")
-    channel: dict[str, Any] | None = Field(None, description="for responses: keys of docs/guides/impulse-responses.md")
+    sonar: Keys | None = Field(None, description="preset and keys of docs/guides/sonars.md")
+    channel: Keys | None = Field(None, description="for responses: keys of docs/guides/impulse-responses.md")
     mount: Mount = Field(
         default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; of a channel none"
     )
@@ -185,10 +183,11 @@ class Recipe(_Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _level(cls, fields: Any) -> Any:
-        """A channel sonar stands as its vehicle does."""
-        receives = isinstance(fields, dict) and fields.get("channel") is not None
-        return {"mount": Mount(), **fields} if receives else fields
+    def _level(cls, fields: object) -> object:
+        """Give a channel sonar the attitude of its vehicle."""
+        if isinstance(fields, dict) and fields.get("channel") is not None:
+            return {"mount": Mount(), **fields}
+        return fields
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -214,10 +213,10 @@ class Recipe(_Part):
         return self
 
     def _check_images(self) -> None:
-        """What belongs to images.
+        """Check the keys of images.
 
         Raises:
-            MitsonarError: keys that contradict each other.
+            MitsonarError: keys contradict each other.
         """
         if len({view.name for view in self.views}) < len(self.views):
             raise MitsonarError(f"receivers and segments must have names of their own: got {[v.name for v in self.views]}")
@@ -227,10 +226,10 @@ class Recipe(_Part):
             raise MitsonarError("labels are pixels: store images or both with them")
 
     def _check_responses(self) -> None:
-        """What belongs to responses.
+        """Check the keys of responses.
 
         Raises:
-            MitsonarError: a key of the instrument that cannot be, or keys that only images have.
+            MitsonarError: a key of the instrument is not valid, or a key belongs to images.
         """
         self.channel_sonar  # noqa: B018
         plain = {
@@ -246,16 +245,16 @@ class Recipe(_Part):
         other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []
         if other:
             raise MitsonarError(
-                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers say where they are "
-                "and look themselves"
+                f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers have their own "
+                "positions and fields of view"
             )
 
     @cached_property
     def instrument(self) -> Sonar:
-        """The sonar (of a bistatic set: the transmitter).
+        """Return the sonar; of a bistatic data set, the transmitter.
 
         Raises:
-            MitsonarError: a data set of impulse responses.
+            MitsonarError: it is a data set of impulse responses.
         """
         if self.sonar is None:
             raise MitsonarError(
@@ -266,10 +265,10 @@ class Recipe(_Part):
 
     @cached_property
     def channel_sonar(self) -> ChannelSonar:
-        """The transmitter and receivers of a data set of impulse responses.
+        """Return the transmitter and receivers of a data set of impulse responses.
 
         Raises:
-            MitsonarError: a data set of images.
+            MitsonarError: it is a data set of images.
         """
         if self.channel is None:
             raise MitsonarError(f"the data set {self.name} is of images: read it with SonarPairs, this needs responses")
@@ -277,7 +276,11 @@ class Recipe(_Part):
 
     @cached_property
     def views(self) -> list[View]:
-        """The images of a ping."""
+        """Return the views: one for each image of a ping.
+
+        Raises:
+            MitsonarError: there are both receivers and segments.
+        """
         sonar = self.instrument
         if self.receivers and self.segments:
             raise MitsonarError("receivers and segments exclude each other: give one")
@@ -289,23 +292,29 @@ class Recipe(_Part):
             made.append(Receiver(sonar, sonar_from({k: v for k, v in own.items() if v is not None}), spec.pose, spec.name))
         return made or [Whole(sonar)]
 
-    def digest(self, *more: Any) -> str:
-        """What the recipe says beside the defaults, and more, as 16 hexadecimal digits: a key that a later version adds
-        changes nothing for who does not use it."""
-        said = self.model_dump(mode="json", exclude_defaults=True)
-        return digest(json.dumps([said, *more]))[:16]
+    def digest(self, *more: object) -> str:
+        """Return a digest of all values that are not defaults, and of more values: 16 hexadecimal digits.
+
+        A key that a later version adds leaves the digest of other recipes as it is.
+        """
+        values = self.model_dump(mode="json", exclude_defaults=True)
+        return digest(json.dumps([values, *more]))[:16]
 
     def suffix(self, view: str) -> str:
-        """What the names of a view's arrays end with: nothing where there is only one."""
+        """Return the suffix of the names of a view's arrays; it is empty where there is one view."""
         return f"_{view}" if len(self.views) > 1 else ""
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What is stored of each view: ``image``, ``vector``, or both."""
+        """Return what is stored of each view: ``image``, ``vector``, or both."""
         return {"images": ("image",), "vectors": ("vector",), "both": ("image", "vector")}[self.store]
 
     def family(self, group: int) -> Family:
-        """The family of a group of scenes."""
+        """Return the family of a group of scenes.
+
+        Raises:
+            MitsonarError: the family is missing or unknown, or a number is outside its limits.
+        """
         fields = {**self.world, **self.scenes[group].world}
         if "family" not in fields:
             raise MitsonarError("world lacks family: give rocky-field, ship-hull, pattern, flat-objects or scene")
@@ -313,12 +322,12 @@ class Recipe(_Part):
 
     @property
     def sequences(self) -> int:
-        """Sequences of the whole data set."""
+        """Return the number of sequences of the whole data set."""
         return sum(group.count * group.sequences for group in self.scenes)
 
 
 def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
-    """What is stored of each view: the array's name -> (kind, view); names end with the view's where there are several."""
+    """Return the stored arrays: name -> (kind, view). A name ends with the view's where there are several views."""
     names = {}
     for view in recipe.views:
         kinds = [*recipe.kinds, *(["nonzero"] if "vector" in recipe.kinds else []), *recipe.labels]
@@ -328,20 +337,20 @@ def array_names(recipe: Recipe) -> dict[str, tuple[str, str]]:
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """The recipes of the package by name."""
+    """Return the recipes of the package by name."""
     folder = Path(str(files("mitsonar.config"))) / "recipes"
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def load_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None) -> Recipe:
-    """The recipe in a YAML file, or the shipped one of that name.
+def load_recipe(name_or_file: str | Path, changes: Keys | None = None) -> Recipe:
+    """Load the recipe of a YAML file, or the shipped one of that name.
 
     Args:
         name_or_file: ``rocky-field``, or ``mine.yaml``.
-        changes: keys to change, dots between the levels: ``{"sonar.range_bins": 256}``.
+        changes: keys to change, with dots between the levels: ``{"sonar.range_bins": 256}``.
 
     Raises:
-        MitsonarError: no such recipe, not YAML, an unknown key, a value outside its limits.
+        MitsonarError: no such recipe, not YAML, an unknown key, or a value outside its limits.
     """
     fields, path = recipe_fields(
         name_or_file, shipped_recipes(), "recipe", Recipe, " or a name of `mitsonar dataset recipes`"
@@ -352,55 +361,25 @@ def load_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None)
     return recipe_from({"name": path.stem, **fields})
 
 
-def recipe_fields(
-    name_or_file: str | Path, shipped: dict[str, Path], what: str, model: type[BaseModel], else_: str = ""
-) -> tuple[dict[str, Any], Path]:
-    """The keys in a YAML file, or in the shipped one of that name, and that file.
-
-    Args:
-        name_or_file: ``rocky-field``, or ``mine.yaml``.
-        shipped: files by name.
-        what: it is, for errors.
-        model: whose fields are the known keys.
-        else_: what may be given besides a YAML file, for errors.
+def recipe_from(fields: Keys) -> Recipe:
+    """Check keys and return their recipe.
 
     Raises:
-        MitsonarError: no such recipe, not YAML, not a table.
-    """
-    path = Path(name_or_file)
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        if str(name_or_file) not in shipped:
-            names = nearest_names(str(name_or_file), shipped)
-            raise MitsonarError(
-                f"no {what} {str(name_or_file)!r}: give a YAML file or the name of a shipped recipe, {names}"
-            )
-        path = shipped[str(name_or_file)]
-    fields = read_yaml(path, what, else_)
-    if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
-        keys = ", ".join(field.alias or name for name, field in model.model_fields.items())
-        raise MitsonarError(f"{path} must hold the keys of a {what}: {keys}")
-    return fields, path
-
-
-def recipe_from(fields: dict[str, Any]) -> Recipe:
-    """The recipe with these keys.
-
-    Raises:
-        MitsonarError: an unknown key, a value outside its limits.
+        MitsonarError: an unknown key, or a value outside its limits.
     """
     return _checked(Recipe, "recipe", fields)
 
 
-def split_from(fields: dict[str, Any]) -> Split:
-    """The split with these keys.
+def split_from(fields: Keys) -> Split:
+    """Check keys and return their split.
 
     Raises:
-        MitsonarError: an unknown key, a value outside its limits.
+        MitsonarError: an unknown key, or a value outside its limits.
     """
     return _checked(Split, "split", fields)
 
 
-def _checked(part: type[_Made], what: str, fields: dict[str, Any]) -> _Made:
+def _checked(part: type[_Made], what: str, fields: Keys) -> _Made:
     try:
         return part(**fields)
     except ValidationError as error:
@@ -409,8 +388,8 @@ def _checked(part: type[_Made], what: str, fields: dict[str, Any]) -> _Made:
         raise MitsonarError(f"{what} keys must be words: {error}") from None
 
 
-def _find_files(fields: dict[str, Any], folder: Path) -> None:
-    """Scene files are named from where the recipe is."""
+def _find_files(fields: Keys, folder: Path) -> None:
+    """Resolve scene files relative to the folder of the recipe."""
     groups = fields.get("scenes")
     for world in [
         fields.get("world"),
@@ -418,17 +397,3 @@ def _find_files(fields: dict[str, Any], folder: Path) -> None:
     ]:
         if isinstance(world, dict) and isinstance(world.get("file"), str):
             world["file"] = str((folder / world["file"]).resolve())
-
-
-def set_key(fields: dict[str, Any], key: str, value: Any) -> None:
-    """Set a key of a recipe, dots between the levels.
-
-    Raises:
-        MitsonarError: a level that is no group of keys.
-    """
-    *levels, last = key.split(".")
-    for level in levels:
-        fields = fields.setdefault(level, {})
-        if not isinstance(fields, dict):
-            raise MitsonarError(f"cannot set {key}: {level} is not a group of keys; change it in a YAML file of your own")
-    fields[last] = value

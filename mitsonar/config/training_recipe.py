@@ -1,4 +1,4 @@
-"""What a training is: a small YAML file, checked; one for every row of the thesis's tables is shipped."""
+"""Recipes of trainings: small YAML files, checked. One for each row of Almanza-Medina's tables is shipped."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from functools import cached_property
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.acoustics.signal_to_noise import snr_of
-from mitsonar.config.data_recipe import Split, recipe_fields, set_key, split_from
+from mitsonar.config.data_recipe import Split, split_from
+from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
 from mitsonar.errors import MitsonarError, complaint
 
 __all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
@@ -34,9 +35,11 @@ Noise = Annotated[str, AfterValidator(_known_noise)]
 
 
 class Input(_Part):
-    """How frames reach the network: words of :class:`~mitsonar.datasets.torch_pairs.SonarPairs`; of impulse responses only
-    frames
-    and leak, those of :class:`~mitsonar.datasets.response_pairs.ImpulsePairs`."""
+    """How frames become inputs of the network: arguments of :class:`~mitsonar.datasets.torch_pairs.SonarPairs`.
+
+    Of impulse responses only ``frames`` and ``leak`` apply, the arguments of
+    :class:`~mitsonar.datasets.response_pairs.ImpulsePairs`.
+    """
 
     frames: int = Field(2, ge=1, le=16, description="of a sample; 1: heights are learnt")
     views: list[str] | None = Field(None, description="which views; null: all")
@@ -62,8 +65,8 @@ class Input(_Part):
             raise ValueError(f"input.{other[0]} is not for kind {self.kind}: leave it out")
         return self
 
-    def words(self) -> dict[str, Any]:
-        """For SonarPairs and RenderedPairs, or ImpulsePairs."""
+    def words(self) -> Keys:
+        """Return the arguments for SonarPairs and RenderedPairs, or for ImpulsePairs."""
         words = self.model_dump()
         if self.kind == "response":
             return {"frames": self.frames, "leak": self.leak}
@@ -78,9 +81,11 @@ def _differ(one: BaseModel, other: BaseModel, name: str) -> bool:
 
 
 class Loss(_Part):
-    """What is made small."""
+    """The loss that training minimises."""
 
-    kind: Literal["mse", "likelihood"] = Field("mse", description="eq. 3.1; or the likelihood of the motion's law")
+    kind: Literal["mse", "likelihood"] = Field(
+        "mse", description="eq. 3.1; or the likelihood of the motion, with its covariance"
+    )
     penalty: float = Field(0.0, ge=0, allow_inf_nan=False, description="eta of eq. 3.2 for estimates beyond the bounds")
     bounds: tuple[float, float] | None = Field(
         None, description="of eq. 3.2, in label units; default: what the largest motions become, +-10 for normx10"
@@ -96,7 +101,7 @@ class Loss(_Part):
 
 
 class Optimiser(_Part):
-    """How weights follow the gradient."""
+    """The optimiser and its learning rate."""
 
     kind: Literal["adam", "adamw"] = "adam"
     rate: float = Field(1e-4, gt=0, le=10, description="learning rate at the start")
@@ -104,7 +109,7 @@ class Optimiser(_Part):
     steps: list[tuple[float, float]] = Field(
         default_factory=list, description="of schedule steps: [epoch, rate from then on]"
     )
-    halve_every: float = Field(12.0, gt=0, description="epochs after which the rate falls, again and again")
+    halve_every: float = Field(12.0, gt=0, description="epochs between falls of the rate")
     fall_to: float = Field(0.5, gt=0, le=1, description="part of the rate that is left then, with schedule halve")
     warmup: int = Field(0, ge=0, description="steps over which the rate rises from 0 at the beginning")
     weight_decay: float = Field(0.0, ge=0, le=1)
@@ -122,12 +127,12 @@ class Optimiser(_Part):
         return self
 
     def rate_at(self, step: int, epoch_steps: int, steps: int) -> float:
-        """The learning rate of a step, a function of the step alone.
+        """Return the learning rate of a step; it depends on the step alone.
 
         Args:
             step: counted from 0.
             epoch_steps: steps of an epoch.
-            steps: of the whole training as planned.
+            steps: planned steps of the whole training.
         """
         rise = min(1.0, (step + 1) / self.warmup) if self.warmup else 1.0
         match self.schedule:
@@ -144,7 +149,7 @@ class Optimiser(_Part):
 
 
 class Validate(_Part):
-    """What is measured while training goes on; nothing of it touches the training."""
+    """Measurements during training; they do not affect it."""
 
     noise: list[Noise] = Field(default=["none", "high"], min_length=1, description="levels of noise")
     pairs: int | None = Field(500, ge=1, description="samples, always the same; null: all of the part")
@@ -153,37 +158,37 @@ class Validate(_Part):
 
 
 class TrainingRecipe(_Part):
-    """A training; docs of each key stand beside it.
+    """A training; each key has its description.
 
     Raises:
-        MitsonarError: through :func:`load_training_recipe`, for an unknown key or a value outside its limits.
+        MitsonarError: through :func:`load_training_recipe`, an unknown key or a value outside its limits.
     """
 
     about: str = Field("", description="a sentence on it")
-    network: dict[str, Any] = Field(description="name of the network, or name and options: {name: posenet, width: 0.25}")
-    start: str | None = Field(None, description="checkpoint or run with whose weights it begins; null: drawn at random")
+    network: Keys = Field(description="name of the network, or name and options: {name: posenet, width: 0.25}")
+    start: str | None = Field(None, description="checkpoint or run with the initial weights; null: random weights")
     data: str = Field("rocky-field", description="data set recipe, name or file, for --render and reproduce")
-    data_changes: dict[str, Any] = Field(default_factory=dict, description="keys of it to change: {sonar.range_bins: 256}")
-    part_of_data: float = Field(1.0, gt=0, le=1, description="only samples of the first so large a part of the frames")
+    data_changes: Keys = Field(default_factory=dict, description="keys of it to change: {sonar.range_bins: 256}")
+    part_of_data: float = Field(1.0, gt=0, le=1, description="part of the frames, from the first, whose samples are used")
     input: Input = Field(default_factory=Input)
-    labels: Literal["raw", "quantised", "normx10"] = Field("normx10", description="what the network says")
-    noise: Noise | list[Noise] = Field("none", description="in training; of a list each sample draws one")
+    labels: Literal["raw", "quantised", "normx10"] = Field("normx10", description="form of the network's outputs")
+    noise: Noise | list[Noise] = Field("none", description="noise in training; each sample draws one of a list")
     augment: list[Literal["mirror", "reverse", "strangers"]] = Field(
-        default_factory=list, description="for networks that know the ground: ways in which samples are changed"
+        default_factory=list, description="changes of samples, for networks that know the ground"
     )
-    split: str | dict[str, Any] = Field("sequence", description="sequence, scene, or keys of a data set recipe's split")
+    split: str | Keys = Field("sequence", description="sequence, scene, or keys of a data set recipe's split")
     loss: Loss = Field(default_factory=Loss)
     optimiser: Optimiser = Field(default_factory=Optimiser)
     batch: int = Field(4, ge=1, le=65_536, description="samples of a step, over all devices")
-    epochs: float | None = Field(32.0, gt=0, description="times that each sample is seen; or steps")
+    epochs: float | None = Field(32.0, gt=0, description="passes over all samples; or steps")
     steps: int | None = Field(None, ge=1, description="of the optimiser, in place of epochs")
-    precision: Precision = Field("32-true", description="Lightning's word")
+    precision: Precision = Field("32-true", description="precision, as Lightning names it")
     validate_: Validate = Field(default_factory=Validate, alias="validate")
     seed: int = Field(0, ge=0, lt=2**31, description="of weights, order, noise, dropout")
 
     @model_validator(mode="before")
     @classmethod
-    def _spelled_out(cls, fields: Any) -> Any:
+    def _spelled_out(cls, fields: object) -> object:
         if not isinstance(fields, dict):
             return fields
         named = {"network": {"name": fields["network"]}} if isinstance(fields.get("network"), str) else {}
@@ -195,7 +200,7 @@ class TrainingRecipe(_Part):
 
     @field_validator("network")
     @classmethod
-    def _has_a_name(cls, network: dict[str, Any]) -> dict[str, Any]:
+    def _has_a_name(cls, network: Keys) -> Keys:
         if not isinstance(network.get("name"), str):
             raise ValueError("give the name of a network, such as posenet, or name and options")
         return network
@@ -221,26 +226,26 @@ class TrainingRecipe(_Part):
 
     @property
     def validation(self) -> Validate:
-        """The key ``validate``, whose name pydantic needs."""
+        """Return the key ``validate``, a name that pydantic reserves."""
         return self.validate_
 
     @property
     def noises(self) -> list[str]:
-        """Levels of training noise."""
+        """Return the levels of noise in training."""
         return [self.noise] if isinstance(self.noise, str) else list(self.noise)
 
     @property
     def noise_said(self) -> str:
-        """Training noise in words."""
+        """Return the noise in training, in words."""
         return " or ".join(self.noises)
 
     @cached_property
     def split_of(self) -> str | Split:
-        """For SonarPairs."""
+        """Return the split for SonarPairs."""
         return split_from(self.split) if isinstance(self.split, dict) else self.split
 
-    def arrangement(self) -> dict[str, Any]:
-        """Words for SonarPairs and RenderedPairs of the training's samples."""
+    def arrangement(self) -> Keys:
+        """Return the arguments for SonarPairs and RenderedPairs in training."""
         noise = self.noises
         return {
             **self.input.words(),
@@ -250,34 +255,38 @@ class TrainingRecipe(_Part):
         }
 
     def length(self, epoch_steps: int) -> int:
-        """Steps of the whole training, one at least."""
+        """Return the number of steps of the whole training, at least one."""
         return self.steps or max(1, round((self.epochs or 0) * epoch_steps))
 
-    def plain(self) -> dict[str, Any]:
-        """All keys with plain values, as the recipe file of a run holds them."""
+    def plain(self) -> Keys:
+        """Return all keys with plain values, as the recipe file of a run holds them."""
         return self.model_dump(mode="json", by_alias=True)
 
-    def replace(self, **fields: Any) -> TrainingRecipe:
-        """This recipe with some keys changed, checked again."""
+    def replace(self, **fields: object) -> TrainingRecipe:
+        """Return a copy with some keys changed, after all checks.
+
+        Raises:
+            MitsonarError: an unknown key, or a value outside its limits.
+        """
         return training_recipe_from({**self.plain(), **fields})
 
 
 def shipped_training_recipes() -> dict[str, Path]:
-    """The recipes of the package by name."""
+    """Return the training recipes of the package by name."""
     if find_spec("mitsonar.recipes") is None:
         return {}
     return {path.stem: path for path in sorted(Path(str(files("mitsonar.recipes"))).glob("*.yaml"))}
 
 
-def load_training_recipe(name_or_file: str | Path, changes: dict[str, Any] | None = None) -> TrainingRecipe:
-    """The training recipe in a YAML file, or the shipped one of that name.
+def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) -> TrainingRecipe:
+    """Load the training recipe of a YAML file, or the shipped one of that name.
 
     Args:
         name_or_file: ``mine.yaml``, or a shipped name.
-        changes: keys to change, dots between the levels: ``{"optimiser.rate": 1e-3}``.
+        changes: keys to change, with dots between the levels: ``{"optimiser.rate": 1e-3}``.
 
     Raises:
-        MitsonarError: no such recipe, not YAML, an unknown key, a value outside its limits.
+        MitsonarError: no such recipe, not YAML, an unknown key, or a value outside its limits.
     """
     fields, path = recipe_fields(name_or_file, shipped_training_recipes(), "training recipe", TrainingRecipe)
     if isinstance(fields.get("network"), str):
@@ -289,16 +298,16 @@ def load_training_recipe(name_or_file: str | Path, changes: dict[str, Any] | Non
     return training_recipe_from(fields)
 
 
-def training_recipe_from(fields: dict[str, Any]) -> TrainingRecipe:
-    """The training recipe with these keys.
+def training_recipe_from(fields: Keys) -> TrainingRecipe:
+    """Check keys and return their training recipe.
 
     Raises:
-        MitsonarError: an unknown key, a value outside its limits.
+        MitsonarError: an unknown key, or a value outside its limits.
     """
     try:
         return TrainingRecipe(**fields)
     except ValidationError as error:
-        said = complaint(error, TrainingRecipe, "training recipe")
-        raise MitsonarError(said.replace("validate_", "validate")) from None
+        message = complaint(error, TrainingRecipe, "training recipe")
+        raise MitsonarError(message.replace("validate_", "validate")) from None
     except TypeError as error:
         raise MitsonarError(f"training recipe keys must be words: {error}") from None

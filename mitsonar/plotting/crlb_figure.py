@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import io
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 __all__ = ["crlb_png"]
 
+Report: TypeAlias = Mapping[str, Any]
+"""A report of :mod:`mitsonar.estimation.crlb.crlb_report`: its keys, with rows of bounds under ``rows``."""
 
-def crlb_png(report: dict[str, Any]) -> bytes:
-    """Draw two-frame bounds against the variable, or pose by pose; of :mod:`mitsonar.estimation.crlb.crlb_report`."""
+
+def crlb_png(report: Report) -> bytes:
+    """Draw the bounds of two frames against the variable, or for each pose, and return the PNG."""
     from matplotlib.figure import Figure
 
     name = report["vary"]
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
-    series: dict[str, list[tuple[Any, list[float | None]]]] = {}
+    series: dict[str, list[tuple[float | str, list[float | None]]]] = {}
     for row in report["rows"]:
         label = " ".join([row["portion"], row["data"], row["law"]])
         if name is None:

@@ -1,12 +1,13 @@
-"""A look at a data set: a sheet of samples, labels and their mean; a table of what it holds."""
+"""Overview of a data set: a sheet of samples, labels and mean image, and a table of its contents."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data_recipe import array_names
@@ -14,19 +15,35 @@ from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.plotting.response_sheet import response_sheet
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
     from mitsonar.datasets.store import DataStore
 
 __all__ = ["info", "sheet_figure"]
 
 SAMPLED_FRAMES = 200
+"""Frames that means are taken over, about."""
+
+Table: TypeAlias = dict[str, Any]
+"""Contents of a data set by name: numbers, words, lists of words, or tables of them."""
+
+Stored: TypeAlias = "NDArray[np.uint8] | NDArray[np.float32]"
+"""Pixels or vectors as they are stored."""
 
 
 def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None, seed: int = 0) -> Figure:
-    """Samples with their labels, the distribution of the labels, and the mean image; of responses see
-    :func:`~mitsonar.plotting.response_sheet.response_sheet`.
+    """Draw samples with their labels, the distribution of the labels, and the mean image.
+
+    Data sets of responses get a :func:`~mitsonar.plotting.response_sheet.response_sheet`.
+
+    Args:
+        store: the data set.
+        samples: number of samples to draw.
+        view: name of a view or receiver; default: the first.
+        seed: of the draw of the samples.
 
     Raises:
-        MitsonarError: no such view; a data set without sequences of the recipe's number of frames.
+        MitsonarError: no such view, or no sequence with the recipe's number of frames.
     """
     if store.recipe.channel is not None:
         return response_sheet(store, samples=samples, receiver=view, seed=seed)
@@ -53,14 +70,14 @@ def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None,
 
 
 def _extent(store: DataStore, view: str) -> tuple[float, float, float, float]:
-    """Bearing and range at the borders of an image, nearest at the bottom."""
+    """Return bearing [deg] and range [m] at the borders of an image, nearest at the bottom."""
     shown = next(v for v in store.recipe.views if v.name == view)
     port, starboard = np.degrees(shown.bearing_rad[[0, -1]])
     return float(port), float(starboard), shown.sonar.range_min, shown.sonar.range_max
 
 
-def _draw(axes: Any, store: DataStore, values: Any, view: str, title: str, *, top: float = 1.0) -> None:
-    """An image shown with gamma 0.6, ``top`` white, or a vector as a line, with axes of degrees and metres."""
+def _draw(axes: Axes, store: DataStore, values: NDArray[np.float64], view: str, title: str, *, top: float = 1.0) -> None:
+    """Draw an image with gamma 0.6 and ``top`` white, or a vector as a line; axes in degrees and metres."""
     if values.ndim == 1:
         axes.plot(store.read("range_m"), values, lw=0.7)
         axes.set(xlabel="range (m)", ylabel="sum of levels")
@@ -71,18 +88,18 @@ def _draw(axes: Any, store: DataStore, values: Any, view: str, title: str, *, to
     axes.set_title(title, fontsize=8)
 
 
-def _levels(store: DataStore, values: Any) -> Any:
-    """Pixels as fractions of the maximum; vectors as they are."""
+def _levels(values: Stored) -> NDArray[np.float64]:
+    """Return pixels as fractions of the maximum; vectors as they are."""
     return np.asarray(values, dtype=float) / (255 if values.dtype == np.uint8 else 1)
 
 
-def _sample(axes: Any, store: DataStore, name: str, view: str, start: int, place: int, frames: int) -> None:
-    """A frame of a sample, or after the last what changed, and the label."""
+def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, place: int, frames: int) -> None:
+    """Draw one panel of a sample: a frame, after the last frame the difference, then the label."""
     if place < frames:
         title = f"frame {start + place}, scene {store.read('scene')[start + place]}"
-        _draw(axes, store, _levels(store, store.read(name, start + place)), view, title)
+        _draw(axes, store, _levels(store.read(name, start + place)), view, title)
     elif place == frames and frames > 1:
-        first, last = (_levels(store, store.read(name, frame)) for frame in (start, start + frames - 1))
+        first, last = (_levels(store.read(name, frame)) for frame in (start, start + frames - 1))
         if first.ndim == 1:
             axes.plot(store.read("range_m"), last - first, lw=0.7)
         else:
@@ -99,7 +116,7 @@ def _sample(axes: Any, store: DataStore, name: str, view: str, start: int, place
 
 
 def _label(store: DataStore, start: int, frames: int) -> str:
-    """Motion and height of a sample, in the units of tables."""
+    """Return motion and height of a sample in words."""
     motion, height = store.read("motion")[start], store.read("height_m")[start]
     text = f"over z = 0  {store.read('pose')[start, 2]:.3f} m\nover what is below {height:.3f} m"
     if frames == 1:
@@ -108,9 +125,9 @@ def _label(store: DataStore, start: int, frames: int) -> str:
     return f"sideways {sideways:+.2f} mm\nforward  {forward:+.2f} mm\nyaw {yaw:+.3f} deg\n{text}"
 
 
-def _summary(axes: Any, store: DataStore, name: str, view: str) -> None:
-    """The mean image, and histograms of the labels."""
-    mean = _levels(store, _sampled(store, name)).mean(axis=0)
+def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) -> None:
+    """Draw the mean image, and histograms of the labels."""
+    mean = _levels(_sampled(store, name)).mean(axis=0)
     top = float(mean.max()) or 1.0
     _draw(axes[0], store, mean, view, "mean of frames" + (f" (white {top:.3g})" if mean.ndim == 2 else ""), top=top)
     motion = store.read("motion")
@@ -128,17 +145,17 @@ def _summary(axes: Any, store: DataStore, name: str, view: str) -> None:
             axis.axis("off")
 
 
-def _sampled(store: DataStore, name: str) -> Any:
-    """Some frames from all over the data set: whole chunks, evenly spread."""
+def _sampled(store: DataStore, name: str) -> Stored:
+    """Read some frames of the whole data set: whole chunks, evenly spread."""
     chunk = int(store.about["chunk_frames"])
     starts = np.arange(0, len(store), chunk)
     some = starts[np.unique(np.linspace(0, len(starts) - 1, max(1, SAMPLED_FRAMES // chunk)).astype(int))]
     return np.concatenate([store.read(name, slice(start, start + chunk)) for start in some])
 
 
-def _level(store: DataStore, name: str, view: str) -> dict[str, Any]:
-    """How many pixels hold an echo, their mean level, and that over the scale of the noise that is added to them."""
-    some = _levels(store, _sampled(store, name))
+def _level(store: DataStore, name: str, view: str) -> Table:
+    """Measure the part of the pixels with an echo, their mean level, and its ratio to the scale of each noise."""
+    some = _levels(_sampled(store, name))
     if some.ndim == 2:  # sums over the beams
         beams = next(len(v.bearing_rad) for v in store.recipe.views if v.name == view)
         echoes, pixels = int(_sampled(store, name.replace("vector", "nonzero", 1)).sum()), some.size * beams
@@ -149,14 +166,14 @@ def _level(store: DataStore, name: str, view: str) -> dict[str, Any]:
     return {"filled": echoes / pixels, "signal_mean": mean, "signal_over_noise": noise}
 
 
-def _levels_of(store: DataStore) -> dict[str, Any]:
-    """The level of each view, once it is finished."""
+def _levels_of(store: DataStore) -> Table:
+    """Measure the level of each view of a finished data set."""
     names = array_names(store.recipe).items() if store.finished else ()
     return {view: _level(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
 
 
-def info(store: DataStore) -> dict[str, Any]:
-    """What a data set holds, by name; values are numbers, words, or tables of them."""
+def info(store: DataStore) -> Table:
+    """Describe the contents of a data set by name; values are numbers, words, or tables of them."""
     about, sizes = store.about, store.place.sizes()
     arrays = {}
     for name, stored in store.modality.stored.items():

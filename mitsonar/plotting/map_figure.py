@@ -26,29 +26,29 @@ if TYPE_CHECKING:
 
 __all__ = ["mosaic_figure", "path_figure", "quality_figure", "save_figure"]
 
-THESIS_COLOURS = {"estimated": ("red", "darkblue"), "true": ("limegreen", "cyan")}
+ALMANZA_COLOURS = {"estimated": ("red", "darkblue"), "true": ("limegreen", "cyan")}
 """Line and arrows of a path (Almanza-Medina, fig. 2.9 and 3.7)."""
 
 OTHER_COLOURS = (("tab:orange", "tab:brown"), ("tab:purple", "tab:pink"), ("tab:olive", "tab:gray"))
 
 ARROWS = 20
-"""Headings drawn along a path, about."""
+"""Number of headings drawn along a path, about."""
 
 UNSEEN = "0.9"
-"""Grey of what no frame showed."""
+"""Grey of cells that no frame observed."""
 
 BAND = 2
-"""Standard deviations that error bands show to either side."""
+"""Half width of error bands [standard deviations]."""
 
 
 def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None, *, title: str = "") -> Figure:
-    """The mean level with metre axes and a scale bar; paths of the sonar with arrows along its heading over it.
+    """Draw the mean level of a mosaic in metres, with a scale bar, and paths of the sonar with arrows along its heading.
 
     Args:
-        mosaic: what to show.
+        mosaic: to draw.
         paths: by name, for the legend; ``estimated`` and ``true`` have the colours of Almanza-Medina's figures: red line and
             dark blue arrows, green line and cyan arrows.
-        title: above it.
+        title: of the figure.
     """
     from matplotlib.colors import PowerNorm
 
@@ -63,7 +63,7 @@ def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None,
 
 
 def quality_figure(mosaic: Mosaic, *, title: str = "") -> Figure:
-    """How far the frames that saw a cell differ, and how many they were."""
+    """Draw the standard deviation of the frames that observed each cell, and their number."""
     figure, (left, right) = _maps(2, mosaic, None)
     spread = mosaic.std
     top = float(np.nanpercentile(spread, 99.5)) if np.isfinite(spread).any() else 1.0
@@ -84,7 +84,7 @@ def path_figure(
     pose_covariances: Mapping[str, NDArray[np.float64]] | None = None,
     title: str = "",
 ) -> Figure:
-    """Paths from above, heading over time, and the motion from each frame to the next over time, per axis (eq. 3.4).
+    """Draw paths from above, and over time the heading and the motion between frames on each axis (eq. 3.4).
 
     Args:
         paths: by name; colours as in :func:`mosaic_figure`.
@@ -92,10 +92,10 @@ def path_figure(
             where unknown. Bands show two standard deviations.
         pose_covariances: of (x, y [m], heading [rad]) ``(frames, 3, 3)``, for ellipses along the path and the band of the
             heading; two standard deviations too.
-        title: above it.
+        title: of the figure.
 
     Raises:
-        MitsonarError: no path, a covariance of an unknown path, or one that does not fit its path.
+        MitsonarError: no path, a covariance of an unknown path, or one whose shape does not fit its path.
     """
     from matplotlib.figure import Figure
 
@@ -109,9 +109,6 @@ def path_figure(
     over_time = [figure.add_subplot(grid[0, 1])]
     over_time += [figure.add_subplot(grid[row, 1], sharex=over_time[0]) for row in range(1, len(AXES) + 1)]
     _draw_paths(above, paths)
-    above.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title, aspect="equal")
-    above.set_adjustable("datalim")
-    above.legend(loc="best")
     for name, line, _ in _colours(paths):
         path = paths[name]
         if name in of_poses:
@@ -122,20 +119,15 @@ def path_figure(
         for axis, (_, _, scale) in enumerate(AXES):
             band = _std(of_motions.get(name), axis, scale)
             _banded(over_time[1 + axis], path.time_s[1:], moved[:, axis] * scale, band, line)
-    over_time[0].set_ylabel("heading (deg)")
-    for axes, (name, unit, _) in zip(over_time[1:], AXES, strict=True):
-        axes.set_ylabel(f"{name} ({unit})")
-    over_time[-1].set_xlabel("time (s)")
-    for axes in (above, *over_time):
-        axes.grid(alpha=0.3)
+    _label(above, over_time, title)
     return figure
 
 
 def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
-    """Write a figure, whole or not at all; the name's ending says how: ``.png``, ``.pdf``, ``.svg``.
+    """Write a figure, whole or not at all, in the format of the name's ending: ``.png``, ``.pdf``, ``.svg``.
 
     Raises:
-        MitsonarError: an ending that is no picture's.
+        MitsonarError: the ending is no format of figures.
     """
     kind = Path(path).suffix.lstrip(".").lower()
     known = figure.canvas.get_supported_filetypes()
@@ -150,7 +142,7 @@ def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
 
 
 def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -> tuple[Figure, list[Axes]]:
-    """A figure with as many maps side by side, shaped to the ground and the paths."""
+    """Create a figure of maps side by side, with the proportions of the ground and the paths."""
     from matplotlib.figure import Figure
 
     west, east, south, north = _view(mosaic, paths or {})
@@ -162,7 +154,7 @@ def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -
 
 
 def _view(mosaic: Mosaic, paths: Mapping[str, Trajectory]) -> tuple[float, float, float, float]:
-    """West, east, south, north of a map and its paths [m], with a margin."""
+    """Return west, east, south, north of a map and its paths [m], with a margin."""
     west, east, south, north = mosaic.extent
     places = [np.array([[west, south], [east, north]]), *(path.poses[:, :2] for path in paths.values())]
     low, high = np.min([p.min(axis=0) for p in places], axis=0), np.max([p.max(axis=0) for p in places], axis=0)
@@ -171,7 +163,7 @@ def _view(mosaic: Mosaic, paths: Mapping[str, Trajectory]) -> tuple[float, float
 
 
 def _finish_map(axes: Axes, mosaic: Mosaic, paths: Mapping[str, Trajectory], title: str) -> None:
-    """Limits, labels, scale bar, legend."""
+    """Set limits, labels, scale bar and legend."""
     west, east, south, north = _view(mosaic, paths)
     axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
     axes.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title)
@@ -181,7 +173,7 @@ def _finish_map(axes: Axes, mosaic: Mosaic, paths: Mapping[str, Trajectory], tit
 
 
 def _scale_bar(axes: Axes, width_m: float) -> None:
-    """A bar of a round length, about a fifth of the map."""
+    """Draw a bar of a round length, about a fifth of the map."""
     from matplotlib.patches import Rectangle
 
     length = _round_length(width_m / 5)
@@ -195,7 +187,7 @@ def _scale_bar(axes: Axes, width_m: float) -> None:
 
 
 def _round_length(wanted: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above."""
+    """Return the largest 1, 2 or 5 times a power of ten that is not above ``wanted``."""
     power = 10.0 ** math.floor(math.log10(wanted))
     return max(step * power for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
 
@@ -204,18 +196,31 @@ def _round_length(wanted: float) -> float:
 
 
 def _colours(paths: Mapping[str, Trajectory]) -> Iterator[tuple[str, str, str]]:
-    """Name, line and arrows of each path."""
+    """Yield name, line colour and arrow colour of each path."""
     others = 0
     for name in paths:
-        if name in THESIS_COLOURS:
-            yield name, *THESIS_COLOURS[name]
+        if name in ALMANZA_COLOURS:
+            yield name, *ALMANZA_COLOURS[name]
         else:
             yield name, *OTHER_COLOURS[others % len(OTHER_COLOURS)]
             others += 1
 
 
+def _label(above: Axes, over_time: list[Axes], title: str) -> None:
+    """Set labels, legend and grids of :func:`path_figure`."""
+    above.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title, aspect="equal")
+    above.set_adjustable("datalim")
+    above.legend(loc="best")
+    over_time[0].set_ylabel("heading (deg)")
+    for axes, (name, unit, _) in zip(over_time[1:], AXES, strict=True):
+        axes.set_ylabel(f"{name} ({unit})")
+    over_time[-1].set_xlabel("time (s)")
+    for axes in (above, *over_time):
+        axes.grid(alpha=0.3)
+
+
 def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
-    """Lines, and arrows along the heading; the start is marked."""
+    """Draw lines with arrows along the heading, and mark the start."""
     for name, line, arrow in _colours(paths):
         poses = paths[name].poses
         axes.plot(poses[:, 0], poses[:, 1], color=line, label=name, linewidth=1.5, zorder=3)
@@ -226,12 +231,12 @@ def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
 
 
 def _some(frames: int) -> NDArray[np.intp]:
-    """Frames that arrows and ellipses are drawn at."""
+    """Select the frames with arrows and ellipses."""
     return np.unique(np.linspace(0, frames - 1, min(ARROWS, frames)).astype(np.intp))
 
 
 def _draw_ellipses(axes: Axes, place: NDArray[np.float64], covariance: NDArray[np.float64], colour: str) -> None:
-    """Two standard deviations around some of the places ``(frames, 2)``."""
+    """Draw ellipses of two standard deviations around some of the positions ``(frames, 2)``."""
     from matplotlib.patches import Ellipse
 
     for one in _some(len(place)):
@@ -245,7 +250,11 @@ def _draw_ellipses(axes: Axes, place: NDArray[np.float64], covariance: NDArray[n
 def _checked(
     paths: Mapping[str, Trajectory], covariances: Mapping[str, NDArray[np.float64]], what: str, fewer: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Covariances as arrays, known to fit their paths."""
+    """Return covariances as arrays, after a check that they fit their paths.
+
+    Raises:
+        MitsonarError: an unknown path, or another shape.
+    """
     for name, values in covariances.items():
         if name not in paths:
             raise MitsonarError(f"{what} names no path that is drawn: got {name!r}; paths: {', '.join(paths)}")
@@ -262,7 +271,7 @@ def _std(covariances: NDArray[np.float64] | None, axis: int, scale: float) -> ND
 def _banded(
     axes: Axes, time: NDArray[np.float64], value: NDArray[np.float64], std: NDArray[np.float64] | None, colour: str
 ) -> None:
-    """A line, and a band of two standard deviations about it."""
+    """Draw a line with a band of two standard deviations."""
     axes.plot(time, value, color=colour, linewidth=1.0)
     if std is not None:
         axes.fill_between(time, value - BAND * std, value + BAND * std, color=colour, alpha=0.2, linewidth=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
 __all__ = ["response_figure", "response_png", "waterfall_figure", "waterfall_png"]
 
 FAINT_DB = -40.0
-"""Lower end of the waterfall's scale."""
+"""Lower end of the waterfall's scale [dB]."""
 
 
 def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
-    """Magnitude, real and imaginary part of one ping at each receiver (Almanza-Medina, fig. 5.4), over taps and range."""
+    """Draw magnitude, real and imaginary part of one ping over taps and range (Almanza-Medina, fig. 5.4)."""
     from matplotlib.figure import Figure
 
     sonar, count = responses.sonar, len(responses.sonar.receivers)
     values = responses.response[ping] / max(float(np.abs(responses.response[ping]).max()), 1e-30)
-    begin, end = _heard(responses)
+    begin, end = _strong_taps(responses)
     figure = Figure(figsize=(9, 1.2 + 1.5 * count), layout="constrained")
-    grid: Any = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    grid = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     taps = np.arange(begin, end)
     for axes, one, receiver in zip(grid, values, sonar.receivers, strict=True):
         axes.plot(taps, np.abs(one[begin:end]), color="black", lw=1.2, label="magnitude")
@@ -44,11 +44,11 @@ def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
 
 
 def waterfall_figure(responses: ImpulseResponses) -> Figure:
-    """Magnitude over time and delay at each receiver, in dB of the largest."""
+    """Draw the magnitude over time and delay at each receiver, in dB of the largest."""
     from matplotlib.figure import Figure
 
     sonar, count = responses.sonar, len(responses.sonar.receivers)
-    begin, end = _heard(responses)
+    begin, end = _strong_taps(responses)
     level = np.abs(responses.response[:, :, begin:end])
     decibel = 20 * np.log10(np.maximum(level / max(float(level.max()), 1e-30), 10 ** (FAINT_DB / 20)))
     time = responses.time_s
@@ -56,8 +56,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
     # a row is drawn around its time
     extent = (1e3 * begin / sonar.sampling_hz, 1e3 * end / sonar.sampling_hz, time[-1] + half, time[0] - half)
     figure = Figure(figsize=(2.6 * count + 1.6, 4.5), layout="constrained")
-    grid: Any = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
-    shown: Any = None
+    grid = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
     for number, (axes, receiver) in enumerate(zip(grid, sonar.receivers, strict=True)):
         shown = axes.imshow(
             decibel[:, number], extent=extent, aspect="auto", cmap="magma", vmin=FAINT_DB, vmax=0, interpolation="nearest"
@@ -70,17 +69,17 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
 
 
 def response_png(responses: ImpulseResponses) -> bytes:
-    """:func:`response_figure` of the first ping."""
+    """Return the PNG of :func:`response_figure` for the first ping."""
     return _png(response_figure(responses))
 
 
 def waterfall_png(responses: ImpulseResponses) -> bytes:
-    """:func:`waterfall_figure`."""
+    """Return the PNG of :func:`waterfall_figure`."""
     return _png(waterfall_figure(responses))
 
 
-def _heard(responses: ImpulseResponses) -> tuple[int, int]:
-    """First tap and the one after the last that anything is to be seen in."""
+def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
+    """Return the first tap with a visible level, and the tap after the last one, with a margin."""
     level = np.abs(responses.response).max(axis=(0, 1))
     loud = np.flatnonzero(level > level.max() * 10 ** (FAINT_DB / 20))
     if not level.max() > 0:

@@ -1,8 +1,8 @@
-"""A look at a data set of impulse responses: pings of some samples, what changes between them, labels, mean energy."""
+"""Overview of a data set of impulse responses: pings of some samples, phase changes, labels and mean energy."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,19 +16,20 @@ if TYPE_CHECKING:
 __all__ = ["response_sheet"]
 
 SAMPLED_PINGS = 200
+"""Pings that means are taken over, about."""
 
 
 def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None = None, seed: int = 0) -> Figure:
-    """Magnitude of first and last ping, the phase between them, the label; below, mean energy and labels.
+    """Draw the first and last ping of samples, the phase between them and the label; below, mean energy and labels.
 
     Args:
-        store: of impulse responses.
-        samples: to draw.
-        receiver: by name; default: the first.
-        seed: of which samples.
+        store: a data set of impulse responses.
+        samples: number of samples to draw.
+        receiver: its name; default: the first.
+        seed: of the draw of the samples.
 
     Raises:
-        MitsonarError: no such receiver; a data set without sequences of the recipe's number of pings.
+        MitsonarError: no such receiver, or no sequence with the recipe's number of pings.
     """
     names = [one.name for one in store.recipe.channel_sonar.receivers]
     receiver = receiver or names[0]
@@ -51,8 +52,8 @@ def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None =
     return figure
 
 
-def _sample(axes: Any, store: DataStore, receiver: int, start: int, pings: int) -> None:
-    """Magnitudes, phase from first to last ping where there is sound, and the label."""
+def _sample(axes: NDArray[np.object_], store: DataStore, receiver: int, start: int, pings: int) -> None:
+    """Draw magnitudes, the phase from first to last ping where the response is strong, and the label."""
     delay_ms = 1e3 * store.read("delay_s")
     response = store.read("response", slice(start, start + pings))[:, receiver]
     for place, style in ((0, "-"), (pings - 1, ":")):
@@ -72,8 +73,8 @@ def _sample(axes: Any, store: DataStore, receiver: int, start: int, pings: int) 
     axes[2].text(0, 0.5, text, fontsize=9, va="center", family="monospace", transform=axes[2].transAxes)
 
 
-def _summary(axes: Any, store: DataStore, names: list[str]) -> None:
-    """Mean energy of the taps of each receiver, and where motions lie."""
+def _summary(axes: NDArray[np.object_], store: DataStore, names: list[str]) -> None:
+    """Draw the mean energy of the taps of each receiver, and the distribution of the motions."""
     every = max(1, len(store) // SAMPLED_PINGS)
     some = store.read("response", slice(None, None, every))
     for receiver, name in enumerate(names):
@@ -89,7 +90,7 @@ def _summary(axes: Any, store: DataStore, names: list[str]) -> None:
     axes[2].set(xlabel="yaw (deg a ping)", ylabel="pings")
 
 
-def _decibels(energy: NDArray[Any]) -> NDArray[Any]:
-    """Over the largest."""
+def _decibels(energy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return levels over the largest [dB]."""
     largest = energy.max() if energy.size and energy.max() > 0 else 1.0
     return np.asarray(10 * np.log10(np.maximum(energy / largest, 1e-12)))

@@ -1,18 +1,17 @@
-"""The one kernel: echoes to exact sums in range bins and beams.
+"""Sum echoes in range bins and beams, in one kernel and exactly.
 
-Every sum is carried out in 64-bit fixed point, so it does not depend on the order of rays, threads or batches; the scale
-follows from the largest sum that is possible, so nothing can overflow.
+Every sum is 64-bit fixed point, so it does not depend on the order of rays, threads or batches. The scale follows from the
+largest possible sum, so nothing can overflow.
 
 ``thesis``: a ray adds its level to the bin that holds its range (Almanza-Medina, eq. 2.2-2.3). ``physical``: its level is
 spread evenly over the range interval that its elevation cell covers. A box of density q over [a, b) is kept as its
-derivative by bins, four additions however long it is: q (1 - frac a) at floor a, q frac a at the next, the same at b
-with the other sign; one running sum over the bins then gives the image.
+derivative by bins, four additions for any length: q (1 - frac a) at floor a, q frac a at the next bin, and the same at b
+with the other sign. One running sum over the bins then gives the image.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,22 +22,23 @@ from mitsonar.acoustics.echo_level import level
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import View
 from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.view_echoes import NARROWEST, ViewEchoes, ViewTracer
 
 __all__ = ["Counts", "accumulate", "develop", "fetch", "strongest"]
 
 ADD = dr.ReduceMode.Local
-"""How additions meet: Dr.Jit's own choice counts on the number of threads staying the same until a launch is replayed."""
+"""Mode of the additions: Dr.Jit's default assumes that the number of threads is the same when a launch is replayed."""
 
 COUNTERS = 3
-"""Cells a beam beyond its bins: returns nearer than the window, farther than it, and misses."""
+"""Cells of a beam after its bins: returns nearer than the window, returns farther than it, and misses."""
 
 
 @dataclass
 class Counts:
-    """What became of the rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed.
+    """Numbers of rays of each beam ``(frames, beams)``: inside the window, nearer, farther, missed.
 
-    Where it differs from ping to ping which rays a beam has (``View.rays_a_beam`` is None), ``inside`` is -1.
+    Where the rays of a beam differ from ping to ping (``View.rays_a_beam`` is None), ``inside`` is -1.
     """
 
     inside: NDArray[np.int64]
@@ -48,18 +48,21 @@ class Counts:
 
 
 def stride(sonar: Sonar) -> int:
-    """Cells of the sums a beam: bins, the one past the last, counters."""
+    """Return the cells of a beam in the sums: bins, the cell after the last, counters."""
     return sonar.range_bins + 1 + COUNTERS
 
 
 def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer) -> mi.UInt64:
-    """Sums ``(pings, beams, stride)``, flat. Joins the kernel that makes the echoes.
+    """Sum the levels of a launch; joins the kernel that traces the echoes.
 
     Args:
-        seen: Dr.Jit arrays, one value a ray.
-        ping: which ping of the launch a ray belongs to.
-        pings: how many there are.
-        tracer: of the view whose image it is.
+        seen: Dr.Jit arrays, one value for each ray.
+        ping: index of each ray's ping in the launch.
+        pings: number of pings in the launch.
+        tracer: of the view.
+
+    Returns:
+        The sums ``(pings, beams, stride)``, flat.
     """
     sonar, active, beams = tracer.view.sonar, seen.active, len(tracer.view.bearing_rad)
     exact = _exact(seen.echoes)
@@ -91,8 +94,8 @@ def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer
     return sums
 
 
-def footprint(exact: Echoes, sonar: Sonar) -> tuple[Any, Any, Any]:
-    """Begin, end and length of each ray's range interval [bins], at least :data:`NARROWEST` long."""
+def footprint(exact: Echoes, sonar: Sonar) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Return begin, end and length of each ray's range interval [bins], at least :data:`NARROWEST` long."""
     a = (exact.near_m - sonar.range_min) * (1 / sonar.bin_m)
     b = (exact.far_m - sonar.range_min) * (1 / sonar.bin_m)
     wide = b - a > NARROWEST
@@ -103,7 +106,7 @@ def footprint(exact: Echoes, sonar: Sonar) -> tuple[Any, Any, Any]:
 
 
 def develop(sums: mi.UInt64, pings: int, tracer: ViewTracer) -> tuple[mi.Float, mi.UInt64]:
-    """Levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat, from the sums."""
+    """Turn sums into levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat."""
     view = tracer.view
     size, lines = stride(view.sonar), pings * len(view.bearing_rad)
     total = sums if view.sonar.model == "thesis" else dr.block_prefix_sum(sums, size, exclusive=False)
@@ -113,9 +116,9 @@ def develop(sums: mi.UInt64, pings: int, tracer: ViewTracer) -> tuple[mi.Float, 
 
 
 def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple[NDArray[np.float32], Counts]:
-    """Levels ``(pings, bins, beams)``, a view of beam-major memory, and counts, from what :func:`develop` gave.
+    """Copy the results of :func:`develop` to NumPy: levels ``(pings, bins, beams)``, beam-major in memory, and counts.
 
-    Turning the image round on the device takes ten times as long as converting it (scattered reads).
+    A transposition on the device would take ten times as long as the copy (scattered reads).
     """
     beams = len(view.bearing_rad)
     levels = np.array(image, copy=False).reshape(pings, beams, stride(view.sonar))[:, :, : view.sonar.range_bins]
@@ -125,8 +128,10 @@ def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple
 
 
 def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, view: View) -> mi.UInt64:
-    """For each cell ``(pings, beams, bins)`` the strongest ray that reaches it: density in the high 32 bits, the ray's
-    number in its ping in the low."""
+    """Find the strongest ray in each cell ``(pings, beams, bins)``.
+
+    The high 32 bits hold the density, the low 32 bits the number of the ray in its ping.
+    """
     sonar, beams = view.sonar, len(view.bearing_rad)
     exact = _exact(seen.echoes)
     best = dr.zeros(mi.UInt64, pings * beams * sonar.range_bins)
@@ -139,7 +144,7 @@ def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, vie
         value = value / width
     inside = seen.active & (exact.hit > 0) & (b > 0) & (a < sonar.range_bins) & (value > 0)
     a, b = _clip(a, sonar.range_bins), _clip(b, sonar.range_bins)
-    strength: Any = dr.reinterpret_array(mi.UInt32, mi.Float(value))
+    strength: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.Float(value))
     # a level below float32's smallest still beats an empty cell
     key = (mi.UInt64(dr.select(strength > 0, strength, 1)) << 32) | mi.UInt64(ray)
     start, bin_, end = (ping * beams + seen.beam) * sonar.range_bins, _whole(a), _whole(dr.ceil(b))
@@ -153,20 +158,20 @@ def strongest(seen: ViewEchoes, ping: mi.UInt32, ray: mi.UInt32, pings: int, vie
 
 
 def _exact(echoes: Echoes) -> Echoes:
-    """In double precision, as NumPy computes it."""
+    """Return the echoes in double precision, as NumPy computes them."""
     return Echoes(**{field.name: mi.Float64(getattr(echoes, field.name)) for field in fields(Echoes)})
 
 
 def _counter(hit: mi.Bool, near: mi.Bool, sonar: Sonar) -> mi.UInt32:
-    """The counter's cell of a ray that is not inside the window."""
+    """Return the cell that counts a ray outside the window."""
     near_cell = mi.UInt32(sonar.range_bins + 1)
     return dr.select(hit, dr.select(near, near_cell, near_cell + 1), near_cell + 2)
 
 
-def _clip(place: Any, bins: int) -> Any:
-    """Into 0..bins; by comparisons, since LLVM 15 and 16 abort on `max` (see simulation.variant)."""
+def _clip(place: DeviceArray, bins: int) -> DeviceArray:
+    """Clip into 0..bins by comparisons, since LLVM 15 and 16 abort on `max` (see simulation.variant)."""
     return dr.select(place > 0, dr.select(place < bins, place, bins), 0)
 
 
-def _whole(place: Any) -> mi.UInt32:
+def _whole(place: DeviceArray) -> mi.UInt32:
     return mi.UInt32(dr.select(place > 0, place, 0))

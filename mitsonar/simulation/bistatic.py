@@ -1,10 +1,10 @@
-"""What a receiver beside the transmitter hears (Almanza-Medina, 3.6): the transmitter's rays, seen from elsewhere."""
+"""Echoes at a receiver beside the transmitter (Almanza-Medina, 3.6): the transmitter's rays, seen from the receiver."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from mitsonar.instruments.imaging_sonar import RAYS, Sonar
 from mitsonar.instruments.views import Receiver
 from mitsonar.motion.pose import mounted, to_world_matrices
 from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 from mitsonar.simulation.view_echoes import ViewEchoes, fraction_bits
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ __all__ = ["ReceiverTracer"]
 
 
 class ReceiverTracer:
-    """The transmitter's echoes as a receiver beside it has them; see :class:`~mitsonar.instruments.views.Receiver`."""
+    """The transmitter's echoes at a receiver beside it; see :class:`~mitsonar.instruments.views.Receiver`."""
 
     def __init__(self, view: Receiver) -> None:
         self.view = view
@@ -36,23 +37,24 @@ class ReceiverTracer:
         traced = {name: getattr(view.transmitter, name) for name in RAYS}  # another window would want others
         self.bits = fraction_bits(view.transmitter.replace(**_window(sonar), **traced), view.transmitter.rays, gain)
 
-    def tables(self, poses: ArrayLike) -> dict[str, Any]:
-        """Where the receiver is: three rows of ``to_world`` a ping."""
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return the receiver's poses: three rows of ``to_world`` for each ping."""
         import mitsuba as mi
 
         rows = to_world_matrices(mounted(poses, self.view.offset))[:, :3].astype(np.float32)
         return {"rows": mi.Float(rows.ravel().tolist())}
 
-    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: dict[str, Any]) -> ViewEchoes:
-        """The echoes as the receiver has them."""
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return the echoes that the receiver measures."""
         import drjit as dr
         import mitsuba as mi
 
         from mitsonar.simulation.tracing import hidden
 
         lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
-        u: Any
-        point, normal = mi.Point3f(echoes.x, echoes.y, echoes.z), mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
+        u: DeviceArray
+        normal: DeviceArray = mi.Normal3f(echoes.nx, echoes.ny, echoes.nz)
+        point = mi.Point3f(echoes.x, echoes.y, echoes.z)
         way = mi.Vector3f(*(p - line.w for p, line in zip(point, lines, strict=True)))
         distance = dr.norm(way)
         u = way / distance
@@ -61,13 +63,16 @@ class ReceiverTracer:
         toward = dr.dot(normal, u)
         lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
         active = lit & ~hidden(scene, point, normal, u, distance, lit)
-        return ViewEchoes(self._heard(echoes, fan, u, distance, normal), dr.select(active, beam, 0), active, elevation)
+        return ViewEchoes(self._received(echoes, fan, u, distance, normal), dr.select(active, beam, 0), active, elevation)
 
-    def _beam(self, starboard: Any, forward: Any, up: Any) -> tuple[Any, Any, Any]:
-        """Beam, whether the direction lies in the field of view, and elevation [rad]."""
+    def _beam(
+        self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
+    ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+        """Return beam, whether the direction lies in the field of view, and elevation [rad]."""
         import drjit as dr
         import mitsuba as mi
 
+        place: DeviceArray
         sonar = self.view.sonar
         half = math.radians(sonar.azimuth_fov_deg) / 2
         if sonar.bearing == "azimuth":
@@ -78,16 +83,18 @@ class ReceiverTracer:
             place = bearing * (sonar.beams / (2 * half)) + sonar.beams / 2
         else:
             place = dr.sin(bearing) * (sonar.beams / (2 * math.sin(half))) + sonar.beams / 2
-        inside = (place >= 0) & (place < sonar.beams) & (dr.abs(bearing) <= half)
-        inside &= dr.abs(elevation) <= math.radians(sonar.elevation_fov_deg) / 2
+        aside: DeviceArray = dr.abs(bearing)
+        lift: DeviceArray = dr.abs(elevation)
+        inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
+        inside &= lift <= math.radians(sonar.elevation_fov_deg) / 2
         beam = mi.UInt32(dr.select(inside, place, 0))
         if sonar.beam_width_deg is not None and sonar.model == "physical":
             axes = mi.Float(sonar.bearing_rad.tolist())
             inside &= dr.abs(bearing - dr.gather(mi.Float, axes, beam)) <= sonar.beam_width_rad / 2
         return beam, inside, elevation
 
-    def _heard(self, echoes: Echoes, fan: Fan, u: Any, distance: Any, normal: Any) -> Echoes:
-        """Range, footprint, cosine and weight of the echoes between transmitter and receiver."""
+    def _received(self, echoes: Echoes, fan: Fan, u: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
+        """Compute range, footprint, cosine and weight of the echoes between transmitter and receiver."""
         import drjit as dr
 
         half = (echoes.range_m + distance) * 0.5
@@ -103,13 +110,13 @@ class ReceiverTracer:
         received.near_m, received.far_m = dr.select(low < high, low, high), dr.select(low < high, high, low)
         cosine = dr.abs(dr.dot(normal, u))
         received.cosine = dr.select(cosine < 1, cosine, 1)
-        # spreading is 1/R_B^2, and the law of levels divides by half the path squared
+        # spreading is 1/R_B^2, and the sonar equation divides by half the path squared
         received.solid_angle_sr = echoes.solid_angle_sr * (half / distance) ** 2
         return received
 
     @staticmethod
-    def _rate(echoes: Echoes, d: Any, turn: Any, u: Any, normal: Any) -> Any:
-        """Change of half the path by an angle of the transmitter's ray, on the tangent plane [m/rad]."""
+    def _rate(echoes: Echoes, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray) -> DeviceArray:
+        """Return the change of half the path by an angle of the transmitter's ray, on the tangent plane [m/rad]."""
         import drjit as dr
 
         from mitsonar.plugins.echo_integrator import steep
@@ -118,11 +125,11 @@ class ReceiverTracer:
         return (along + dr.dot(u, d * along + turn * echoes.range_m)) * 0.5
 
 
-def _window(sonar: Sonar) -> dict[str, Any]:
+def _window(sonar: Sonar) -> dict[str, float]:
     return {name: getattr(sonar, name) for name in ("range_min", "range_max", "range_bins")}
 
 
-def _asin(value: Any) -> Any:
+def _asin(value: DeviceArray) -> DeviceArray:
     import drjit as dr
 
     return dr.asin(dr.select(value < 1, dr.select(value > -1, value, -1), 1))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,26 +21,28 @@ from mitsonar.simulation.variant import thread_count
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitsonar.simulation.channel_tracing import EchoValues
+
 __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impulse_response"]
 
 FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
-"""What is fetched of :class:`~mitsonar.simulation.channel_tracing.EchoBatch`."""
+"""Fields of :class:`~mitsonar.simulation.channel_tracing.EchoBatch` that a launch returns."""
 
 PINGS_AT_A_TIME = 16
-"""Whose launches wait for their transforms: 50 bytes an echo and receiver."""
+"""Pings whose echoes wait in memory for their transforms: 50 bytes an echo and receiver."""
 
 
 @dataclass(frozen=True)
 class Channels:
-    """Responses of consecutive pings, and what became of the echoes.
+    """Responses of consecutive pings, with counts of their echoes.
 
     Attributes:
         first: number of the first ping.
         response: ``(pings, receivers, taps)`` complex64.
-        height_m: of the transmitter over what is straight below it ``(pings,)``; nan where nothing is.
-        echoes: that count ``(pings, receivers)``.
-        dropped: echoes from beyond ``range_max`` ``(pings, receivers)``.
+        height_m: of the transmitter over what is straight below it ``(pings,)`` [m]; nan where nothing is.
+        echoes: number of echoes within ``range_max`` ``(pings, receivers)``.
+        dropped: number of echoes from beyond ``range_max`` ``(pings, receivers)``.
     """
 
     first: int
@@ -60,8 +62,8 @@ class Paths:
     Attributes:
         delay_s: ``(n,)`` float64.
         amplitude: ``(n,)`` float64.
-        doppler_hz: shift of the carrier ``(n,)``, positive where the way gets shorter.
-        dropped: how many more came from beyond ``range_max``.
+        doppler_hz: shift of the carrier ``(n,)``, positive where the path gets shorter.
+        dropped: number of echoes from beyond ``range_max``.
     """
 
     delay_s: NDArray[np.float64]
@@ -71,22 +73,23 @@ class Paths:
 
 
 class ChannelSimulator:
-    """A scene heard by a channel sonar.
+    """Simulate the impulse responses that a channel sonar measures in a scene.
 
-    ``scatterers``: points of the world (:mod:`mitsonar.simulation.scatterers`) that the transmitter sees, one shadow ray
-    each; amplitude sqrt(C dA cos_A cos_B) / (r_A r_B), so that its square is the level of an imaging sonar's echo. ``rays``:
-    the thesis's model, rays that are fixed to the vehicle, evenly over each receiver's field of view; amplitude C cos_A.
+    Model ``scatterers``: points of the world (:mod:`mitsonar.simulation.scatterers`) that the transmitter sees, with one
+    shadow ray each. The amplitude is sqrt(C dA cos_A cos_B) / (r_A r_B), so that its square is the level of an imaging
+    sonar's echo. Model ``rays`` (Almanza-Medina, 5.2.1): rays that are fixed to the vehicle, evenly over each receiver's
+    field of view. The amplitude is C cos_A.
 
     Args:
         scene: any Mitsuba scene.
         sonar: the instrument.
-        like: of the same scene, whose scatterers are used again where the instruments would have the same.
+        like: a simulator of the same scene; its scatterers are shared where both instruments have the same.
 
     Attributes:
         notes: what a user should know about the scene's BSDFs.
 
     Raises:
-        MitsonarError: no surface to carry scatterers.
+        MitsonarError: no surface can carry scatterers.
     """
 
     def __init__(self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None) -> None:
@@ -100,13 +103,13 @@ class ChannelSimulator:
     def responses(
         self, flown: Trajectory, velocity: ArrayLike | None = None, progress: Callable[[int], None] = lambda pings: None
     ) -> ImpulseResponses:
-        """Responses of a whole trajectory.
+        """Simulate the responses of a whole trajectory.
 
         Args:
             flown: poses of the transmitter and times.
             velocity: in the vehicle's axes, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`; default:
                 that of the trajectory (:func:`~mitsonar.motion.trajectory.velocities`).
-            progress: called with the number of pings that were added.
+            progress: called with the number of new pings.
 
         Raises:
             MitsonarError: velocities that do not fit.
@@ -128,11 +131,11 @@ class ChannelSimulator:
         )
 
     def step(self, pose: ArrayLike, velocity: ArrayLike, *, time_s: float | None = None) -> ImpulseResponses:
-        """Measure the next ping of a closed loop.
+        """Simulate the next ping of a closed loop.
 
-        Stepping over the poses and velocities of a trajectory gives what :meth:`responses` gives for it, bit for bit. The
-        velocity is told each time: one pose alone does not say it. Nothing is drawn anew for a ping, and responses have no
-        gain: only the pings are counted, for their times.
+        Stepping over the poses and velocities of a trajectory gives the bits of :meth:`responses`. Each step needs its
+        velocity, since one pose does not determine it. The loop has no other state than the number of pings, for their
+        times: responses have no gain and no random numbers of a ping.
 
         Args:
             pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
@@ -140,10 +143,10 @@ class ChannelSimulator:
             time_s: of the ping [s]; default: its number / ``frame_rate_hz``.
 
         Returns:
-            One ping.
+            The responses of one ping.
 
         Raises:
-            MitsonarError: not one pose, or a velocity that cannot be.
+            MitsonarError: not one pose, or a velocity that is not finite or too large.
         """
         table = np.atleast_2d(np.asarray(pose, dtype=float))
         if table.shape != (1, 6):
@@ -158,13 +161,16 @@ class ChannelSimulator:
         self._stepped = 0
 
     def pings(self, poses: ArrayLike, velocity: ArrayLike | None = None, *, first: int = 0) -> Iterator[Channels]:
-        """Responses of consecutive pings, some at a time: memory does not grow with their number.
+        """Simulate consecutive pings in batches: memory does not grow with their number.
 
         Args:
             poses: of the transmitter when a ping is sent ``(pings, 6)``.
             velocity: in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s], or one
-                of all pings ``(4,)``; default: standing still.
+                of all pings ``(4,)``; default: at rest.
             first: number of the first ping.
+
+        Yields:
+            The responses of each batch.
 
         Raises:
             MitsonarError: velocities that do not fit.
@@ -177,15 +183,15 @@ class ChannelSimulator:
                 yield self._channels(table[here], speeds[here], first + begin, threads)
 
     def paths(self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int = 0) -> Paths:
-        """The echoes that one receiver's response is made of.
+        """Trace the echoes of one ping at one receiver.
 
         Args:
             pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
             velocity: as of :meth:`pings`.
-            receiver: its number.
+            receiver: its index.
 
         Raises:
-            MitsonarError: other numbers than these.
+            MitsonarError: no such receiver, or a pose or velocity that is not valid.
         """
         table = np.asarray(pose, dtype=float).reshape(1, -1)
         if table.shape != (1, 6) or not np.isfinite(table).all():
@@ -201,7 +207,7 @@ class ChannelSimulator:
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
     ) -> Channels:
-        """Responses of some pings: a launch for each; which points it asks for and its transform are found beside others."""
+        """Simulate some pings, one launch each; threads select its points and transform its echoes in parallel."""
         shape = (len(poses), len(self.sonar.receivers))
         asked = [threads.submit(self.tracer.source.asked, poses[k], receiver) for k, receiver in np.ndindex(shape)]
         made = []
@@ -218,8 +224,8 @@ class ChannelSimulator:
         )
 
 
-def _one_response(sonar: ChannelSonar, received: dict[str, NDArray[Any]]) -> tuple[NDArray[np.complex128], int, int]:
-    """One response, its echoes, and those from too far."""
+def _one_response(sonar: ChannelSonar, received: EchoValues) -> tuple[NDArray[np.complex128], int, int]:
+    """Return one response, the number of its echoes, and the number from beyond ``range_max``."""
     keep = np.flatnonzero(received["counts"])
     strength = np.empty(len(keep), np.complex128)
     strength.real, strength.imag = received["real"][keep], received["imag"][keep]
@@ -230,12 +236,15 @@ def _one_response(sonar: ChannelSonar, received: dict[str, NDArray[Any]]) -> tup
 def frequency_response(
     delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSonar
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Frequencies of the band ``(k,)`` [Hz] and H_f there (Almanza-Medina, eq. 5.15), by a type 1 non-uniform FFT.
+    """Compute the frequency response H_f of echoes (Almanza-Medina, eq. 5.15) by a type 1 non-uniform FFT.
 
     Args:
-        delay_s: of each echo.
-        amplitude: of each echo.
+        delay_s: of each echo ``(n,)`` [s].
+        amplitude: of each echo ``(n,)``.
         sonar: carrier, band and frequency step.
+
+    Returns:
+        Frequencies of the band ``(k,)``, from the carrier [Hz], and H_f ``(k,)``.
     """
     delay = np.asarray(delay_s, dtype=float)
     turn, strength = _phasors(delay, np.asarray(amplitude), sonar, 1)
@@ -245,35 +254,46 @@ def frequency_response(
 
 
 def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSonar) -> NDArray[np.complex128]:
-    """The response ``(taps,)`` of echoes: frequency response, raised cosine, inverse FFT (eq. 5.15-5.17), padded."""
+    """Compute the impulse response of echoes (Almanza-Medina, eq. 5.15-5.17).
+
+    The frequency response is weighted by a raised cosine, padded, and transformed by an inverse FFT.
+
+    Args:
+        delay_s: of each echo ``(n,)`` [s].
+        amplitude: of each echo ``(n,)``.
+        sonar: carrier, band, frequency step and taps.
+
+    Returns:
+        The response ``(taps,)``.
+    """
     delay = np.asarray(delay_s, dtype=float)
     turn, strength = _phasors(delay, np.asarray(amplitude), sonar, PADDING)
     return _taps(sonar, _spectrum(sonar, turn, strength, PADDING), PADDING)
 
 
 def _phasors(
-    delay: NDArray[np.float64], amplitude: NDArray[Any], sonar: ChannelSonar, padding: int
+    delay: NDArray[np.float64], amplitude: NDArray[np.inexact], sonar: ChannelSonar, padding: int
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """What :class:`EchoBatch` holds for the transform, of echoes on this side."""
+    """Compute phase step and complex amplitude of echoes in NumPy, as :class:`EchoBatch` holds them."""
     turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
     strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
     return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)
 
 
 def _half(sonar: ChannelSonar, padding: int) -> int:
-    """Number of the last frequency within the band, counted from its middle."""
+    """Return the index of the last frequency within the band, counted from its middle."""
     return math.floor((1 + sonar.rolloff) * sonar.bandwidth_hz / 2 / sonar.frequency_step_hz * padding + 1e-9)
 
 
 def _spectrum(
     sonar: ChannelSonar, turn: NDArray[np.float64], strength: NDArray[np.complex128], padding: int
 ) -> NDArray[np.complex128]:
-    """Sum of strength exp(-i k turn) for k of the band ``(2 half + 1,)``."""
+    """Sum strength exp(-i k turn) for each k of the band ``(2 half + 1,)``."""
     return phasor_sums(turn, strength, 2 * _half(sonar, padding) + 1)
 
 
 def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -> NDArray[np.complex128]:
-    """Raised cosine and inverse FFT (eq. 5.17); of the padded length the asked taps."""
+    """Apply raised cosine and inverse FFT (eq. 5.17), and cut the padded response to the taps."""
     half = _half(sonar, padding)
     number = np.arange(-half, half + 1)
     length_ = sonar.taps * padding
@@ -283,10 +303,10 @@ def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -
 
 
 def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDArray[np.float64]:
-    """Velocities ``(pings, 4)``.
+    """Return velocities ``(pings, 4)``.
 
     Raises:
-        MitsonarError: another shape, not finite, as fast as sound.
+        MitsonarError: another shape, not finite, or above a tenth of the sound speed.
     """
     table = np.zeros((pings, 4)) if velocity is None else np.atleast_2d(np.asarray(velocity, dtype=float))
     if table.shape == (1, 4):

@@ -1,11 +1,11 @@
-"""What a receiver hears of a scene: delay and amplitude of every echo, from scatterers of the world or from rays."""
+"""Echoes of a scene at a receiver: delay and amplitude of each, from scatterers of the world or from rays."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -15,24 +15,31 @@ from numpy.typing import NDArray
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar, FieldOfView, Maths
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.plugins.surfaces import Surfaces
+from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.scatterers import Scatterers
 from mitsonar.simulation.tracing import height_below, hidden
 from mitsonar.simulation.variant import garbage_stays
 
-__all__ = ["ChannelTracer", "EchoBatch"]
+__all__ = ["ChannelTracer", "EchoBatch", "EchoValues"]
+
+EchoValues: TypeAlias = dict[str, NDArray[Any]]
+"""Fields of :class:`EchoBatch` by name as NumPy arrays ``(points,)``, numbers or truth values."""
+
+_Launch: TypeAlias = Callable[..., list[DeviceArray]]
+"""A frozen launch: indices, scene, link table and tables to values."""
 
 DRJIT = Maths(dr.asin, dr.atan2, dr.cos, dr.clip, dr.select)
 
 
 class ChannelTracer:
-    """A scene as the receivers of a channel sonar hear it.
+    """Trace the echoes of a scene at the receivers of a channel sonar.
 
     Attributes:
         notes: what a user should know about the scene's BSDFs.
 
     Raises:
-        MitsonarError: no surface to carry scatterers.
+        MitsonarError: no surface can carry scatterers.
     """
 
     def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: ChannelTracer | None = None) -> None:
@@ -49,7 +56,7 @@ class ChannelTracer:
             self.source = _WorldScatterers(scene, sonar, shared)
         else:
             self.source = _VehicleRays(sonar, surfaces)
-        self.launches: dict[tuple[int, tuple[str, ...]], Callable[..., list[Any]]] = {}
+        self.launches: dict[tuple[int, tuple[str, ...]], _Launch] = {}
 
     def trace(
         self,
@@ -58,15 +65,15 @@ class ChannelTracer:
         receiver: int,
         wanted: tuple[str, ...],
         asked: NDArray[np.uint32] | None = None,
-    ) -> dict[str, NDArray[Any]]:
-        """What a receiver hears of one ping: values of :class:`EchoBatch`, one a point that it may hear.
+    ) -> EchoValues:
+        """Trace one ping at one receiver: values of :class:`EchoBatch`, one for each point that it may receive from.
 
         Args:
-            pose: of the transmitter ``(6,)``.
-            velocity: of the vehicle in its own axes ``(4,)``.
-            receiver: number of the receiver.
+            pose: of the transmitter ``(6,)`` [m, rad].
+            velocity: of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
+            receiver: its index.
             wanted: names of the values.
-            asked: numbers of the points that it may hear, where they are known already.
+            asked: indices of the points to trace; default: those that the receiver may receive from.
         """
         asked = self.source.asked(pose, receiver) if asked is None else asked
         if not len(asked):
@@ -79,15 +86,15 @@ class ChannelTracer:
         return {name: np.array(values) for name, values in zip(wanted, received, strict=True)}
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Height of each pose over what is straight below it ``(pings,)`` [m]; nan where there is nothing."""
+        """Return the height of each pose over what is straight below it ``(pings,)`` [m]; nan where there is nothing."""
         place = mi.Point3f(*(mi.Float(axis.astype(np.float32)) for axis in poses[:, :3].T))
         return np.array(height_below(self.scene, place), dtype=float)
 
-    def _compile(self, receiver: int, wanted: tuple[str, ...]) -> Callable[..., list[Any]]:
-        """A receiver's launch, traced once and then replayed (``dr.freeze``)."""
+    def _compile(self, receiver: int, wanted: tuple[str, ...]) -> _Launch:
+        """Record a receiver's launch; later calls replay it (``dr.freeze``)."""
 
         @dr.freeze
-        def launch(index: Any, scene: Any, table: Any, tables: Any) -> list[Any]:
+        def launch(index: mi.UInt32, scene: mi.Scene, table: mi.Float64, tables: DeviceArray) -> list[DeviceArray]:
             received = self.source.received(LinkGeometry(self.sonar, receiver, table), index, scene, tables)
             values = [getattr(received, name) for name in wanted]
             dr.eval(values)
@@ -98,33 +105,36 @@ class ChannelTracer:
 
 @dataclass
 class EchoBatch:
-    """Dr.Jit arrays, not evaluated yet, one value a point.
+    """Echoes as Dr.Jit arrays that are not evaluated yet, one value for each point.
 
     Attributes:
         delay: of the echo [s].
         amplitude: of the echo.
         doppler: shift of the carrier [Hz].
-        counts: whether there is an echo.
-        beyond: whether there was one, but from beyond ``range_max``.
-        turn: for the transform, the delay in turns of the finest frequency, -pi..pi.
+        counts: whether there is an echo within ``range_max``.
+        beyond: whether there is an echo from beyond ``range_max``.
+        turn: phase of the delay at the finest frequency, -pi..pi, for the transform [rad].
         real, imag: the amplitude with the carrier's phase.
     """
 
-    delay: Any
-    amplitude: Any
-    doppler: Any
-    counts: Any
-    beyond: Any
-    turn: Any
-    real: Any
-    imag: Any
+    delay: DeviceArray
+    amplitude: DeviceArray
+    doppler: DeviceArray
+    counts: DeviceArray
+    beyond: DeviceArray
+    turn: DeviceArray
+    real: DeviceArray
+    imag: DeviceArray
 
 
 def link_table(
     sonar: ChannelSonar, receiver: int, pose: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Of one ping: place of transmitter and receiver, the receiver's velocity, axes of its field of view and of the
-    transmitter's, all in the world ``(27,)``."""
+    """Return the geometry of one ping in the world ``(27,)``.
+
+    Three numbers each: positions of transmitter and receiver [m], the receiver's velocity [m/s]. Nine numbers each: axes of
+    the receiver's field of view, and of the transmitter's.
+    """
     turn = vehicle_rotation(pose).as_matrix()[0]
     one = sonar.receivers[receiver]
     offset = np.array(one.position)
@@ -134,11 +144,11 @@ def link_table(
 
 
 class LinkGeometry:
-    """Where transmitter and receiver are in a ping; on the device, what touches the phase in float64.
+    """Geometry between transmitter and receiver in one ping, on the device; what affects the phase is float64.
 
     Args:
         sonar: the instrument.
-        receiver: which.
+        receiver: its index.
         table: of :func:`link_table`.
     """
 
@@ -149,30 +159,31 @@ class LinkGeometry:
         self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
         self.sends: FieldOfView = sonar.transmitter
 
-    def vector(self, place: int) -> list[Any]:
-        """Three numbers of the table."""
-        return self.numbers[place : place + 3]
+    def vector(self, start: int) -> list[DeviceArray]:
+        """Return three numbers of the table."""
+        return self.numbers[start : start + 3]
 
     @property
-    def sent_from(self) -> list[Any]:
-        """Place of the transmitter."""
+    def sent_from(self) -> list[DeviceArray]:
+        """Return the position of the transmitter [m]."""
         return self.vector(0)
 
     @property
-    def velocity(self) -> list[Any]:
-        """Of the receiver."""
+    def velocity(self) -> list[DeviceArray]:
+        """Return the velocity of the receiver [m/s]."""
         return self.vector(6)
 
-    def axes(self, place: int) -> list[mi.Vector3f]:
-        """Of the receiver's field of view (0) or the transmitter's (1)."""
-        return [mi.Vector3f(*self.vector(9 + 9 * place + 3 * k)) for k in range(3)]
+    def axes(self, which: int) -> list[mi.Vector3f]:
+        """Return the axes of the receiver's field of view (0) or the transmitter's (1)."""
+        return [mi.Vector3f(*self.vector(9 + 9 * which + 3 * k)) for k in range(3)]
 
-    def to_point(self, point: list[Any]) -> tuple[list[Any], list[Any]]:
-        """From transmitter and from receiver to points of the world."""
-        return tuple([p - a for p, a in zip(point, self.vector(start), strict=True)] for start in (0, 3))  # type: ignore[return-value]
+    def to_point(self, point: list[DeviceArray]) -> tuple[list[DeviceArray], list[DeviceArray]]:
+        """Return the vectors from the transmitter and from the receiver to points of the world [m]."""
+        sent, received = ([p - a for p, a in zip(point, self.vector(start), strict=True)] for start in (0, 3))
+        return sent, received
 
-    def sensitivity(self, sent: Any, received: Any) -> Any:
-        """Of transmitter and receiver together, given unit directions."""
+    def sensitivity(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
+        """Return the sensitivity of transmitter and receiver together, given unit directions to the points."""
         ahead, aside, above = (dr.dot(axis, received) for axis in self.axes(0))
         both = self.listens.sensitivity(ahead, aside, above, DRJIT)
         if self.sends.shape != "all":
@@ -180,14 +191,17 @@ class LinkGeometry:
             both = both * self.sends.sensitivity(ahead, aside, above, DRJIT)
         return both
 
-    def doppler(self, sent: Any, received: Any) -> Any:
-        """Shift of the carrier [Hz]: both ways get shorter as the vehicle comes nearer."""
+    def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
+        """Return the shift of the carrier [Hz], given unit directions to the points.
+
+        It is positive where the vehicle approaches the point: both parts of the path get shorter.
+        """
         velocity = mi.Vector3f(*self.velocity)
         return (dr.dot(sent, velocity) + dr.dot(received, velocity)) * (1 / self.sonar.wavelength_m)
 
-    def told(self, delay: Any, amplitude: Any, doppler: Any, seen: Any) -> EchoBatch:
-        """What is heard, nearer than ``range_max`` or from beyond."""
-        beyond = seen & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
+    def echo_batch(self, delay: DeviceArray, amplitude: DeviceArray, doppler: DeviceArray, valid: DeviceArray) -> EchoBatch:
+        """Return the echoes, divided into those within ``range_max`` and those from beyond."""
+        beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
         turn = delay * (self.sonar.frequency_step_hz / PADDING)
         phase = delay * self.sonar.carrier_hz
         sin, cos = dr.sincos(mi.Float((phase - dr.round(phase)) * (2 * math.pi)))  # float32 once the turns are away
@@ -195,7 +209,7 @@ class LinkGeometry:
             delay=delay,
             amplitude=amplitude,
             doppler=doppler,
-            counts=seen & ~beyond,
+            counts=valid & ~beyond,
             beyond=beyond,
             turn=(turn - dr.round(turn)) * (2 * math.pi),
             real=amplitude * cos,
@@ -220,38 +234,38 @@ class _WorldScatterers:
         self.stored = mi.Float(rows.ravel())
 
     def asked(self, pose: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
-        """Numbers of the scatterers that a receiver may hear."""
+        """Return indices of the scatterers that a receiver may receive from."""
         turn = vehicle_rotation(pose).as_matrix()[0]
         one = self.sonar.receivers[receiver]
         return self.scatterers.within(pose[:3] + turn @ np.array(one.position), one.field.axes @ turn.T, one.field)
 
     def tables(self, receiver: int) -> mi.Float:
-        """What a launch reads: place, strength and normal of all points."""
+        """Return the inputs of a launch: position, strength and normal of all points."""
         return self.stored
 
-    def received(self, ways: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: mi.Float) -> EchoBatch:
-        """Delay, amplitude and visibility of scatterers."""
-        first: Any = dr.gather(mi.Vector4f, tables, index * 2)
-        second: Any = dr.gather(mi.Vector4f, tables, index * 2 + 1)
+    def received(self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: mi.Float) -> EchoBatch:
+        """Return the echoes of the scatterers that transmitter and receiver see."""
+        first: DeviceArray = dr.gather(mi.Vector4f, tables, index * 2)
+        second: DeviceArray = dr.gather(mi.Vector4f, tables, index * 2 + 1)
         at, strength, normal = mi.Point3f(first.x, first.y, first.z), first.w, mi.Normal3f(second.x, second.y, second.z)
-        to_point, from_receiver = ways.to_point([mi.Float64(value) for value in at])
-        delay = delay_exact(to_point, from_receiver, ways.velocity, self.sonar.sound_speed)
+        to_point, from_receiver = link.to_point([mi.Float64(value) for value in at])
+        delay = delay_exact(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
         way_out, way_back = mi.Vector3f(*to_point), mi.Vector3f(*from_receiver)
         sent, received = dr.norm(way_out), dr.norm(way_back)
-        u_sent: Any = way_out / sent
-        u_heard: Any = way_back / received
-        weight = ways.sensitivity(u_sent, u_heard)
-        lambert = dr.dot(normal, u_sent) * dr.dot(normal, u_heard)
+        u_sent: DeviceArray = way_out / sent
+        u_received: DeviceArray = way_back / received
+        weight = link.sensitivity(u_sent, u_received)
+        lambert = dr.dot(normal, u_sent) * dr.dot(normal, u_received)
         inside = (weight > 0) & (lambert > 0)
         seen = inside & ~hidden(scene, at, normal, u_sent, sent, inside)
         amplitude = weight * dr.sqrt(dr.select(seen, strength * lambert, 0))
         if self.sonar.spreads:
             amplitude /= sent * received
-        return ways.told(delay, amplitude, ways.doppler(u_sent, u_heard), seen)
+        return link.echo_batch(delay, amplitude, link.doppler(u_sent, u_received), seen)
 
 
 class _VehicleRays:
-    """Echoes of rays that are fixed to the vehicle, evenly over each receiver's field of view (the thesis's, 5.2.1)."""
+    """Echoes of rays that are fixed to the vehicle, evenly over each receiver's field of view (Almanza-Medina, 5.2.1)."""
 
     def __init__(self, sonar: ChannelSonar, surfaces: Surfaces) -> None:
         self.sonar, self.surfaces = sonar, surfaces
@@ -260,37 +274,39 @@ class _VehicleRays:
         self.stored = [mi.Float64(each.ravel()) for each in directions]
 
     def asked(self, pose: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
-        """Numbers of the rays that belong to a receiver."""
+        """Return indices of the rays that belong to a receiver."""
         return self.numbers[receiver]
 
-    def tables(self, receiver: int) -> tuple[Any, ...]:
-        """What a launch reads: directions of the rays, tables of the surfaces."""
+    def tables(self, receiver: int) -> tuple[mi.Float64, LaunchTables]:
+        """Return the inputs of a launch: directions of the rays, tables of the surfaces."""
         return self.stored[receiver], self.surfaces.arrays()
 
-    def received(self, ways: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: tuple[Any, ...]) -> EchoBatch:
-        """Delay and amplitude of what the rays hit."""
+    def received(
+        self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: tuple[mi.Float64, LaunchTables]
+    ) -> EchoBatch:
+        """Return the echoes of the points that the rays hit."""
         directions, facets = tables
         own = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
-        axes = [ways.vector(9 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
+        axes = [link.vector(9 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
         u = [sum(own[k] * axes[k][axis] for k in range(3)) for axis in range(3)]
         u_sent = mi.Vector3f(*u)
-        hit = replace(self.surfaces, **facets).hit(scene, mi.Ray3f(mi.Point3f(*ways.sent_from), u_sent))
-        point = [a + axis * mi.Float64(hit.t) for a, axis in zip(ways.sent_from, u, strict=True)]
-        to_point, from_receiver = ways.to_point(point)
-        delay = delay_iterated(to_point, from_receiver, ways.velocity, self.sonar.sound_speed)
+        hit = replace(self.surfaces, **facets).hit(scene, mi.Ray3f(mi.Point3f(*link.sent_from), u_sent))
+        point = [a + axis * mi.Float64(hit.t) for a, axis in zip(link.sent_from, u, strict=True)]
+        to_point, from_receiver = link.to_point(point)
+        delay = delay_iterated(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
         way_back = mi.Vector3f(*from_receiver)
         received = dr.norm(way_back)
-        weight = ways.sensitivity(u_sent, way_back / received)
+        weight = link.sensitivity(u_sent, way_back / received)
         amplitude = weight * hit.reflectivity * dr.abs(dr.dot(hit.n, u_sent))
         if self.sonar.spreads:
             amplitude /= hit.t * received
-        return ways.told(delay, amplitude, ways.doppler(u_sent, way_back / received), hit.valid & (weight > 0))
+        return link.echo_batch(delay, amplitude, link.doppler(u_sent, way_back / received), hit.valid & (weight > 0))
 
 
 def _even(field: FieldOfView, rays: int) -> NDArray[np.float64]:
-    """Directions evenly over a field of view, along its axes ``(n, 3)``: about ``rays`` of them within it.
+    """Return directions evenly over a field of view, along its axes ``(n, 3)``: about ``rays`` of them within it.
 
-    A little more than the field is covered, since it is the receiver's and rays begin at the transmitter.
+    They cover :data:`MARGIN_DEG` more: the field is the receiver's, but rays begin at the transmitter.
     """
     match field.shape:
         case "rectangular":
@@ -309,4 +325,4 @@ def _even(field: FieldOfView, rays: int) -> NDArray[np.float64]:
 
 
 MARGIN_DEG = 2.0
-"""By which rays from the transmitter go beyond a receiver's field of view: 0.1 m at 3 m."""
+"""Angle by which the rays exceed a receiver's field of view: 0.1 m at 3 m."""

@@ -1,13 +1,14 @@
 """What a sonar receives, differentiated by its motion: central differences of rendered frames.
 
-A frame is random where rays are moved within their cells, and a function with jumps where they are not: a ray crosses the
-border of a bin or of a textured cell, or slides off a rock. What has a derivative is the mean over the draws of the jitter.
-It is taken with common random numbers (both sides of a difference draw the same rays), over many pings, in two halves that
-share no ping: noise of the rays lifts J' W J by its own square, but not J1' W J2, whose expectation is right.
+A frame with jitter is random. A frame without jitter is a function with jumps: a ray crosses the border of a bin or of a
+textured cell, or slides off a rock. The mean over the draws of the jitter has a derivative. It is estimated with common
+random numbers (both sides of a difference draw the same rays), over many pings, in two halves that share no ping. The noise
+of the rays biases J' W J by its own square. It does not bias J1' W J2.
 
-A difference over 2 d is the derivative of the frame smoothed over a box of that length. Were each axis smoothed along itself
-only, a motion that hardly shows (sideways against yaw) would seem to show, by what the smoothings differ. So each ping is
-displaced along the other two axes, evenly within their boxes: all three derivatives are those of one function.
+A difference over 2 d is the derivative of the frame smoothed over a box of that length. If each axis were smoothed along
+itself only, the smoothings would differ, and a motion that is almost unobservable (sideways against yaw) would seem
+observable. So each ping is displaced along the other two axes, evenly within their boxes. All three derivatives are then
+those of one function.
 """
 
 from __future__ import annotations
@@ -27,28 +28,31 @@ from mitsonar.simulation.imaging import Simulator
 __all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "jittered", "step_for"]
 
 FIRST_PING = 2**40
-"""Pings from here on are drawn for derivatives: no run or data set counts so far, so its frames are independent of them."""
+"""First ping of derivatives. No run or data set counts so far, so its frames are independent of derivatives."""
 
 STEP = 1 / 16
-"""Step, as a part of the bin or beam that it moves echoes by: small against both, and against the texture, whose finest
-detail would be lost; large enough that some rays cross a border, or noise of the rays would be all that is left. Halving it
-changes bounds by 2 % (thesis model) to 10 % (physical): edges and nearest points of rocks have no scale of their own."""
+"""Step, as a part of the bin or beam by which it moves echoes.
+
+It is small against both, and against the finest detail of textures. It is large enough that some rays cross a border;
+otherwise only the noise of the rays would remain. Halving it changes bounds by 2 % (model ``thesis``) to 10 %
+(``physical``): edges and nearest points of rocks have no scale of their own.
+"""
 
 PINGS = 8
-"""Of each half: bounds of a full frame then vary by 1 to 4 %."""
+"""Pings of each half: bounds of a full frame then vary by 1 to 4 %."""
 
 
 @dataclass(frozen=True)
 class Derivative:
-    """One view at one pose, over the draws of its jitter, and how it changes with the motion.
+    """The mean of one view at one pose over its jitter, and its derivatives by the motion.
 
     Attributes:
         level: mean of the pixels before noise, after gain and clipped to 0..1 ``(bins, beams)``.
         filled: part of the pings in which a pixel holds an echo ``(bins, beams)``.
-        variance: of a pixel's level from ping to ping, which is the noise of the rays ``(bins, beams)``.
+        variance: of a pixel's level between pings, which is the noise of the rays ``(bins, beams)``.
         jacobian: two independent estimates of the derivatives of level and filled by sideways, forward [1/m] and yaw
             [1/rad], float32 ``(2, bins, beams, 2, 3)``.
-        pings: that each half is the mean of.
+        pings: number of pings in each half.
     """
 
     level: NDArray[np.float64]
@@ -67,20 +71,23 @@ def differentiate(
     step: Motion | None = None,
     first: int = FIRST_PING,
 ) -> Iterator[list[Derivative]]:
-    """Derivatives at each pose, one for each view of the simulator.
+    """Estimate the derivatives at each pose, one for each view of the simulator.
 
     The motion is the one of eq. 3.4 (Almanza-Medina) at rest: sideways, forward, yaw of the sonar's own pose.
 
     Args:
-        simulator: of scene, sonar and views; its rays are jittered for this, whatever its sonar says.
+        simulator: of scene, sonar and views; its rays are jittered here, even where its sonar has no jitter.
         poses: of the sonar ``(n, 6)`` x, y, z [m], pitch, roll, heading [rad].
-        gain: the constant that levels are multiplied by.
+        gain: constant factor of the levels.
         pings: of each half, at least 1; each is rendered on both sides of three steps, 12 frames.
         step: half the distance between both sides; default: :func:`step_for` the sonar.
         first: number of the first ping.
 
+    Yields:
+        The derivatives of each pose.
+
     Raises:
-        MitsonarError: poses that are none, no ping.
+        MitsonarError: poses that are not finite ``(n, 6)``, or no ping.
     """
     table = np.atleast_2d(np.asarray(poses, dtype=float))
     if table.ndim != 2 or table.shape[1] != 6 or not np.isfinite(table).all():
@@ -93,20 +100,20 @@ def differentiate(
 
 
 def jittered(simulator: Simulator) -> Simulator:
-    """The simulator, with rays that are moved at random within their cells."""
+    """Return a simulator with rays that are jittered within their cells; the given one where it is so already."""
     if simulator.sonar.jittered:
         return simulator
     return Simulator(simulator.tracer.scene, simulator.sonar.replace(jitter=True), views=simulator.views)
 
 
 def step_for(sonar: Sonar, part: float = STEP) -> Motion:
-    """Steps that move echoes by a part of a bin (forward) and of a beam (sideways, yaw)."""
+    """Return steps that move echoes by a part of a bin (forward) and of a beam (sideways, yaw) [m, rad]."""
     middle = (sonar.range_min + sonar.range_max) / 2
     return Motion(part * sonar.beam_width_rad * middle, part * sonar.bin_m, part * sonar.beam_width_rad)
 
 
 def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, first: int) -> list[Derivative]:
-    """Means of both sides of each step, in two halves, become one derivative a view."""
+    """Render both sides of each step, in two halves, and return one derivative for each view."""
     sums = [_Sums.empty(len(view.bearing_rad), view.sonar.range_bins) for view in source.views]
     within = _evenly(2 * pings) * np.array(step)
     for axis in range(3):
@@ -114,14 +121,14 @@ def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, fi
             motions = within.copy()
             motions[:, axis] = (2 * side - 1) * step[axis]
             moved = np.array([compose(pose, Motion(*motion)) for motion in motions])
-            for looks in source.render_views(moved, first=first):
-                for own, seen in zip(sums, looks, strict=True):
+            for views in source.render_views(moved, first=first):
+                for own, seen in zip(sums, views, strict=True):
                     own.add(seen.levels, np.arange(len(seen)) + seen.first - first >= pings, gain, axis, side)
     return [own.derivative(pings, step) for own in sums]
 
 
 def _evenly(count: int) -> NDArray[np.float64]:
-    """Points ``(count, 3)`` that fill the cube -1..1 evenly, every run of them: the additive recurrence of M. Roberts."""
+    """Return points ``(count, 3)`` that fill the cube -1..1 evenly, as does every run of them (M. Roberts' recurrence)."""
     ratio = 1.2207440846057596  # the root of x^4 = x + 1
     return np.asarray((np.arange(1, count + 1)[:, None] / ratio ** np.arange(1, 4)) % 1 * 2 - 1)
 
@@ -143,7 +150,7 @@ class _Sums:
         return cls(np.zeros((2, 3, 2, 2, bins, beams)), np.zeros((bins, beams)))
 
     def add(self, levels: NDArray[np.float32], second: NDArray[np.bool_], gain: float, axis: int, side: int) -> None:
-        """Pings of one side; ``second`` tells which are of the second half."""
+        """Add pings of one side; ``second`` marks those of the second half."""
         for half in (0, 1):
             image = np.minimum(levels[second == half] * np.float32(gain), np.float32(1))
             self.of[half, axis, side, 0] += image.sum(axis=0, dtype=np.float64)
@@ -151,7 +158,7 @@ class _Sums:
             self.squares += np.einsum("pij,pij->ij", image, image, dtype=np.float64)
 
     def derivative(self, pings: int, step: Motion) -> Derivative:
-        """Differences over twice the steps, and means over all sides."""
+        """Compute differences over twice the steps, and means over all sides."""
         level, filled = self.of.mean(axis=(0, 1, 2)) / pings
         jacobian = (self.of[:, :, 1] - self.of[:, :, 0]) / pings / (2 * np.array(step))[:, None, None, None]
         variance = np.maximum(self.squares / (12 * pings) - level**2, 0.0)

@@ -1,4 +1,4 @@
-"""What to say of frames without echoes: where the sonar is, where it looks, what its rays met, what may be wrong."""
+"""Describe frames without echoes: pose and view of the sonar, what its rays hit, and what may be wrong."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mitsonar.motion.pose import vehicle_rotation
 __all__ = ["NEARLY_EMPTY", "angle_hint", "empty_frames", "view_of"]
 
 NEARLY_EMPTY = 1e-4
-"""A frame with a smaller part of its pixels filled is said to be empty: 5 pixels of 512 x 96."""
+"""Part of the pixels below which a frame counts as empty: 5 pixels of 512 x 96."""
 
 
 def empty_frames(
@@ -24,22 +24,22 @@ def empty_frames(
     window: tuple[float, float],
     found: tuple[float, float] | None,
 ) -> str:
-    """One sentence on empty frames.
+    """Describe empty frames in one sentence.
 
     Args:
-        empty: how many frames hold no echo, or hardly one (:data:`NEARLY_EMPTY`).
-        frames: how many there are.
-        first: number of the first of the empty ones and its pose ``(6,)`` [m, rad].
-        rays: of that frame, how many met something inside the window, nearer, farther, and nothing.
-        window: nearest and farthest range that is shown [m].
+        empty: number of frames with no echo, or almost none (:data:`NEARLY_EMPTY`).
+        frames: number of all frames.
+        first: number of the first empty frame, and its pose ``(6,)`` [m, rad].
+        rays: numbers of that frame's rays that hit something inside the window, nearer, farther, and nothing.
+        window: nearest and farthest range of the image [m].
         found: nearest and farthest return outside the window in that frame [m]; None where there is none.
     """
     number, pose = first
     hint = angle_hint(pose)
     if not any(rays[:3]):
         check = "check the pose (x, y, z in m; pitch > 0 looks down) and the scene's units"
-        said = f"no ray hit anything in {empty} frames: {check}; in frame {number} {view_of(pose)}"
-        return f"{said}; {hint}" if hint else said
+        text = f"no ray hit anything in {empty} frames: {check}; in frame {number} {view_of(pose)}"
+        return f"{text}; {hint}" if hint else text
     inside, nearer, farther, missed = (100 * count / sum(rays) for count in rays)
     beside = f" (returns at {found[0]:.3g}..{found[1]:.3g} m)" if found else ""
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
@@ -51,7 +51,7 @@ def empty_frames(
 
 
 def view_of(pose: NDArray[np.float64]) -> str:
-    """Where a sonar is and where it looks, in words."""
+    """Describe position and view direction of a sonar in words."""
     forward = vehicle_rotation(pose).apply([0.0, 1.0, 0.0])[0]
     below = math.degrees(math.asin(float(np.clip(-forward[2], -1, 1))))
     level = (
@@ -62,7 +62,7 @@ def view_of(pose: NDArray[np.float64]) -> str:
 
 
 def angle_hint(pose: NDArray[np.float64]) -> str:
-    """What may be wrong with the angles of an empty frame: the other unit, or a view upwards; nothing where neither shows.
+    """Suggest what is wrong with the angles of an empty frame: their unit, or a view upwards; else return an empty text.
 
     Args:
         pose: x, y, z [m], pitch, roll, heading [rad].

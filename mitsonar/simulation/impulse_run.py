@@ -1,12 +1,12 @@
-"""Runs of impulse responses on disk: written as they are made; a run that is killed goes on to the same bits."""
+"""Runs of impulse responses on disk. A run that was killed can be resumed and ends with the same bits."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.render_run import SIMULATORS
 
+if TYPE_CHECKING:
+    import zarr
+
 __all__ = ["SOUNDING", "ImpulseReport", "Spread", "iteration_error", "run_impulse", "spread_of"]
 
 SOUNDING = RunKind(
@@ -35,28 +38,28 @@ SOUNDING = RunKind(
 )
 
 OVERSPREAD = 0.3
-"""Delay spread times Doppler spread above which a channel can hardly be measured."""
+"""Delay spread times Doppler spread above which a channel is reported as overspread."""
 
 MOST_ENERGY = (0.01, 0.99)
-"""Quantiles of the echoes' energy between which delays and Doppler shifts are counted as spread."""
+"""Quantiles of the echoes' energy between which the spread of delays and Doppler shifts is measured."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How far echoes spread: 98 % of their energy lies within ``delay_s`` [s] and ``doppler_hz`` [Hz]."""
+    """Delay spread [s] and Doppler spread [Hz] of echoes: 98 % of their energy lies within each."""
 
     delay_s: float
     doppler_hz: float
 
     @property
     def factor(self) -> float:
-        """Above 1 a channel changes before it has been heard once."""
+        """Return delay spread times Doppler spread; above 1 a channel changes within one response."""
         return self.delay_s * self.doppler_hz
 
 
 @dataclass(frozen=True)
 class ImpulseReport:
-    """What a run did."""
+    """Folder, number of pings, spread and warnings of a run."""
 
     folder: Path
     pings: int
@@ -70,22 +73,22 @@ def run_impulse(
     velocity: NDArray[np.float64],
     folder: str | Path,
     *,
-    origin: dict[str, Any],
+    origin: Mapping[str, object],
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[int], None] = lambda pings: None,
 ) -> ImpulseReport:
-    """Make a run's folder, or go on with one: ``responses.zarr`` and ``.npz``, two figures, ``run.json``.
+    """Make a run's folder, or resume one: ``responses.zarr`` and ``.npz``, two figures, ``run.json``.
 
     Args:
         simulator: scene and instrument.
         flown: poses and times of the pings.
         velocity: of the vehicle in each, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`.
         folder: of the run.
-        origin: what repeats the run beside instrument and path.
+        origin: what reproduces the run, beside instrument and trajectory.
         overwrite: replace a run that is there.
-        resume: go on with a run that was broken off.
-        progress: called with the number of pings that were added.
+        resume: continue a run that was interrupted.
+        progress: called with the number of new pings.
 
     Raises:
         MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
@@ -120,7 +123,7 @@ def _make(
     run: RunDirectory,
     progress: Callable[[int], None],
 ) -> ImpulseResponses:
-    """Make the pings that are missing; the run's notes follow each batch."""
+    """Simulate the missing pings; the run's notes are updated after each batch."""
     import zarr
 
     done = run.count("frames_done", len(flown))
@@ -149,26 +152,31 @@ def _make(
             progress(len(part))
     except MitsonarError:
         raise
-    except Exception as error:  # a damaged Zarr raises whatever its bytes lead to
+    except Exception as error:  # a damaged Zarr store raises errors of any type
         raise MitsonarError(f"cannot go on with {url}: {error}; make it again with --overwrite") from None
     return ImpulseResponses.load(url)
 
 
-def _check(group: Any, pings: int, sonar: ChannelSonar) -> None:
-    """That a store is that of the run, before anything is written into it."""
+def _check(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
+    """Check that a store is that of the run, before anything is written into it.
+
+    Raises:
+        MitsonarError: an array is missing or has another shape or type.
+        ValueError: an array has other chunks.
+    """
     sizes = {"pings": pings, "receivers": len(sonar.receivers), "taps": sonar.taps, "four": 4, "six": 6}
     for name, column in COLUMNS.items():
-        array = group[name]
+        array = cast("zarr.Array[Any]", group[name])
         check_column(array, name, column, sizes, str(group.store_path))
         if array.chunks != ((1, *array.shape[1:]) if array.ndim > 2 else array.shape):
             raise ValueError(f"{name} is cut into pieces of {array.chunks}")
 
 
 def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[Paths]) -> None:
-    """Nothing is heard in the first ping: neither may it be in the middle and the last.
+    """Refuse a run without echoes in the first, the middle and the last ping; the first is known to have none.
 
     Raises:
-        MitsonarError: it is not.
+        MitsonarError: there are none in the other two either.
     """
     sonar = simulator.sonar
     for pose in flown.poses[[len(flown) // 2, -1]]:
@@ -179,18 +187,18 @@ def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[
     height = float(simulator.tracer.height_m(flown.poses[:1])[0])
     below = f"{height:.3g} m above what is below it" if math.isfinite(height) else "with nothing below it"
     raise MitsonarError(
-        f"no receiver hears anything: the vehicle is at ({x:g}, {y:g}, {z:g}) m, {below}, pitched by "
+        f"no receiver has an echo: the vehicle is at ({x:g}, {y:g}, {z:g}) m, {below}, pitched by "
         f"{math.degrees(pitch):.3g} deg; {beyond:,} echoes came from beyond range_max {sonar.range_max:g} m. z is upwards, "
-        "a level vehicle has pitch 0 (to_world's +z is forward), and receivers look tilt_deg away from straight down"
+        "a level vehicle has pitch 0 (to_world's +z is forward), and receivers point tilt_deg away from straight down"
     )
 
 
 FAR_ARM_M = 10.0
-"""A receiver farther from the transmitter is probably given in millimetres."""
+"""Distance from the transmitter [m] above which a receiver's position is probably given in millimetres."""
 
 
 def spread_of(paths: list[Paths]) -> Spread:
-    """Spread of the echoes of all receivers, of 98 % of their energy."""
+    """Measure the spread of the echoes of all receivers, of 98 % of their energy."""
     energy = np.concatenate([path.amplitude**2 for path in paths])
     widths = []
     for values in (np.concatenate([path.delay_s for path in paths]), np.concatenate([path.doppler_hz for path in paths])):
@@ -204,7 +212,7 @@ def spread_of(paths: list[Paths]) -> Spread:
 
 
 def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
-    """What the user should know of a run, a sentence each."""
+    """Return the warnings of a run, one sentence each."""
     sentences = []
     assert made.echoes is not None
     assert made.dropped is not None
@@ -212,14 +220,14 @@ def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
         silent = int((made.echoes[:, number] == 0).sum())
         away = math.dist(receiver.position, (0, 0, 0))
         if away > FAR_ARM_M:
-            sentences.append(f"receiver {receiver.name} sits {away:g} m from the transmitter: positions are in metres")
+            sentences.append(f"receiver {receiver.name} is {away:g} m from the transmitter: positions are in metres")
         if silent:
-            looks = receiver.field
-            up = " (more than 90 looks up)" if looks.tilt_deg > 90 else ""
+            view = receiver.field
+            up = " (above 90: upwards)" if view.tilt_deg > 90 else ""
             pitch = "" if made.poses is None else f" (pitched by {math.degrees(made.poses[0, 3]):.3g} deg)"
             sentences.append(
-                f"receiver {receiver.name} hears nothing in {silent} of {len(made)} pings: check where it looks "
-                f"(heading {looks.heading_deg:g} deg, tilt {looks.tilt_deg:g} deg from straight down{up}), "
+                f"receiver {receiver.name} has no echo in {silent} of {len(made)} pings: check its direction "
+                f"(heading {view.heading_deg:g} deg, tilt {view.tilt_deg:g} deg from straight down{up}), "
                 f"the vehicle's pose{pitch} and range_max"
             )
     dropped = int(made.dropped.sum())
@@ -239,8 +247,13 @@ def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
 
 
 def iteration_error(flown: Trajectory, velocity: NDArray[np.float64], sonar: ChannelSonar) -> tuple[float, float]:
-    """What the thesis's two rounds (eq. 5.5-5.14) leave of a moving receiver's delay: largest static error and that of two
-    rounds, in turns of the carrier, for points ahead and behind at ``range_max``."""
+    """Bound the error of a moving receiver's delay by Almanza-Medina's iteration (eq. 5.5-5.14).
+
+    The points lie ahead and behind at ``range_max``.
+
+    Returns:
+        Largest errors without iteration and after two rounds [turns of the carrier]; 0, 0 where they are not finite.
+    """
     speed = float(np.linalg.norm(velocity[:, :3], axis=1).max(initial=0.0))
     ahead = (np.array([sonar.range_max, -sonar.range_max]), np.zeros(2), np.zeros(2))
     moving = (np.full(2, speed), np.zeros(2), np.zeros(2))

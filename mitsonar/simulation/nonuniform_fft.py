@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import finufft
 import numpy as np
@@ -14,16 +13,19 @@ from mitsonar.simulation.variant import current_variant
 __all__ = ["TOLERANCE", "phasor_sums"]
 
 TOLERANCE = 1e-9
-"""Relative, of the sums."""
+"""Relative error of the sums."""
 
 
 def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], modes: int) -> NDArray[np.complex128]:
-    """Sums of strength exp(-i k turn) ``(modes,)`` for an odd number of k around 0.
+    """Sum strength exp(-i k turn) over the echoes, for an odd number of k around 0.
 
     Args:
-        turn: of each echo, -pi..pi ``(n,)``.
-        strength: of each echo ``(n,)``.
-        modes: how many k.
+        turn: phase step of each echo, -pi..pi ``(n,)`` [rad].
+        strength: complex amplitude of each echo ``(n,)``.
+        modes: number of k.
+
+    Returns:
+        The sums ``(modes,)``.
     """
     if not len(turn):
         return np.zeros(modes, np.complex128)
@@ -34,7 +36,7 @@ def phasor_sums(turn: NDArray[np.float64], strength: NDArray[np.complex128], mod
 
 @cache
 def _has_cufinufft() -> bool:
-    """Whether it is installed and loads: it finds CUDA's libraries in those of torch, if their versions agree."""
+    """Test whether cufinufft is installed and loads; it finds CUDA's libraries in torch's, if their versions agree."""
     try:
         import torch  # noqa: F401, I001  # first: its libraries are found then
 
@@ -48,5 +50,5 @@ def _on_the_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], 
     import cufinufft
     import torch
 
-    there: Any = (torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength))
+    there = [torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength)]
     return np.asarray(cufinufft.nufft1d1(*there, modes, eps=TOLERANCE, isign=-1).cpu().numpy())

@@ -1,8 +1,8 @@
-"""Points that belong to the world and scatter sound, and which of them a field of view may hold.
+"""Points of the world that scatter sound, and a search for those in a field of view.
 
-A surface whose reflectivity comes in cells (``cell_noise`` over uv, or a picture) has one point in each cell, at a place
-that is a hash of the cell; any other surface gets points at random, so many a square metre, from the seed. Neither depends
-on who looks, when, or with how many rays.
+A surface whose reflectivity comes in cells (``cell_noise`` over uv, or a picture) has one point in each cell. Its position
+is a hash of the cell. Any other surface gets random points, ``points_per_m2`` of them, from the seed. The points do not
+depend on the sonar's pose, the time or the number of rays.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -24,31 +24,32 @@ from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.surfaces import facet_points, reflectances_of, reflectivity_at
+from mitsonar.simulation.device_arrays import DeviceArray
 
 __all__ = ["Scatterers"]
 
 MOST = 2**26
-"""Points of a scene: 28 bytes each."""
+"""Largest number of points of a scene, 28 bytes each."""
 
 A_BUCKET = 256
-"""Points that lie together, about: few enough to fit a field of view closely, enough for buckets to be few."""
+"""Points in a bucket, about: few enough to fit a field of view closely, enough to keep the buckets few."""
 
 A_BLOCK = 64
-"""Buckets that are looked at together first."""
+"""Buckets in a block; the search tests blocks first."""
 
 BITS = 20
-"""Of a bucket's place along each axis."""
+"""Bits of a bucket's position along each axis."""
 
 
 @dataclass(frozen=True)
 class Spheres:
-    """Balls that hold groups of points, and where their surfaces face.
+    """Bounding spheres of groups of points, and the directions that their surfaces face.
 
     Attributes:
         middle: ``(groups, 3)`` [m].
         radius: ``(groups,)`` [m].
-        facing: mean normal of a group whose points are seen from one side only, else zero ``(groups, 3)``.
-        spread: largest angle of a normal to it ``(groups,)`` [rad].
+        facing: mean normal of a group on a closed body, which is visible from outside only; else zero ``(groups, 3)``.
+        spread: largest angle between a normal of the group and ``facing`` ``(groups,)`` [rad].
     """
 
     middle: NDArray[np.float64]
@@ -59,26 +60,27 @@ class Spheres:
     def may_be_seen(
         self, groups: NDArray[np.int64], eye: NDArray[np.float64], axes: NDArray[np.float64], field: FieldOfView
     ) -> NDArray[np.int64]:
-        """Of some groups those that a field of view at ``eye`` may hold any point of, seen from its front."""
+        """Return those of some groups that may have a visible point in a field of view at ``eye``."""
         way = self.middle[groups] - eye
         distance = np.sqrt(np.einsum("gi,gi->g", way, way))
         unit, radius = way / np.maximum(distance, 1e-12)[:, None], self.radius[groups]
         margin = np.where(distance > radius, np.arcsin(np.minimum(radius / np.maximum(distance, 1e-12), 1)), np.pi)
         away = np.einsum("gi,gi->g", self.facing[groups], unit) > np.sin(np.minimum(margin + self.spread[groups], np.pi / 2))
         ahead, aside, above = axes @ unit.T
-        return groups[field.may_see(ahead, aside, above, margin) & ~away]
+        kept: NDArray[np.int64] = groups[field.may_see(ahead, aside, above, margin) & ~away]
+        return kept
 
 
 @dataclass(frozen=True)
 class Scatterers:
-    """Points of a scene, neighbours side by side.
+    """Scattering points of a scene, sorted so that neighbours are adjacent.
 
     Attributes:
-        place: where they lie ``(points, 3)`` float32 [m]; as they are, exactly, whoever looks.
-        normal: of the surface there ``(points, 3)`` float32.
-        strength: reflectivity times the area that a point stands for ``(points,)`` float32 [m2].
-        first: number of the first point of each bucket, and of the end ``(buckets + 1,)``.
-        one_sided: whether a bucket's points are those of closed bodies, seen from outside only ``(buckets,)``.
+        place: positions ``(points, 3)`` float32 [m]; exact as they are.
+        normal: unit normal of the surface ``(points, 3)`` float32.
+        strength: reflectivity times the area that a point represents ``(points,)`` float32 [m2].
+        first: index of the first point of each bucket, and the number of points ``(buckets + 1,)``.
+        one_sided: whether a bucket's points lie on closed bodies, visible from outside only ``(buckets,)``.
     """
 
     place: NDArray[np.float32]
@@ -89,17 +91,17 @@ class Scatterers:
 
     @classmethod
     def of(cls, scene: mi.Scene, sonar: ChannelSonar) -> Scatterers:
-        """The scatterers of a scene's shapes.
+        """Place scatterers on a scene's shapes.
 
         Raises:
-            MitsonarError: no surface to carry any, or more than memory should hold.
+            MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
         """
         parts, closed = [], []
         for number, shape in enumerate(scene.shapes()):
             if shape.bsdf() is not None:
                 grid = _grid_of(shape)
                 parts.append(_in_cells(shape, grid, number) if grid else _at_random(shape, sonar, number))
-                closed.append(np.full(len(parts[-1][2]), shape.is_mesh() and _is_closed(shape)))
+                closed.append(np.full(len(parts[-1][2]), isinstance(shape, mi.Mesh) and _is_closed(shape)))
         if not sum(map(len, closed)):
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
@@ -115,7 +117,7 @@ class Scatterers:
 
     @cached_property
     def spheres(self) -> tuple[Spheres, Spheres]:
-        """Around blocks of buckets, and around buckets."""
+        """Return bounding spheres of the blocks, and of the buckets."""
         buckets = np.arange(len(self.one_sided))
         blocks = self.first[:-1][::A_BLOCK]
         mixed = np.logical_and.reduceat(self.one_sided, buckets[::A_BLOCK])
@@ -131,12 +133,12 @@ class Scatterers:
         return Spheres((low + high) / 2, np.linalg.norm(high - low, axis=1) / 2, mean * one_sided[:, None], spread)
 
     def within(self, eye: NDArray[np.float64], axes: NDArray[np.float64], field: FieldOfView) -> NDArray[np.uint32]:
-        """Numbers of the points that a field of view may hold: all that it does hold, and some beside it.
+        """Return indices of the points that may lie in a field of view: all that do, and some beside it.
 
         Args:
-            eye: where it is ``(3,)`` [m].
-            axes: its :attr:`FieldOfView.axes` turned to the world ``(3, 3)``.
-            field: its shape.
+            eye: position of the receiver ``(3,)`` [m].
+            axes: :attr:`FieldOfView.axes` in the world ``(3, 3)``.
+            field: shape of the field of view.
         """
         blocks, buckets = self.spheres
         near = blocks.may_be_seen(np.arange(len(blocks.radius)), eye, axes, field)
@@ -145,13 +147,16 @@ class Scatterers:
 
 
 def _side(normal: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Which of six ways a normal points, 1 to 6."""
+    """Classify normals by the nearest of the six axis directions, 1 to 6."""
     axis = np.abs(normal).argmax(axis=1)
     return np.asarray(1 + 2 * axis + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] < 0))
 
 
-def _is_closed(mesh: Any) -> bool:
-    """Whether a mesh bounds bodies, its normals outside: each edge is met once in each direction, each body's volume > 0."""
+def _is_closed(mesh: mi.Mesh) -> bool:
+    """Test whether a mesh bounds bodies with normals outwards.
+
+    It does where each edge occurs once in each direction and each body has a volume above 0.
+    """
     faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
     vertex = np.array(mesh.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -165,26 +170,36 @@ def _is_closed(mesh: Any) -> bool:
     return bool((volume[np.unique(body[faces[:, 0]])] > 0).all())
 
 
-def _grid_of(shape: mi.Shape) -> tuple[Any, int, int] | None:
-    """The grid over uv that gives a shape its reflectivity: texture, cells along u and v; None where there is none."""
+class _Grid(NamedTuple):
+    """The cells over uv of a shape's reflectivity; ``texture`` is None for a picture."""
+
+    texture: CellNoise | None
+    columns: int
+    rows: int
+
+
+def _grid_of(shape: mi.Shape) -> _Grid | None:
+    """Return the cells over uv of a shape's reflectivity; None where it has none."""
     textures = reflectances_of(shape.bsdf())
     if len(textures) != 1:
         return None
+    texture: Any = textures[0]  # Mitsuba's type of it is not the plugin's class
     # by its name: the class is made anew with each variant
-    if type(textures[0]).__name__ == CellNoise.__name__ and textures[0].coordinates == "uv":
-        fine = round(textures[0].cells * 2 ** (textures[0].octaves - 1))
-        return (textures[0], fine, fine) if fine >= 1 else None
-    if textures[0].class_name() == "BitmapTexture":
-        size = textures[0].resolution()
-        return None, int(size[0]), int(size[1])
+    if type(texture).__name__ == CellNoise.__name__ and texture.coordinates == "uv":
+        fine = round(texture.cells * 2 ** (texture.octaves - 1))
+        return _Grid(texture, fine, fine) if fine >= 1 else None
+    if texture.class_name() == "BitmapTexture":
+        size = texture.resolution()
+        return _Grid(None, int(size[0]), int(size[1]))
     return None
 
 
-Points = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+Points: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Positions, normals and strengths."""
 
 
-def _in_cells(shape: mi.Shape, grid: tuple[Any, int, int], number: int) -> Points:
-    """One point a cell, at a place that is a hash of cell and texture's seed (of a picture: the shape's number)."""
+def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> Points:
+    """Place one point in each cell, at a hash of the cell and the texture's seed (for a picture: the shape's number)."""
     texture, columns, rows = grid
     turn = np.eye(3)
     if texture is not None:
@@ -197,7 +212,7 @@ def _in_cells(shape: mi.Shape, grid: tuple[Any, int, int], number: int) -> Point
     cell = dr.arange(mi.UInt32, int(wide * tall))
     column, row = mi.Int32(cell % int(wide)) + int(low[0]), mi.Int32(cell // int(wide)) + int(low[1])
     key = mi.UInt32(_key(texture.seed if texture is not None else number, texture is not None))
-    bits: list[Any] = [dr.reinterpret_array(mi.UInt32, value) for value in (column, row)]
+    bits: list[DeviceArray] = [dr.reinterpret_array(mi.UInt32, value) for value in (column, row)]
     first, second = mi.sample_tea_32(bits[0], bits[1] ^ key, ROUNDS)
     u, v = (mi.Float(column) + _fraction(first)) / columns, (mi.Float(row) + _fraction(second)) / rows
     uv = mi.Point2f(*(float(a) * u + float(b) * v + float(c) for a, b, c in back[:2]))
@@ -208,7 +223,7 @@ def _in_cells(shape: mi.Shape, grid: tuple[Any, int, int], number: int) -> Point
 
 
 def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> Points:
-    """Points all over a surface, each standing for the same area (of shapes that are no meshes: for its part of it)."""
+    """Place random points on a surface; on a mesh each represents the same area, elsewhere its own part of the area."""
     area = float(shape.surface_area()[0])
     _check_count(shape, area * sonar.points_per_m2)
     count = round(area * sonar.points_per_m2)
@@ -216,7 +231,7 @@ def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> Points:
         return np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
     rng = np.random.default_rng([sonar.seed, number, 81])
     u, v = (mi.Float(draw.astype(np.float32)) for draw in rng.random((2, count)))
-    if shape.is_mesh():
+    if isinstance(shape, mi.Mesh):
         share = np.cumsum(_facet_areas(shape))
         facet = np.searchsorted(share, np.sort(rng.random(count)) * share[-1], side="right")
         facet, root = np.minimum(facet, len(share) - 1).astype(np.uint32), dr.sqrt(u)
@@ -226,15 +241,15 @@ def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> Points:
     return _kept(shape, si, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / count, si.is_valid())
 
 
-def _facet_areas(mesh: Any) -> NDArray[np.float64]:
-    """Area of each triangle [m2]."""
+def _facet_areas(mesh: mi.Mesh) -> NDArray[np.float64]:
+    """Return the area of each triangle ``(faces,)`` [m2]."""
     facets = dr.arange(mi.UInt32, mesh.face_count())
     corners = [np.array(facet_points(mesh, facets, mi.Point2f(*at)).p, dtype=float) for at in ((0, 0), (1, 0), (0, 1))]
     return np.asarray(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0), axis=0) / 2)
 
 
-def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: Any, valid: Any) -> Points:
-    """Place, normal and strength of the points that scatter anything."""
+def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, valid: DeviceArray) -> Points:
+    """Return position, normal and strength of the points whose strength is above 0."""
     strength = dr.select(valid, reflectivity_at(shape.bsdf(), si) * area, 0)
     dr.eval(si.p, si.n, strength)
     found = np.broadcast_to(np.array(strength), np.array(si.p).shape[1:])
@@ -252,7 +267,7 @@ def _check_count(shape: mi.Shape, count: float) -> None:
 
 
 def _key(number: int, texture: bool) -> int:
-    """32 bits that draw places within cells; others than those that draw the cell's reflectivity."""
+    """Return 32 bits to draw positions within cells; they differ from those that draw the reflectivity."""
     return int(np.random.SeedSequence([abs(number), int(texture), 82]).generate_state(1)[0])
 
 
@@ -261,8 +276,11 @@ def _fraction(bits: mi.UInt32) -> mi.Float:
 
 
 def _buckets(place: NDArray[np.float32], side: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """An order in which points of one cube that face one way follow each other, near cubes near; where each group begins,
-    and the end."""
+    """Sort points into buckets: the points of one cube that face one direction.
+
+    Returns:
+        The order of the points, near cubes near each other; and the index where each bucket begins, with the end.
+    """
     low, high = place.min(axis=0).astype(float), place.max(axis=0).astype(float)
     reach = np.sort(high - low)[::-1]
     # an edge that holds A_BUCKET points of a surface as large as the two longest sides
@@ -277,7 +295,7 @@ def _buckets(place: NDArray[np.float32], side: NDArray[np.int64]) -> tuple[NDArr
 
 
 def _spaced(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Bits of numbers below 2^21 with two zeros before each: three such make a place on Morton's curve."""
+    """Put two zeros before each bit of numbers below 2^21: three such make a position on Morton's curve."""
     masks = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
     for shift, mask in zip((32, 16, 8, 4, 2), masks, strict=True):
         number = (number | (number << np.uint64(shift))) & np.uint64(mask)
@@ -285,7 +303,7 @@ def _spaced(number: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def _ranges(first: NDArray[np.int64], buckets: NDArray[np.int64]) -> NDArray[np.uint32]:
-    """All numbers of some buckets' points."""
+    """Return the indices of all points of some buckets."""
     begin, count = first[buckets], first[buckets + 1] - first[buckets]
     if not len(begin):
         return np.empty(0, np.uint32)

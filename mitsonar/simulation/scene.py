@@ -1,11 +1,11 @@
-"""Scenes from Mitsuba XML files, the user's or shipped ones, and the sonar that stands in them."""
+"""Scenes from Mitsuba XML files, the user's or shipped ones, and the sonar in them."""
 
 from __future__ import annotations
 
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,21 +36,25 @@ MOST_OBJECTS = 1_000_000
 
 
 def shipped_scenes() -> dict[str, Path]:
-    """The scenes of the package by name, each with a trajectory of the same name beside it."""
+    """Return the scenes of the package by name; a trajectory of the same name lies beside each."""
     folder = Path(str(files("mitsonar.scenes")))
     return {path.stem: path for path in sorted(folder.glob("*.xml"))}
 
 
 def shipped_trajectory(name: str) -> Path:
-    """The trajectory to fly in a shipped scene (TUM)."""
+    """Return the file of the trajectory for a shipped scene (TUM).
+
+    Raises:
+        MitsonarError: no such scene.
+    """
     return find_scene(name).with_suffix(".tum")
 
 
 def find_scene(name_or_file: str | Path) -> Path:
-    """The XML file of that path, or the shipped scene of that name.
+    """Return the XML file at a path, or the shipped scene of that name.
 
     Raises:
-        MitsonarError: neither.
+        MitsonarError: there is neither.
     """
     path = Path(name_or_file)
     if path.is_file():
@@ -64,7 +68,7 @@ def find_scene(name_or_file: str | Path) -> Path:
     raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or the name of a shipped scene, {names}")
 
 
-def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
+def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
     """Load a Mitsuba scene; ``parameters`` replace its ``$name`` values, as in ``mi.load_file``.
 
     Raises:
@@ -75,7 +79,7 @@ def load_scene(name_or_file: str | Path, **parameters: Any) -> mi.Scene:
     import mitsuba as mi
 
     try:
-        texts: dict[str, Any] = {key: str(value) for key, value in parameters.items()}
+        texts = {key: str(value) for key, value in parameters.items()}
         check_nesting(path, texts)
         parser = mi.parser
         check_meshes_of(parser.parse_file(parser.ParserConfig(variant), str(path), **texts), path.parent)
@@ -110,7 +114,7 @@ def object_names_in(scene: mi.Scene) -> tuple[str, ...]:
 
 
 def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
-    """Sonar and pose of the scene's ``imaging_sonar`` number ``index``; None where there is none. Cameras are ignored."""
+    """Return sonar and pose of the scene's ``imaging_sonar`` number ``index``, None without one; cameras are ignored."""
     from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
 
     found = [sensor for sensor in scene.sensors() if is_imaging_sonar(sensor)]
@@ -118,7 +122,7 @@ def sonar_in(scene: mi.Scene, index: int = 0) -> tuple[Sonar, Pose] | None:
 
 
 def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pose] | None:
-    """Instrument and pose of the scene's ``channel_sonar`` number ``index``; None where there is none."""
+    """Return instrument and pose of the scene's ``channel_sonar`` number ``index``; None where there is none."""
     from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
 
     found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
@@ -126,7 +130,7 @@ def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pos
 
 
 def _parameters(path: Path, error: BaseException) -> str:
-    """What parameters a scene has, where it was given others."""
+    """Name the parameters of a scene, where the error is an unknown one; else return nothing."""
     wrong = re.search(r"unused parameters:\s*-?\s*\$(\w+)", str(error))
     if wrong is None:
         return ""
@@ -135,11 +139,11 @@ def _parameters(path: Path, error: BaseException) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """Mitsuba's complaint in one line: our own error where a plugin raised one, else all but the traceback in it."""
+    """Return Mitsuba's error in one line: our own error where a plugin raised one, else the text without its traceback."""
     text = str(error).strip()
     ours = re.findall(r"^mitsonar\.errors\.MitsonarError: (.+)$", text, flags=re.MULTILINE)
     if ours:
         return str(ours[-1])
     head, _, trace = text.partition("Traceback (most recent call last):")
-    said = f"{head} {trace.strip().splitlines()[-1]}" if trace.strip() else head
-    return " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", said).split())
+    shown = f"{head} {trace.strip().splitlines()[-1]}" if trace.strip() else head
+    return " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", shown).split())

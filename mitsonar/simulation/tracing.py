@@ -1,10 +1,9 @@
-"""Scene, sonar and poses to echoes: the only file beside the plugins that calls the ray tracer."""
+"""Scene, sonar and poses to echoes: only this file and the plugins call the ray tracer."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,15 +14,18 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
 from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 
 __all__ = ["Rays", "Tracer", "height_below", "hidden"]
 
 OFF_SURFACE = 1e-5
-"""How far off a surface a ray to a receiver begins, as a part of the size of coordinates: ten times their rounding."""
+"""Distance off a surface at which a shadow ray begins, as a part of the coordinates' size: ten times their rounding."""
 
 
 class Rays:
-    """Which ray is which in a launch: strips of a few columns, down each, so that rays traced together are neighbours.
+    """Number the rays of a launch.
+
+    Rays run down strips of a few columns, so that rays that are traced together are neighbours.
 
     Attributes:
         ping: number of the ping in the launch.
@@ -48,9 +50,9 @@ class Rays:
 
     @staticmethod
     def numbered(sonar: Sonar, pings: int) -> mi.UInt32:
-        """0, 1, 2 ... for all rays of a launch, in memory: the width of a frozen launch follows from its inputs.
+        """Return 0, 1, 2 ... for all rays of a launch, evaluated: the width of a frozen launch follows from its inputs.
 
-        Without an input as wide as the launch, Dr.Jit 1.5 infers the width from whatever input divides it, the
+        Without an input as wide as the launch, Dr.Jit 1.5 infers the width from any input that divides it, the
         data of virtual calls too, and a replay can lose rays.
         """
         index = dr.arange(mi.UInt32, pings * sonar.rays)
@@ -59,7 +61,7 @@ class Rays:
 
 
 def strip_columns(sonar: Sonar) -> int:
-    """Columns of a strip: the power of two, dividing all columns, that makes 16 rays in a row most nearly a square."""
+    """Return the columns of a strip: a power of two that divides all columns and makes 16 rays nearly a square."""
     across = sonar.beam_width_rad / sonar.across
     down = math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
     wanted = 2 ** min(4, max(0, round(math.log2(math.sqrt(16 * down / across)))))
@@ -67,7 +69,7 @@ def strip_columns(sonar: Sonar) -> int:
 
 
 class Tracer:
-    """A scene seen by a sonar.
+    """Trace the echoes of a scene for one sonar.
 
     Attributes:
         notes: what a user should know about the scene's BSDFs.
@@ -81,26 +83,26 @@ class Tracer:
         self.surfaces = surfaces.Surfaces.of(scene)
         self.notes = self.surfaces.notes
 
-    def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[Any, ...]:
-        """What a launch reads: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces."""
+    def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
+        """Return the inputs of a launch: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces."""
         matrices = to_world_matrices(poses)[:, :3].astype(np.float32)
         keys = [self.sensor.key(first_ping + k) for k in range(len(matrices))]
         # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
         return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
     def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, imaging_sonar_sensor.Fan]:
-        """The rays in the world, and their fan with its directions in world axes."""
+        """Return the rays in the world, and their fan with its directions in world axes."""
         fan = self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
         lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
         fan = fan.carried(lines)
         return mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d), fan
 
-    def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: dict[str, Any]) -> Echoes:
-        """Echoes of :meth:`rays_of`, not evaluated yet."""
+    def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: LaunchTables) -> Echoes:
+        """Trace the rays of :meth:`rays_of`; the echoes are not evaluated yet."""
         return echo_integrator.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan)
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
-        """One ping's echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
+        """Trace one ping and return its echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
         rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
         rows, keys, tables = self.inputs(np.reshape(pose, (1, 6)), ping)
         traced = self.echoes(self.scene, *self.rays_of(rays, rows, keys), tables)
@@ -110,32 +112,34 @@ class Tracer:
         dr.eval(values)
         return Echoes(**{name: np.array(value) for name, value in values.items()})
 
-    def height_m(self, scene: mi.Scene, rows: mi.Float) -> Any:
-        """Height of each pose over what is straight below it [m]; nan where there is nothing."""
+    def height_m(self, scene: mi.Scene, rows: mi.Float) -> DeviceArray:
+        """Return the height of each pose over what is straight below it [m]; nan where there is nothing."""
         line = dr.arange(mi.UInt32, dr.width(rows) // 12) * 3
         return height_below(scene, mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3))))
 
 
-def height_below(scene: mi.Scene, place: mi.Point3f) -> Any:
-    """Height of places over what is straight below them [m]; nan where there is nothing."""
+def height_below(scene: mi.Scene, place: mi.Point3f) -> DeviceArray:
+    """Return the height of points over what is straight below them [m]; nan where there is nothing."""
     found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
     return dr.select(found.is_valid(), found.t, dr.nan)
 
 
-def hidden(scene: Any, point: Any, normal: Any, u: Any, distance: Any, active: Any) -> Any:
-    """Whether something stands between points of a surface and an eye.
+def hidden(
+    scene: mi.Scene, point: DeviceArray, normal: DeviceArray, u: DeviceArray, distance: DeviceArray, active: DeviceArray
+) -> DeviceArray:
+    """Test whether a surface blocks the line between points of a surface and a receiver.
 
     Args:
-        scene: traced.
-        point: on the surface.
-        normal: of the surface there, either way.
-        u: unit direction from the eye to the point.
-        distance: from the eye [m].
-        active: which points are asked for.
+        scene: to trace.
+        point: on the surface [m].
+        normal: unit normal of the surface there; its sign does not matter.
+        u: unit direction from the receiver to the point.
+        distance: from the receiver to the point [m].
+        active: points to test.
     """
     size = dr.select(dr.abs(point.x) > dr.abs(point.y), dr.abs(point.x), dr.abs(point.y)) + dr.abs(point.z)
     off = (1 + size) * OFF_SURFACE
     begin = point + normal * dr.select(dr.dot(normal, u) > 0, -off, off)
     ray = mi.Ray3f(begin, -u)
     ray.maxt = distance * (1 - mi.math.ShadowEpsilon)
-    return scene.ray_test(ray, True, active)
+    return scene.ray_test(ray, True, active)  # type: ignore[call-overload]  # the stubs want mi.Bool for coherent

@@ -29,14 +29,14 @@ INSTALL = "on Debian or Ubuntu type `sudo apt-get install libllvm19 libatomic1` 
 
 
 class Backend(NamedTuple):
-    """What the renderer runs on: variant, and version of LLVM or None on CUDA."""
+    """The renderer's variant, and its version of LLVM (None on CUDA)."""
 
     variant: str
     llvm: tuple[int, int, int] | None
 
 
 def ensure_variant(name: str | None = None) -> str:
-    """Set a variant unless a usable one is set; the name (or ``MITSONAR_VARIANT``) forces one.
+    """Set a variant unless a usable one is set, and return its name; ``name`` or ``MITSONAR_VARIANT`` forces one.
 
     Raises:
         MitsonarError: unknown variant; neither CUDA nor LLVM is found (with the command that installs it).
@@ -61,7 +61,7 @@ def ensure_variant(name: str | None = None) -> str:
 
 
 def backend() -> Backend:
-    """The variant, set if need be, and the LLVM that it runs on."""
+    """Return the variant and its version of LLVM; sets a variant if none is set."""
     variant = ensure_variant()
     import drjit as dr
 
@@ -69,7 +69,7 @@ def backend() -> Backend:
 
 
 def use_threads(count: int) -> None:
-    """How many threads the renderer has; to be said before anything is rendered."""
+    """Set the number of threads of the renderer; call it before anything is rendered."""
     import drjit as dr
 
     if dr.thread_count() != count:
@@ -77,7 +77,7 @@ def use_threads(count: int) -> None:
 
 
 def current_variant() -> str:
-    """The variant that is set; empty where Mitsuba is not loaded or none is."""
+    """Return the current variant; empty where Mitsuba is not loaded or no variant is set."""
     import sys
 
     mi = sys.modules.get("mitsuba")
@@ -85,7 +85,7 @@ def current_variant() -> str:
 
 
 def thread_count() -> int:
-    """How many threads the renderer has, one at least."""
+    """Return the number of threads of the renderer, at least one."""
     import drjit as dr
 
     return max(1, int(dr.thread_count()))
@@ -93,7 +93,7 @@ def thread_count() -> int:
 
 @contextmanager
 def garbage_stays() -> Iterator[None]:
-    """No garbage collection while a launch is recorded: Dr.Jit 1.5 ends the process where an array is freed then."""
+    """Suspend garbage collection while a launch is recorded: Dr.Jit 1.5 ends the process where an array is freed then."""
     was = gc.isenabled()
     gc.disable()
     try:
@@ -104,7 +104,7 @@ def garbage_stays() -> Iterator[None]:
 
 
 def release_memory() -> None:
-    """Give back what scenes that nobody holds any more have left: they are cycles of objects, and Dr.Jit keeps memory."""
+    """Free the memory of scenes that are no longer referenced: they are cycles of objects, and Dr.Jit caches memory."""
     import drjit as dr
 
     gc.collect()

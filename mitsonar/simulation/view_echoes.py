@@ -1,11 +1,11 @@
-"""What of a ping's echoes makes the image of a view: all of them, or those of a portion of the field of view."""
+"""Echoes of a view: all echoes of a ping, or those of a portion of the field of view."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from numpy.typing import ArrayLike
 
@@ -13,6 +13,7 @@ from mitsonar.acoustics.echo_level import largest_level
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -23,59 +24,59 @@ if TYPE_CHECKING:
 __all__ = ["NARROWEST", "SegmentTracer", "ViewEchoes", "ViewTracer", "WholeTracer", "fraction_bits"]
 
 NARROWEST = 2.0**-6
-"""Shortest footprint [bins]: a surface seen straight on has none, and a density needs one."""
+"""Shortest footprint [bins]: a surface at normal incidence has none, and a density needs one."""
 
 
 @dataclass(frozen=True)
 class ViewEchoes:
-    """What a view makes of the echoes of a launch, one value a ray, not evaluated yet.
+    """The echoes of a launch in one view, one value for each ray, not evaluated yet.
 
     Attributes:
-        echoes: as this view has them.
-        beam: the view's beam that each belongs to.
-        active: rays that belong to the view at all; the others are not even counted.
+        echoes: with ranges and levels of this view.
+        beam: index of the view's beam.
+        active: whether the ray belongs to the view; other rays are not counted.
         elevation: of each ray in the view's own frame [rad].
     """
 
     echoes: Echoes
-    beam: Any
-    active: Any
-    elevation: Any
+    beam: DeviceArray
+    active: DeviceArray
+    elevation: DeviceArray
 
 
 class ViewTracer(Protocol):
-    """How the echoes of a launch become those of one view.
+    """Turn the echoes of a launch into those of one view.
 
     Attributes:
-        view: whose image it is.
-        bits: fraction bits of its fixed-point sums.
+        bits: fraction bits of the fixed-point sums.
     """
 
     bits: int
 
     @property
-    def view(self) -> View: ...
+    def view(self) -> View:
+        """Return the view."""
 
-    def tables(self, poses: ArrayLike) -> dict[str, Any]:
-        """What it needs on the device, given the sonar's poses ``(pings, 6)``."""
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return the view's inputs of a launch, given the sonar's poses ``(pings, 6)`` [m, rad]."""
 
-    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: dict[str, Any]) -> ViewEchoes:
-        """The echoes of a launch as this view has them; joins the kernel that makes them."""
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return the echoes of a launch in this view; joins the kernel that traces them."""
 
 
 class WholeTracer:
-    """All echoes, each in its ray's own beam."""
+    """All echoes, each in the beam of its ray."""
 
     def __init__(self, view: Whole) -> None:
         self.view = view
         self.bits = fraction_bits(view.sonar, view.sonar.rays // view.sonar.beams)
 
-    def tables(self, poses: ArrayLike) -> dict[str, Any]:
-        """Nothing."""
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return an empty table: the view needs no inputs."""
         return {}
 
-    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: dict[str, Any]) -> ViewEchoes:
-        """Every ray in its own beam."""
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return all echoes, each in the beam of its ray."""
         return ViewEchoes(echoes, rays.beam, True, fan.elevation)
 
 
@@ -87,7 +88,7 @@ class SegmentTracer:
         self.bits = fraction_bits(view.sonar, view.sonar.rays // view.sonar.beams)
 
     @cached_property
-    def _on_device(self) -> dict[str, Any]:
+    def _on_device(self) -> LaunchTables:
         import drjit as dr
         import mitsuba as mi
 
@@ -95,12 +96,12 @@ class SegmentTracer:
         dr.make_opaque(table)
         return {"member": table}
 
-    def tables(self, poses: ArrayLike) -> dict[str, Any]:
-        """Which pixels of the film belong to it."""
+    def tables(self, poses: ArrayLike) -> LaunchTables:
+        """Return the pixels of the film that belong to the portion."""
         return self._on_device
 
-    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: dict[str, Any]) -> ViewEchoes:
-        """The rays of the portion, beams counted from its own first."""
+    def view_echoes(self, scene: mi.Scene, rays: Rays, fan: Fan, echoes: Echoes, tables: LaunchTables) -> ViewEchoes:
+        """Return the echoes of the portion; beams count from its first."""
         import drjit as dr
         import mitsuba as mi
 
@@ -109,9 +110,12 @@ class SegmentTracer:
 
 
 def fraction_bits(sonar: Sonar, rays: int, gain: float = 1.0) -> int:
-    """Bits below one of the fixed-point sums: ``rays`` in one bin, each as strong as can be, stay below 2^62.
+    """Return the fraction bits of the fixed-point sums: ``rays`` of the largest level in one bin stay below 2^62.
 
-    ``gain`` is what a view may multiply a ray's level by at most.
+    Args:
+        sonar: the instrument.
+        rays: largest number of rays in one bin.
+        gain: largest factor by which a view multiplies a ray's level.
     """
     cell = sonar.beam_width_rad / sonar.across * math.radians(sonar.elevation_fov_deg) / sonar.rays_per_beam
     largest = largest_level(sonar, cell) * rays * gain

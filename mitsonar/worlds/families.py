@@ -1,8 +1,6 @@
-"""The kinds of world by name."""
+"""The families of worlds by name."""
 
 from __future__ import annotations
-
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -27,8 +25,12 @@ FAMILIES: dict[str, type[Family]] = {
 SEE_SCENE = " (see docs/guides/data-sets.md, `A scene of your own`)"
 
 
-def create_family(name: str, **fields: Any) -> Family:
-    """The family of that name with these numbers, the others the thesis's; or ``scene``, a file of the user's own.
+def create_family(name: str, **fields: object) -> Family:
+    """Create the family of a name; ``scene`` is a file of the user's own.
+
+    Args:
+        name: of :data:`FAMILIES`, or ``scene``.
+        fields: numbers of the family; the others are Almanza-Medina's.
 
     Raises:
         MitsonarError: unknown name or key, or a number outside its limits.

@@ -25,7 +25,7 @@ from mitsonar.worlds.world import (
 __all__ = ["FlatObjects"]
 
 STEP_M = 5e-6
-"""Tops of objects that overlap differ by so much: of two at one height the ray tracer would see now one, now the other."""
+"""Height difference of objects that overlap [m]: of two at one height the ray tracer would hit either at random."""
 
 
 class FlatObjects(Family):
@@ -38,17 +38,18 @@ class FlatObjects(Family):
     rectangles: int | None = Field(None, ge=0, le=10**6, description="rectangles, instead of a draw")
     ellipses: int | None = Field(None, ge=0, le=10**6, description="ellipses, instead of a draw")
     thickness_m: float = Field(
-        0.001, gt=0, le=100, description="height over the seabed [m]; 0.1 in one of the thesis's tests"
+        0.001, gt=0, le=100, description="height over the seabed [m]; 0.1 in one test of Almanza-Medina"
     )
     side_m: Interval = Field((0.2, 1.0), description="length and width [m]")
     object_reflectivity: Interval = Field((0.0, 1.0), description="uniform reflectivity of an object")
 
     @property
     def half_m(self) -> float:
+        """Return half the edge of the field [m]."""
         return self.size_m / 2
 
     def build(self, seed: int) -> World:
-        """The field of a seed."""
+        """Build the field of a seed."""
         kinds = (("rectangles", slab(), self.rectangles), ("ellipses", cylinder(24, 1), self.ellipses))
         streams = [stream(seed, 1, number) for number in range(len(kinds))]
         counts = [whole(rng, self.objects) if kind[2] is None else kind[2] for rng, kind in zip(streams, kinds, strict=True)]
@@ -74,7 +75,7 @@ class FlatObjects(Family):
 
 
 def _levels(middle: NDArray[np.float64], side: NDArray[np.float64]) -> NDArray[np.int64]:
-    """A level for each object, other than those of all objects that it may overlap, as low as it goes."""
+    """Return the lowest level of each object that differs from the levels of all objects that it may overlap ``(n,)``."""
     radius = np.hypot(*side.T) / 2
     level = np.zeros(len(middle), dtype=np.int64)
     if len(middle) < 2:

@@ -1,4 +1,4 @@
-"""Meshes that a scene names, checked before Mitsuba reads them: it checks no indices, and a wrong one ends the process."""
+"""Check a scene's meshes before Mitsuba reads them: it checks no indices, and a wrong index ends the process."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ if TYPE_CHECKING:
 __all__ = ["check_counts", "check_mesh", "check_meshes_of"]
 
 LARGEST_COORDINATE = 1e12
-"""Of vertices, normals and texture coordinates: beyond it single precision overflows."""
+"""Largest coordinate of vertices, normals and textures: beyond it single precision overflows."""
 
 LONGEST_HEADER = 2**16
-"""Bytes of a PLY header."""
+"""Largest size of a PLY header [bytes]."""
 
 INFLATION = 1032
-"""Deflated data can grow by no more."""
+"""Largest ratio of inflated to deflated data."""
 
 TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
     **{"double": "f8", "float64": "f8"},
 }
-"""Types of PLY properties, and NumPy's."""
+"""Types of PLY properties to NumPy's types."""
 
 ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
 class _FaultError(ValueError):
-    """What is wrong with a mesh file, in words."""
+    """A fault of a mesh file, in words."""
 
 
 @dataclass
 class _Element:
-    """An element of a PLY header: its name, how many there are, and names and types of its properties.
+    """An element of a PLY header: its name, its count, and names and types of its properties.
 
-    A list has the type of its count as ``counted``, and stands for three values.
+    A list has the type of its count in ``counted``, and holds three values.
     """
 
     name: str
@@ -55,7 +55,7 @@ class _Element:
     counted: dict[str, str] = field(default_factory=dict)
 
     def dtype(self, order: str) -> np.dtype[np.void]:
-        """One of them as it lies in a binary file, lists as a count and three values."""
+        """Return the type of one row of a binary file; a list is a count and three values."""
         parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
         for name, kind in self.scalars.items():
             if name in self.counted:
@@ -69,14 +69,14 @@ class _Element:
 
 
 def check_meshes_of(state: mi.parser.ParserState, folder: Path) -> None:
-    """Check the mesh files of a scene that Mitsuba has parsed, with what it includes and its parameters filled in.
+    """Check the mesh files of a parsed scene, whose included files and parameters are resolved.
 
     Args:
         state: of the scene, not instantiated yet.
-        folder: of its XML file; Mitsuba looks for files there, beside included files, and where its resolver says.
+        folder: of its XML file; Mitsuba searches there, beside included files, and in the paths of its resolver.
 
     Raises:
-        MitsonarError: a mesh that is damaged.
+        MitsonarError: a mesh is damaged.
     """
     import mitsuba as mi
 
@@ -93,11 +93,11 @@ def check_meshes_of(state: mi.parser.ParserState, folder: Path) -> None:
 
 
 def check_mesh(path: str | Path, kind: str) -> None:
-    """Check a mesh file: counts against its size, indices against vertices, numbers finite. Once a file and process.
+    """Check a mesh file, once in a process: counts against its size, indices against vertices, finite numbers.
 
     Args:
         path: of the file.
-        kind: of Mitsuba's plugins that would read it: ``ply``, ``obj`` or ``serialized``.
+        kind: name of the Mitsuba plugin that reads it: ``ply``, ``obj`` or ``serialized``.
 
     Raises:
         MitsonarError: it is damaged, or has no triangles.
@@ -121,7 +121,7 @@ def _check_once(path: str, kind: str, size: int, modified_ns: int) -> None:
 
 
 def _check_triangles(indices: NDArray[np.generic], vertices: int, what: str = "a triangle names vertex") -> None:
-    """Indices from 0."""
+    """Check that indices, which count from 0, name vertices."""
     if not indices.size:
         raise _FaultError("it has no triangles")
     low, high = int(indices.min()), int(indices.max())
@@ -138,10 +138,10 @@ def _check_numbers(values: NDArray[np.generic], what: str) -> None:
 
 
 def check_counts(path: Path) -> None:
-    """Check that a PLY file has the bytes that its header promises at least; its faces may have any number of corners.
+    """Check that a PLY file has at least the bytes that its header promises; faces may have any number of corners.
 
     Raises:
-        ValueError: it has not.
+        ValueError: it has fewer.
     """
     with path.open("rb") as file:
         order, elements, start = _ply_header(file.read(LONGEST_HEADER), strict=False)
@@ -154,7 +154,7 @@ def check_counts(path: Path) -> None:
 
 
 def _check_ply(content: bytes) -> None:
-    """Stanford's PLY, binary or text."""
+    """Check a file in Stanford's PLY, binary or text."""
     order, elements, start = _ply_header(content)
     counts = {element.name: element.count for element in elements}
     if min(counts.get("vertex", 0), counts.get("face", 0)) < 1:
@@ -171,7 +171,7 @@ def _check_ply(content: bytes) -> None:
 
 
 def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_Element], int]:
-    """Byte order (None: text), elements, and where the data begin."""
+    """Return byte order (None: text), elements, and offset of the data."""
     end = content.find(b"end_header", 0, LONGEST_HEADER)
     stop = content.find(b"\n", end)
     if not content.startswith(b"ply") or end < 0 or stop < 0 or content[end + 10 : stop].strip():
@@ -210,7 +210,7 @@ def _add_property(element: _Element, name: str, kind: str, counted: str | None =
 
 
 def _check_elements(elements: list[_Element]) -> None:
-    """What the header may say."""
+    """Check that a header has the elements and properties of a triangle mesh."""
     names = [element.name for element in elements]
     if len(set(names)) < len(names):
         raise _FaultError("its header names an element twice")
@@ -224,7 +224,7 @@ def _check_elements(elements: list[_Element]) -> None:
 
 
 def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) -> list[NDArray[np.void]]:
-    """Tables of a binary file, up to its faces."""
+    """Read the tables of a binary file, up to its faces."""
     rows = []
     for element in elements:
         kind = element.dtype(order)
@@ -242,7 +242,7 @@ def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) 
 
 
 def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.void]]:
-    """Tables of a text file, up to its faces."""
+    """Read the tables of a text file, up to its faces."""
     words, start, rows = text.split(), 0, list[NDArray[np.void]]()
     for element in elements:
         width = len(element.scalars) + 3 * len(element.counted)
@@ -259,7 +259,7 @@ def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.
 
 
 def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.void]:
-    """The columns of an element by name; whole numbers are whole."""
+    """Return the columns of an element by name, and check that integers are whole numbers."""
     kinds: list[tuple[str, type] | tuple[str, type, tuple[int]]] = []
     for name in element.scalars:
         listed = name in element.counted
@@ -275,7 +275,7 @@ def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.voi
 
 
 def _check_obj(content: bytes) -> None:
-    """Wavefront OBJ: positions, texture coordinates and normals are named by faces from 1."""
+    """Check a file in Wavefront OBJ, whose faces name positions, texture coordinates and normals from 1."""
     lines: dict[bytes, list[list[bytes]]] = {b"v": [], b"vt": [], b"vn": [], b"f": []}
     for line in content.splitlines():
         words = line.partition(b"#")[0].split()
@@ -306,7 +306,7 @@ def _check_obj(content: bytes) -> None:
 
 
 def _check_serialized(content: bytes) -> None:
-    """Mitsuba's serialized meshes: deflated, several in a file, a table of where they begin at its end."""
+    """Check a file of Mitsuba's serialized meshes: several deflated meshes, with a table of offsets at the end."""
     if len(content) < 8:
         raise _FaultError("it is too short")
     (count,) = struct.unpack_from("<I", content, len(content) - 4)
@@ -323,7 +323,7 @@ def _check_serialized(content: bytes) -> None:
 
 
 def _check_one_serialized(content: bytes) -> None:
-    """One mesh of a file."""
+    """Check one serialized mesh."""
     ours, number = struct.unpack_from("<HH", content)
     if ours != 0x041C or number not in (3, 4):
         raise _FaultError("it is no serialized mesh of version 3 or 4")
@@ -343,4 +343,4 @@ def _check_one_serialized(content: bytes) -> None:
 
 
 CHECKS = {"ply": _check_ply, "obj": _check_obj, "serialized": _check_serialized}
-"""Of the files that Mitsuba's plugins of these names read."""
+"""Checks by the name of the Mitsuba plugin that reads the file."""

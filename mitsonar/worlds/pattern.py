@@ -17,15 +17,18 @@ from mitsonar.worlds.world import Family, Floor, Mesh, Standpoint, World
 __all__ = ["Pattern"]
 
 PHOTO_M = 2.0
-"""Edge of the piece of seabed that a shipped picture shows; it is repeated."""
+"""Edge of the seabed in a shipped picture [m]; the picture is repeated."""
 
 T = np.array([(-1, 0.5), (0, 0.5), (1, 0.5), (0, -0.5)])
-"""Middles of the blocks, in steps: three across, one below the middle."""
+"""Centres of the blocks, in steps: three across, one below the middle."""
 
 
 class Pattern(Family):
-    """The test field of Almanza-Medina, section 2.3. The seed draws the three random seabeds; the other three are pictures
-    (generated stand-ins for the thesis's photographs, see the README beside them)."""
+    """The test field of Almanza-Medina, 2.3.
+
+    The seed draws the three random seabeds. The other three are pictures: generated stand-ins for Almanza-Medina's
+    photographs, see the README beside them.
+    """
 
     size_m: float = Field(12.0, gt=0, le=10_000, description="edge of the square seabed [m] (ours)")
     texture: Literal["gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock"] = Field(
@@ -42,14 +45,16 @@ class Pattern(Family):
 
     @property
     def half_m(self) -> float:
+        """Return half the edge of the seabed [m]."""
         return self.size_m / 2
 
     @property
     def seeded(self) -> bool:
+        """Return whether the seabed is random."""
         return not self.texture.startswith("photo")
 
     def build(self, seed: int) -> World:
-        """The field with the seabed of a seed."""
+        """Build the field with the seabed of a seed."""
         blocks = np.column_stack([T * self.block_step_m, np.full(len(T), self.block_m[2] / 2)])
         meshes = [self._boxes("blocks", 1, np.tile(self.block_m, (len(T), 1)), blocks)]
         meshes.append(self._boxes("bars", 1 + len(T), *self._bars()))
@@ -67,7 +72,7 @@ class Pattern(Family):
         return Mesh(name, placed.vertices, placed.faces, reflectivity, first_id + placed.number)
 
     def _bars(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Sizes and middles of the eight bars: fore, aft, port, starboard, the inner first."""
+        """Return sizes and centres of the eight bars [m]: fore, aft, port, starboard, the inner first."""
         sizes, centres = [], []
         for axis, (length, inner) in ((1, self.bars_across_m), (0, self.bars_along_m)):
             for sign in (1, -1):
@@ -81,7 +86,7 @@ class Pattern(Family):
         return np.array(sizes), np.array(centres)
 
     def _seabed(self, seed: int) -> str:
-        """The floor's texture; the random ones have the grain of the shipped scene ``pattern``, whatever the size."""
+        """Return the floor's texture; random ones have the grain of the shipped scene ``pattern`` at any size."""
         a_metre = self.size_m / 12
         if self.texture == "gaussian":
             numbers = {"cells": 800 * a_metre, "mean": 0.45, "std": 0.2}

@@ -10,7 +10,7 @@ __all__ = ["perlin_reflectivity"]
 PERIOD = 256
 OCTAVES = 2
 CONTRAST = 1.5
-BLOCK = 2**15  # places at a time: what they need stays in the cache
+BLOCK = 2**15  # points at a time: their data fit the cache
 GRADIENTS = np.array(
     [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) == 2], dtype=float
 )
@@ -20,9 +20,16 @@ GRADIENTS = np.array(
 def perlin_reflectivity(
     places: NDArray[np.float64], cell_m: float, span: tuple[float, float], rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Reflectivity at places ``(n, 3)`` [m]: Perlin's noise (Improving Noise, 2002), two octaves, 1.5 times, into ``span``.
+    """Compute reflectivities by Perlin's noise (Improving Noise, 2002): two octaves, contrast 1.5.
 
-    ``cell_m`` is the edge of a lattice cell of the first octave [m]; the lattice repeats after 256 cells.
+    Args:
+        places: points ``(n, 3)`` [m].
+        cell_m: edge of a lattice cell of the first octave [m]; the lattice repeats after 256 cells.
+        span: range of the reflectivity.
+        rng: draws the lattice.
+
+    Returns:
+        One value for each point ``(n,)``.
     """
     order = np.argsort(rng.random(PERIOD)).astype(np.int16)
     kinds = (rng.random(PERIOD) * len(GRADIENTS)).astype(np.int16)
@@ -37,7 +44,7 @@ def perlin_reflectivity(
 
 
 def _noise(places: NDArray[np.float64], order: NDArray[np.int16], kinds: NDArray[np.int16]) -> NDArray[np.float64]:
-    """One octave, about -1..1; ``places`` in lattice cells."""
+    """Compute one octave, about -1..1, at ``places`` in lattice cells."""
     x, y, z = places.T
     corner = [np.floor(axis) for axis in (x, y, z)]
     inside = [axis - low for axis, low in zip((x, y, z), corner, strict=True)]

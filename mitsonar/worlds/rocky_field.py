@@ -37,10 +37,13 @@ class _Kind(NamedTuple):
 
 
 class RockyField(Family):
-    """Rocks on a flat seabed (Almanza-Medina, 3.2.1): each kind on its own square grid, each rock moved at random within
-    its grid step, with its own height, sizes and turns; their reflectivity is Perlin's noise, one value a face."""
+    """Rocks on a flat seabed (Almanza-Medina, 3.2.1).
 
-    size_m: float = Field(30.0, gt=0, le=10_000, description="edge of the square field [m]; the thesis has 30 and 50")
+    Each kind of rock has its own square grid. Each rock is displaced at random within its grid step, and has its own height,
+    sizes and turns. The reflectivity is Perlin's noise, one value for each face.
+    """
+
+    size_m: float = Field(30.0, gt=0, le=10_000, description="edge of the square field [m]; Almanza-Medina has 30 and 50")
     seabed_cells: int = Field(2048, ge=1, le=2**20, description="cells along the seabed's edge")
     seabed_reflectivity: Interval = Field((0.0, 1.0), description="uniform reflectivity of a cell")
     a_side: Counts = Field((30, 130), description="rocks of a kind along the grid's edge, drawn for each kind")
@@ -55,10 +58,11 @@ class RockyField(Family):
 
     @property
     def half_m(self) -> float:
+        """Return half the edge of the field [m]."""
         return self.size_m / 2
 
     def build(self, seed: int) -> World:
-        """The field of a seed."""
+        """Build the field of a seed."""
         kinds = [
             _Kind("cubes", box(), self.cubes_a_side),
             _Kind("cylinders", cylinder(), self.cylinders_a_side),
@@ -82,7 +86,7 @@ class RockyField(Family):
         )
 
     def _rocks(self, kind: _Kind, a_side: int, first_id: int, rng: np.random.Generator) -> Mesh:
-        """All rocks of one kind."""
+        """Build all rocks of one kind."""
         count = a_side**2
         centre = np.column_stack([shifted_grid(self.half_m, a_side, rng), draw(rng, self.centre_height_m, count)])
         size = draw(rng, self.rock_size_m, count, 3)

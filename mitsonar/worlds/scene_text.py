@@ -1,4 +1,4 @@
-"""How deep a scene's XML nests, before Mitsuba reads it: its parser calls itself, and a deep file ends the process."""
+"""Check how deep a scene's XML nests before Mitsuba reads it: its parser recurses, and a deep file ends the process."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mitsonar.io.whole_files import read_bytes
 __all__ = ["check_nesting"]
 
 DEEPEST = 100
-"""Elements within elements; scenes have about ten."""
+"""Largest depth of nested elements; scenes have about ten."""
 
 LARGEST = 2**28
-"""Bytes of an XML file."""
+"""Largest size of an XML file [bytes]."""
 
 ASIDE = re.compile(rb"<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>", re.DOTALL)
 TAG = re.compile(rb"<(/?)([A-Za-z_][^\s/>]*+)((?:[^>\"']++|\"[^\"]*+\"|'[^']*+')*+)>")
@@ -26,7 +26,7 @@ def check_nesting(path: Path, parameters: dict[str, str], *, _seen: frozenset[Pa
 
     Args:
         path: of the file.
-        parameters: values of the scene's ``$name``, which may stand in the name of an included file.
+        parameters: values of the scene's ``$name``, which may occur in the name of an included file.
 
     Raises:
         MitsonarError: elements nest too deep, or the file is too large.
@@ -39,15 +39,15 @@ def check_nesting(path: Path, parameters: dict[str, str], *, _seen: frozenset[Pa
         if depth > DEEPEST:
             raise MitsonarError(f"{path} nests its elements more than {DEEPEST} deep: it is no scene")
         if name in (b"default", b"include"):
-            told = {key.decode(): (one or other).decode("utf-8", "replace") for key, one, other in ATTRIBUTE.findall(rest)}
+            given = {key.decode(): (one or other).decode("utf-8", "replace") for key, one, other in ATTRIBUTE.findall(rest)}
             if name == b"default":
-                values.setdefault(told.get("name", ""), told.get("value", ""))
+                values.setdefault(given.get("name", ""), given.get("value", ""))
             else:
-                _check_included(path, told.get("filename", ""), values, _seen | {path.resolve()})
+                _check_included(path, given.get("filename", ""), values, _seen | {path.resolve()})
 
 
 def _check_included(path: Path, name: str, values: dict[str, str], seen: frozenset[Path]) -> None:
-    """A file that another includes; Mitsuba says so itself where it is not there, or includes itself."""
+    """Check a file that another includes; Mitsuba itself reports one that is missing or includes itself."""
     for key in sorted(values, key=len, reverse=True):
         name = name.replace(f"${key}", values[key]) if key else name
     for folder in (path.parent, Path(), *(one.parent for one in seen)):

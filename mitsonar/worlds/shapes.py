@@ -1,9 +1,9 @@
-"""Shapes of one unit in each direction, and many copies of one as a single mesh."""
+"""Shapes of one unit in each direction, and many copies of a shape as a single mesh."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["Copies", "box", "capsule", "cylinder", "place", "slab"]
 
 GRID_M = 1e-6
-"""Vertices lie on a grid of a micrometre: the last bits of a library's sine do not reach the file."""
+"""Grid of the vertices [m]: rounding to it removes the last bits of a library's sine from the file."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Copies:
     Attributes:
         vertices: ``(vertices, 3)`` [m].
         faces: ``(faces, 3)``.
-        number: which copy each face belongs to ``(faces,)``.
-        count: how many copies.
+        number: index of the copy that each face belongs to ``(faces,)``.
+        count: number of copies.
     """
 
     vertices: NDArray[np.float64]
@@ -36,26 +36,26 @@ class Copies:
 
     @property
     def centres(self) -> NDArray[np.float64]:
-        """The middle of each face ``(faces, 3)`` [m]."""
+        """Return the centre of each face ``(faces, 3)`` [m]."""
         return np.asarray(self.vertices[self.faces].mean(axis=1))
 
 
 def box() -> trimesh.Trimesh:
-    """A cube, four triangles along each edge: 48."""
+    """Return a cube of 48 triangles, eight a side."""
     import trimesh
 
-    return trimesh.creation.box().subdivide()
+    return cast("trimesh.Trimesh", trimesh.creation.box().subdivide())
 
 
 def slab() -> trimesh.Trimesh:
-    """A cube of 12 triangles."""
+    """Return a cube of 12 triangles."""
     import trimesh
 
-    return trimesh.creation.box()
+    return cast("trimesh.Trimesh", trimesh.creation.box())
 
 
 def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
-    """A cylinder along z, its side cut into ``rings``."""
+    """Return a cylinder along z, its side cut into ``rings``."""
     import trimesh
 
     side = [(0.5, z) for z in np.linspace(-0.5, 0.5, rings + 1)]
@@ -63,7 +63,7 @@ def cylinder(sections: int = 12, rings: int = 2) -> trimesh.Trimesh:
 
 
 def capsule(sections: int = 12) -> trimesh.Trimesh:
-    """A capsule along z, twice as long as wide before it is squeezed to one unit: half spheres of two bands."""
+    """Return a capsule along z: half spheres of two bands, twice as long as wide, squeezed to one unit."""
     import trimesh
 
     turn = np.radians([-90, -45, 0])
@@ -73,7 +73,7 @@ def capsule(sections: int = 12) -> trimesh.Trimesh:
 
 
 def place(shape: trimesh.Trimesh, size: ArrayLike, turn: Rotation, centre: ArrayLike) -> Copies:
-    """Copies of a unit shape: scaled to ``size`` ``(n, 3)`` [m], turned, moved to ``centre`` ``(n, 3)`` [m]."""
+    """Copy a unit shape: scale it to ``size`` ``(n, 3)`` [m], turn it, move it to ``centre`` ``(n, 3)`` [m]."""
     size, centre = np.asarray(size, dtype=float), np.asarray(centre, dtype=float)
     count, each = len(size), len(shape.vertices)
     placed = (np.asarray(shape.vertices) * size[:, None]) @ turn.as_matrix().transpose(0, 2, 1) + centre[:, None]

@@ -26,8 +26,11 @@ __all__ = ["ShipHull"]
 
 
 class ShipHull(Family):
-    """The bottom of a ship, laid flat (Almanza-Medina, 3.2.2): groups of elliptical tubes side by side, and sacrificial
-    anodes, elliptical too with their cross-section facing the sonar; both attached to the plate z = 0."""
+    """The bottom of a ship, laid flat (Almanza-Medina, 3.2.2).
+
+    It has groups of elliptical tubes side by side, and sacrificial anodes. The anodes are elliptical too, with their
+    cross-section towards the sonar. Both are attached to the plate z = 0.
+    """
 
     size_m: float = Field(20.0, gt=0, le=10_000, description="edge of the square plate [m] (ours)")
     plate_cells: int = Field(1024, ge=1, le=2**20, description="cells along the plate's edge")
@@ -46,10 +49,11 @@ class ShipHull(Family):
 
     @property
     def half_m(self) -> float:
+        """Return half the edge of the plate [m]."""
         return self.size_m / 2
 
     def build(self, seed: int) -> World:
-        """The hull of a seed."""
+        """Build the hull of a seed."""
         meshes: list[Mesh] = []
         counts: list[str] = []
         first_id = 1
@@ -69,7 +73,7 @@ class ShipHull(Family):
         )
 
     def _tubes(self, rng: np.random.Generator) -> Copies:
-        """All tubes; those of a group lie side by side, along one direction."""
+        """Build all tubes; those of a group lie side by side, along one direction."""
         middle = shifted_grid(self.half_m, whole(rng, self.groups_a_side), rng)
         groups = len(middle)
         counts = whole(rng, self.tubes_a_group, groups)
@@ -89,7 +93,7 @@ class ShipHull(Family):
         return place(cylinder(12, 12), np.column_stack([width, height, length]), laid, centre)
 
     def _anodes(self, rng: np.random.Generator) -> Copies:
-        """All anodes."""
+        """Build all anodes."""
         middle = shifted_grid(self.half_m, whole(rng, self.anodes_a_side), rng)
         count = len(middle)
         height = draw(rng, self.anode_height_m, count)

@@ -1,4 +1,4 @@
-"""A user's own model, textured or not, as a world."""
+"""A world from a user's own model, with or without textures."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from mitsonar.errors import MitsonarError, argument, meant
@@ -23,30 +23,32 @@ __all__ = ["FORMATS", "mesh_world"]
 
 FORMATS = (".glb", ".gltf", ".obj", ".stl", ".dae", ".ply")
 UNCOLOURED = 0.5
-"""Reflectivity of a model without colours, as of BSDFs that have none."""
+"""Reflectivity of a model without colours, as that of BSDFs without reflectance."""
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
-"""Rows of the turn that brings each axis up, by even permutations: nothing is mirrored."""
+"""Rows of the rotation that turns each axis upwards: even permutations, which do not mirror."""
 
 
 LARGEST_M = 1e6
+"""Largest extent of a model [m]."""
+
 FARTHEST_M = 1e9
-"""Of a model [m]: its extent, and its distance from the file's origin."""
+"""Largest distance of a model from the file's origin [m]."""
 
 MOST_TRIANGLES = 50_000_000
-"""Of a model, each copy counted."""
+"""Largest number of triangles of a model, with all copies."""
 
 MOST_PIXELS = 2**26
-"""Of a model's picture."""
+"""Largest number of pixels of a model's picture."""
 
 LARGEST_FILE = 2**32
-"""Bytes of a model."""
+"""Largest size of a model's file [bytes]."""
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """One geometry of a model: triangles with one value each, or with uv and a picture."""
+    """One geometry of a model: triangles with one reflectivity each, or with uv and a picture."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
@@ -64,42 +66,28 @@ def mesh_world(
     floor: bool = True,
     floor_m: float | None = None,
 ) -> World:
-    """The world of a model: turned z up, scaled, its lowest point on a seabed at z = 0, its middle at the origin.
+    """Build the world of a model: z upwards, scaled, its lowest point on a seabed at z = 0, centred on the origin.
 
     Args:
         path: glTF, OBJ, STL, COLLADA or PLY.
-        scale: metres a unit of the file.
+        scale: metres in a unit of the file.
         up: the file's axis that points up, x, y or z; default: y for glTF, z otherwise.
-        reflectivity: ``luminance`` (of linear light, as Mitsuba computes it), ``red`` (the red channel as stored, as the
-            thesis does), or one number for all.
-        floor: a seabed of random cells of 15 mm below.
+        reflectivity: ``luminance`` (of linear light, as Mitsuba computes it), ``red`` (the stored red channel, as in
+            Almanza-Medina), or one number for all.
+        floor: whether a seabed of random cells of 15 mm lies below.
         floor_m: edge of that seabed [m]; default: three times the model's diagonal.
 
     Raises:
-        MitsonarError: unreadable, broken or empty model; scale, axis or reflectivity that is not allowed.
+        MitsonarError: the model is unreadable, broken or empty; scale, axis or reflectivity is not allowed.
     """
     path = Path(path)
     up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
-    if up not in UP:
-        raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{meant(up, UP)}")
-    if not (np.isfinite(scale) and scale > 0):
-        raise MitsonarError(f"{argument('scale')} must be a finite number above 0, metres a unit of the file: got {scale:g}")
-    if floor_m is not None and not 0 < floor_m <= 10_000:
-        raise MitsonarError(f"{argument('floor_m')} must lie in 0..10000 m: got {floor_m:g}")
-    value = _value(reflectivity)
-    pieces = _pieces(path, value)
+    _check_options(up, scale, floor_m)
+    pieces = _pieces(path, _value(reflectivity))
     turn = np.array(UP[up], dtype=float) * scale
     corners = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
+    _check_extent(path, corners, scale)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        extent = float(np.ptp(corners, axis=0).max())
-    if not np.isfinite(corners).all() or extent <= 0:
-        raise MitsonarError(f"{path} is broken: its vertices are not finite or all in one place; export it again")
-    if not (extent <= LARGEST_M and np.abs(corners).max() <= FARTHEST_M):
-        raise MitsonarError(
-            f"{path} spans {extent:.4g} m with scale {scale:g}: a model spans at most {LARGEST_M:g} m; give the scale in "
-            "metres a unit of the file"
-        )
     shift = np.array([*(low + high)[:2] / 2, low[2]])
     meshes, content = _merge(pieces, turn, shift)
     radius = float(np.linalg.norm(high - low)) / 2
@@ -114,8 +102,39 @@ def mesh_world(
     )
 
 
+def _check_options(up: str, scale: float, floor_m: float | None) -> None:
+    """Check the options of :func:`mesh_world`.
+
+    Raises:
+        MitsonarError: one of them is not allowed.
+    """
+    if up not in UP:
+        raise MitsonarError(f"{argument('up')} must be x, y or z: got {up!r}{meant(up, UP)}")
+    if not (np.isfinite(scale) and scale > 0):
+        raise MitsonarError(f"{argument('scale')} must be a finite number above 0, metres a unit of the file: got {scale:g}")
+    if floor_m is not None and not 0 < floor_m <= 10_000:
+        raise MitsonarError(f"{argument('floor_m')} must lie in 0..10000 m: got {floor_m:g}")
+
+
+def _check_extent(path: Path, corners: NDArray[np.float64], scale: float) -> None:
+    """Check that the corners of a model ``(n, 3)`` [m] are finite, and neither one point nor too far apart.
+
+    Raises:
+        MitsonarError: they are not.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        extent = float(np.ptp(corners, axis=0).max())
+    if not np.isfinite(corners).all() or extent <= 0:
+        raise MitsonarError(f"{path} is broken: its vertices are not finite or all in one place; export it again")
+    if not (extent <= LARGEST_M and np.abs(corners).max() <= FARTHEST_M):
+        raise MitsonarError(
+            f"{path} spans {extent:.4g} m with scale {scale:g}: a model spans at most {LARGEST_M:g} m; give the scale in "
+            "metres a unit of the file"
+        )
+
+
 def _stand(radius: float, height: float) -> Standpoint:
-    """So far away, 30 deg above, that the model fills a field of view of 29 deg."""
+    """Return a sonar 30 deg above, at the distance at which the model fills a field of view of 29 deg."""
     away = 1.1 * radius / np.tan(np.radians(14.5))
     middle = height / 2
     sin, cos = np.sin(np.radians(30)), np.cos(np.radians(30))
@@ -124,7 +143,11 @@ def _stand(radius: float, height: float) -> Standpoint:
 
 
 def _value(reflectivity: str | float) -> str | float:
-    """``red``, ``luminance``, or a number."""
+    """Return ``red``, ``luminance``, or a number 0..1.
+
+    Raises:
+        MitsonarError: it is none of these.
+    """
     if reflectivity in ("red", "luminance"):
         return reflectivity
     try:
@@ -140,17 +163,17 @@ def _value(reflectivity: str | float) -> str | float:
 
 
 def _pieces(path: Path, value: str | float) -> list[_Piece]:
-    """The geometries of a file with their reflectivity."""
+    """Read the geometries of a file with their reflectivity."""
     geometries = _geometries(path)
     try:
         return [_piece(geometry, value) for geometry in geometries]
-    except Exception as error:  # colours and pictures lead to whatever their bytes do
+    except Exception as error:  # damaged colours and pictures raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read the colours of {path}: {reason}; export the model again") from None
 
 
 def _geometries(path: Path) -> list[trimesh.Trimesh]:
-    """The triangles of a file, moved to where its scene graph puts them."""
+    """Read the triangles of a file, transformed by its scene graph."""
     if not path.is_file():
         raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
     if path.suffix.lower() not in FORMATS:
@@ -172,7 +195,7 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
                 raise ValueError("a vertex or a triangle has not three numbers")
             if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
                 raise ValueError("a triangle names a vertex that is not there")
-    except Exception as error:  # readers raise whatever the bytes lead them to
+    except Exception as error:  # readers of damaged files raise errors of any type
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
     if not found:
@@ -181,10 +204,10 @@ def _geometries(path: Path) -> list[trimesh.Trimesh]:
 
 
 def _check_file(path: Path) -> None:
-    """What a file promises, against its size, before a reader takes memory for it.
+    """Check the counts in a file against its size, before a reader allocates memory.
 
     Raises:
-        ValueError: more than is there.
+        ValueError: the file promises more than it has.
     """
     size = path.stat().st_size
     if size > LARGEST_FILE:
@@ -197,7 +220,7 @@ def _check_file(path: Path) -> None:
 
 
 def _check_gltf(path: Path, size: int) -> None:
-    """That accessors of a glTF file point into bytes that are there."""
+    """Check that the accessors of a glTF file point into its bytes."""
     content = path.read_bytes()
     if path.suffix.lower() == ".glb":
         (length,) = struct.unpack_from("<I", content, 12)
@@ -216,12 +239,12 @@ def _check_gltf(path: Path, size: int) -> None:
 
 
 def _check_copies(scene: trimesh.Scene) -> None:
-    """That a scene graph, which may place a geometry many times, and its pictures can be held."""
+    """Check the size of a scene graph, which may copy a geometry many times, and of its pictures."""
     total = 0
     for node in scene.graph.nodes_geometry:
         geometry = scene.geometry[scene.graph[node][1]]
         total += len(getattr(geometry, "faces", ()))
-        material: Any = getattr(geometry.visual, "material", None)
+        material = getattr(geometry.visual, "material", None)
         for name in ("baseColorTexture", "image"):
             picture = getattr(material, name, None)
             if picture is not None and picture.width * picture.height > MOST_PIXELS:
@@ -231,7 +254,7 @@ def _check_copies(scene: trimesh.Scene) -> None:
 
 
 def _piece(geometry: trimesh.Trimesh, value: str | float) -> _Piece:
-    """A geometry with its reflectivity."""
+    """Return a geometry with its reflectivity."""
     vertices, faces = np.asarray(geometry.vertices, dtype=float), np.asarray(geometry.faces)
     if not isinstance(value, str):
         return _Piece(vertices, faces, np.full(len(faces), value))
@@ -252,8 +275,8 @@ def _piece(geometry: trimesh.Trimesh, value: str | float) -> _Piece:
     return _Piece(vertices, faces, _one(_colours(visual.face_colors), value))
 
 
-def _tint(material: Any, value: str) -> float:
-    """One number of a material's own colour, 0..1; a picture is multiplied by it."""
+def _tint(material: trimesh.visual.material.Material, value: str) -> float:
+    """Return the reflectivity of a material's own colour, 0..1; a picture is multiplied by it."""
     if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear already, white where it is not given
         factor = material.baseColorFactor
         colour = np.ones(3) if factor is None else _colours(factor)[0]
@@ -263,15 +286,15 @@ def _tint(material: Any, value: str) -> float:
     return float(_one(_colours(material.main_color), value)[0])
 
 
-def _colours(values: Any) -> NDArray[np.float64]:
-    """RGB in 0..1 ``(n, 3)`` of 8-bit or fractional RGB(A)."""
+def _colours(values: ArrayLike) -> NDArray[np.float64]:
+    """Return RGB in 0..1 ``(n, 3)`` of 8-bit or fractional RGB(A)."""
     table = np.atleast_2d(np.asarray(values))
     scale = 255 if np.issubdtype(table.dtype, np.integer) else 1
     return np.clip(table[:, :3].astype(float) / scale, 0, 1)
 
 
 def _one(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
-    """One number of colours ``(..., 3)`` as stored: red, or the luminance of the linear light that sRGB stands for."""
+    """Reduce stored colours ``(..., 3)`` to one number each: red, or the luminance of their linear light (sRGB)."""
     if value == "red":
         return colours[..., 0]
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
@@ -279,7 +302,7 @@ def _one(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
 
 
 def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
-    """The picture's reflectivity as a 16-bit grey PNG."""
+    """Return the picture's reflectivity as a 16-bit grey PNG."""
     grey = _one(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
     pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
     buffer = io.BytesIO()
@@ -290,7 +313,7 @@ def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
 def _merge(
     pieces: list[_Piece], turn: NDArray[np.float64], shift: NDArray[np.float64]
 ) -> tuple[list[Mesh], dict[str, bytes]]:
-    """One mesh of all plain pieces, and one for each picture."""
+    """Merge all plain pieces into one mesh, and those of each picture into another; also return the pictures as files."""
     groups: dict[bytes | None, list[tuple[int, _Piece]]] = {}
     for number, piece in enumerate(pieces, start=1):
         groups.setdefault(piece.picture, []).append((number, piece))

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, overload
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -25,7 +25,7 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Interval = Annotated[tuple[float, float], AfterValidator(_rising)]
-"""From low to high, both finite."""
+"""Lowest and highest value, both finite."""
 
 
 def _counting(pair: tuple[int, int]) -> tuple[int, int]:
@@ -35,64 +35,71 @@ def _counting(pair: tuple[int, int]) -> tuple[int, int]:
 
 
 Counts = Annotated[tuple[int, int], AfterValidator(_counting)]
-"""From low to high, both drawn too."""
+"""Lowest and highest number of objects; the number is drawn from both and all between."""
 
 
 class Family(BaseModel):
-    """A kind of world: what may be chosen, and :meth:`build`, which makes one from a seed."""
+    """A family of worlds: its options are the fields, and :meth:`build` makes a world from a seed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @property
     def half_m(self) -> float:
-        """Half the edge of the square, around the origin, that the world fills [m]."""
+        """Return half the edge of the square around the origin that the world fills [m]."""
         raise NotImplementedError
 
     @property
     def seeded(self) -> bool:
-        """Whether another seed gives another world."""
+        """Return whether another seed gives another world."""
         return True
 
     def build(self, seed: int) -> World:
-        """The world of a seed; the same bytes for the same seed."""
+        """Build the world of a seed; the same seed gives the same bytes."""
         raise NotImplementedError
 
     def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Refuse a scene that is smaller than what its frames are taken from; a world that is built is as large as it says.
+        """Refuse a scene that is smaller than the square of its frames; a world that is built is never smaller.
 
         Args:
-            low: least x, y, z of all that the scene holds ``(3,)`` [m].
+            low: least x, y, z of the scene ``(3,)`` [m].
             high: largest ``(3,)`` [m].
 
         Raises:
             MitsonarError: it is smaller.
         """
 
-    def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, Any]]:
-        """Write the world of a seed into a new folder; the XML file, and the parameters to load it with."""
+    def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, str]]:
+        """Write the world of a seed into a new folder, and return its XML file and the parameters to load it with."""
         return self.build(seed).write(folder), {}
 
 
 def stream(seed: int, *purpose: int) -> np.random.Generator:
-    """Random numbers that belong to a seed and a purpose, whoever draws them."""
+    """Return the generator of random numbers of a seed and a purpose."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *purpose])))
 
 
 def draw(rng: np.random.Generator, span: tuple[float, float], *shape: int) -> NDArray[np.float64]:
-    """Uniform numbers of an interval; only the generator's plain doubles are used, whose bits do not change."""
+    """Draw uniform numbers of an interval; only the generator's plain doubles are used, whose bits do not change."""
     low, high = span
     return np.asarray(low + (high - low) * rng.random(shape), dtype=np.float64)
 
 
-def whole(rng: np.random.Generator, span: tuple[int, int], *shape: int) -> Any:
-    """Whole numbers of a closed interval; one without a shape."""
+@overload
+def whole(rng: np.random.Generator, span: tuple[int, int]) -> int: ...
+@overload
+def whole(rng: np.random.Generator, span: tuple[int, int], first: int, /, *shape: int) -> NDArray[np.int64]: ...
+def whole(rng: np.random.Generator, span: tuple[int, int], *shape: int) -> int | NDArray[np.int64]:
+    """Draw whole numbers of a closed interval: one without a shape, else an array of that shape."""
     values = span[0] + np.floor(rng.random(shape) * (span[1] + 1 - span[0])).astype(int)
     return values if shape else int(values)
 
 
 def shifted_grid(half_m: float, a_side: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Vertices of a square grid over the field, each moved within its grid step (Almanza-Medina, 3.2.1) ``(a_side^2, 2)``
-    [m]."""
+    """Draw the vertices of a square grid, each displaced within its grid step (Almanza-Medina, 3.2.1).
+
+    Returns:
+        Points over the field ``(a_side^2, 2)`` [m].
+    """
     step = 2 * half_m / max(a_side, 1)
     vertex = np.stack(np.meshgrid(*[np.arange(a_side)] * 2, indexing="ij"), -1).reshape(-1, 2) * step - half_m
     return np.asarray(vertex + step * rng.random((a_side**2, 2)), dtype=np.float64)
@@ -107,9 +114,9 @@ class Mesh:
         vertices: ``(vertices, 3)`` [m].
         faces: ``(faces, 3)``.
         reflectivity: of each face ``(faces,)`` 0..1, where no texture gives it.
-        object_id: of each face ``(faces,)``, 1 and more; one number an object.
+        object_id: of each face ``(faces,)``, from 1; one number for each object.
         uv: of each vertex ``(vertices, 2)``, with a texture.
-        texture: file of a picture, within the world's folder, that gives the reflectivity.
+        texture: picture of the reflectivity, a file within the world's folder.
     """
 
     name: str
@@ -121,11 +128,11 @@ class Mesh:
     texture: str | None = None
 
     def ply(self) -> bytes:
-        """The mesh as binary PLY, attributes by the names that Mitsuba reads."""
+        """Return the mesh as binary PLY, with the attribute names that Mitsuba reads."""
         vertex = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
         if self.uv is not None:
             vertex |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
-        face: dict[str, NDArray[Any]] = {}
+        face: dict[str, NDArray[np.number]] = {}
         if self.reflectivity is not None:
             face["reflectivity_0"] = self.reflectivity
         if self.object_id is not None:
@@ -139,12 +146,12 @@ class Mesh:
             points[name] = values
         corners = np.empty(len(self.faces), [("count", "u1"), ("corners", "<i4", 3), *((name, "<f4") for name in face)])
         corners["count"], corners["corners"] = 3, self.faces
-        for name, values in face.items():
-            corners[name] = values
+        for name, column in face.items():
+            corners[name] = column
         return "\n".join([*head, "end_header", ""]).encode() + points.tobytes() + corners.tobytes()
 
     def xml(self) -> str:
-        """The shape."""
+        """Return the XML of the shape."""
         if self.texture is not None:
             reflectance = (
                 f'<texture type="bitmap" name="reflectance"><string name="filename" value={quoteattr(self.texture)}/>'
@@ -175,7 +182,7 @@ class Floor:
 
     @staticmethod
     def cells(count: int, span: tuple[float, float], seed: int) -> str:
-        """Independent cells, ``count`` along each edge, uniform within ``span``."""
+        """Return the XML of a texture of independent cells, ``count`` along each edge, uniform within ``span``."""
         return f"""<texture type="cell_noise" name="reflectance">
                 <float name="cells" value="{count}"/>
                 <float name="low" value="{span[0]!r}"/>
@@ -184,7 +191,7 @@ class Floor:
             </texture>"""
 
     def xml(self) -> str:
-        """The shape."""
+        """Return the XML of the shape."""
         return f"""
     <shape type="rectangle" id="{self.name}">
         <transform name="to_world">
@@ -199,7 +206,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class Standpoint:
-    """A sonar that stands in the world: window, origin and the point that its axis meets [m]."""
+    """The sonar in a world: its position, the point on its axis, its window of ranges [m], and its preset."""
 
     origin: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -207,7 +214,7 @@ class Standpoint:
     preset: str = "didson300"
 
     def xml(self) -> str:
-        """The sensor."""
+        """Return the XML of the sensor."""
         return f"""
     <sensor type="imaging_sonar">
         <string name="preset" value="{self.preset}"/>
@@ -224,10 +231,10 @@ class World:
     """Meshes, a floor and a sonar to begin with.
 
     Attributes:
-        about: what made it, for the file's head.
+        about: family and seed, for the head of the file.
         meshes: of the world.
-        stand: where a sonar stands.
-        floor: under them, if any.
+        stand: the sonar in it.
+        floor: below the meshes, if any.
         pictures: files to copy into the world's folder, by their name there.
         content: files to write into the world's folder, by their name there.
     """
@@ -241,17 +248,17 @@ class World:
 
     @property
     def size_m(self) -> float:
-        """Longest edge of the box around the meshes [m]."""
+        """Return the longest edge of the box around the meshes [m]."""
         vertices = np.concatenate([mesh.vertices for mesh in self.meshes])
         return float(np.ptp(vertices, axis=0).max())
 
     @property
     def faces(self) -> int:
-        """Triangles of all meshes."""
+        """Return the number of triangles of all meshes."""
         return sum(len(mesh.faces) for mesh in self.meshes)
 
     def xml(self) -> str:
-        """The Mitsuba scene."""
+        """Return the XML of the Mitsuba scene."""
         shapes: Iterable[Floor | Mesh] = [*([self.floor] if self.floor else []), *self.meshes]
         about = escape(self.about).replace("--", "- -")
         return f"""<?xml version="1.0" encoding="utf-8"?>
@@ -264,10 +271,10 @@ class World:
 """
 
     def write(self, folder: str | Path) -> Path:
-        """Write ``scene.xml``, ``meshes/`` and ``textures/``, the scene last; returns its path.
+        """Write ``scene.xml``, ``meshes/`` and ``textures/``, the scene last, and return its path.
 
         Raises:
-            MitsonarError: the folder holds something.
+            MitsonarError: the folder is not empty.
         """
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

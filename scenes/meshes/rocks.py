@@ -1,6 +1,6 @@
 """Generate `rocks.ply`: stones strewn over the seabed around the sunken ship, half of them near its hull.
 
-Needs trimesh. The seed is fixed, so the same bytes come out each time; `--quick` tells whether they are what is shipped.
+Needs trimesh. The seed is fixed, so the same bytes come out each time; `--quick` compares them with the shipped file.
 """
 
 import argparse
@@ -18,7 +18,7 @@ HULL_M = (9.0, 5.0)
 
 
 def rocks(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices ``(n, 3)`` and triangles ``(m, 3)``: rough balls, flattened, turned and sunk into the floor z = 0."""
+    """Return vertices ``(n, 3)`` [m] and triangles ``(m, 3)``: rough balls, flattened, turned, sunk into the floor z = 0."""
     ball = trimesh.creation.icosphere(subdivisions=1)
     vertices, faces = [], []
     for number in range(COUNT):

@@ -1,7 +1,7 @@
 """Generate the tileable greyscale textures of the shipped scenes: stand-ins for photographs of real surfaces.
 
 Each picture is a made-up luminance (albedo times a soft oblique light) with periodic boundaries. The seeds are fixed,
-so the same bytes come out each time; `--quick` makes one, and tells whether it is what is shipped.
+so the same bytes come out each time; `--quick` makes one and compares it with the shipped one.
 """
 
 import argparse
@@ -75,7 +75,7 @@ def cells(
 
 
 def sand() -> Field:
-    """Rippled sand: a narrow band of wave vectors, whose phase singularities are the forks of real ripples."""
+    """Return rippled sand: a narrow band of wave vectors, whose phase singularities are the forks of real ripples."""
     rng = np.random.default_rng(1)
     band = np.exp(-(((KY - 17) / 2.6) ** 2) - ((KX - 3) / 3.5) ** 2)
     wave = fft.ifft2(fft.fft2(rng.standard_normal((SIZE, SIZE))) * band)
@@ -88,7 +88,7 @@ def sand() -> Field:
 
 
 def gravel() -> Field:
-    """Pebbles of various sizes: rounded, domed cells of a power diagram with dark grit between them."""
+    """Return pebbles of various sizes: rounded, domed cells of a power diagram with dark grit between them."""
     rng = np.random.default_rng(2)
     centres, radii = scatter(rng, np.clip(rng.lognormal(2.0, 0.55, 16000), 4.5, 32), 0.86)
     warp = [2.5 * fractal(rng, 2.6, 9) for _ in range(2)]
@@ -104,7 +104,7 @@ def gravel() -> Field:
 
 
 def rock() -> Field:
-    """Weathered rock: a lit 1/f relief with stains, broken by cracks that wander, widen and die out."""
+    """Return weathered rock: a lit 1/f relief with stains, broken by cracks that wander, widen and die out."""
     rng = np.random.default_rng(3)
     relief, warp = fractal(rng, 1.75), [fractal(rng, 1.7) for _ in range(2)]
     light = slope_light(28 * relief, 40)

@@ -129,9 +129,9 @@ def test_a_receiver_that_hears_nothing_is_named(mitsonar: Command, tmp_path: Pat
     )
     done = mitsonar("impulse", path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert "receiver up hears nothing in 1 of 1 pings" in done.stderr
-    assert "more than 90 looks up" in done.stderr
-    assert "receiver up sits 20 m from the transmitter: positions are in metres" in done.stderr
+    assert "receiver up has no echo in 1 of 1 pings" in done.stderr
+    assert "above 90: upwards" in done.stderr
+    assert "receiver up is 20 m from the transmitter: positions are in metres" in done.stderr
     assert "receiver front" not in done.stderr
     assert not ImpulseResponses.load(tmp_path / "out").response[0, 2].any()
 
@@ -153,7 +153,7 @@ def test_mistakes_are_answered(mitsonar: Command, scene: Path, tmp_path: Path, m
     refused(mitsonar("impulse", scene, "--velocity", "900,0"), "a tenth of the sound speed", "m/s")
     refused(mitsonar("impulse", scene, "--set", "receivers=front,bow"), "of the receivers front, right: got 'bow'")
     refused(mitsonar("impulse", scene, "--set", "transmitter=all"), "in the scene, or in Python")
-    refused(mitsonar("impulse", scene, "--from", "0,0,-10,0,0,0"), "no receiver hears anything", "(0, 0, -10) m")
+    refused(mitsonar("impulse", scene, "--from", "0,0,-10,0,0,0"), "no receiver has an echo", "(0, 0, -10) m")
     refused(mitsonar("impulse", scene, "--trajectory", "sqare"), "unknown course 'sqare'", "square")
     refused(mitsonar("impulse", scene, "--trajectory", tmp_path / "no.tum"), "cannot read trajectory")
     refused(mitsonar("impulse", scene, "--trajectory", "square", "--velocity", "1,1"), "contradict")

@@ -1,9 +1,8 @@
-"""Recipes: the thesis's own numbers, and one sentence for whatever is wrong in a user's file."""
+"""Recipes: Almanza-Medina's own numbers, and one sentence for whatever is wrong in a user's file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -28,7 +27,7 @@ IMAGES = {
     "rocky-field-physical": 200_000,
     "ship-hull-physical": 100_000,
 }
-"""Pings of the whole set, from the thesis: 3.2, 3.4.5, 3.6 and 4.2 (pairs times 5/4), 4.4.4, 4.5, 2.3."""
+"""Pings of the whole set, from Almanza-Medina: 3.2, 3.4.5, 3.6 and 4.2 (pairs times 5/4), 4.4.4, 4.5, 2.3."""
 
 
 def test_all_that_is_promised_is_shipped() -> None:
@@ -92,7 +91,7 @@ def test_wide_frames_fly_the_poses_of_the_plain_ones() -> None:
     np.testing.assert_array_equal(plain.poses, wide.poses)
 
 
-def written(folder: Path, **changes: Any) -> Path:
+def written(folder: Path, **changes: object) -> Path:
     path = folder / "mine.yaml"
     path.write_text(yaml.safe_dump({**TINY, **changes}))
     return path
@@ -159,7 +158,7 @@ def test_a_scene_of_one_s_own(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_are_answered_by_one_sentence(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_mistakes_are_answered_by_one_sentence(changes: dict[str, object], words: str, tmp_path: Path) -> None:
     with pytest.raises(MitsonarError) as error:
         load_recipe(written(tmp_path, **changes))
     assert words in str(error.value)

@@ -639,7 +639,8 @@ def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
 def test_values_of_a_recipe_that_cannot_be(key: str, value: Any) -> None:
     import copy
 
-    from mitsonar.config.data_recipe import recipe_from, set_key
+    from mitsonar.config.data_recipe import recipe_from
+    from mitsonar.config.recipe_keys import set_key
 
     fields = copy.deepcopy(TINY)
     set_key(fields, key, value)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -17,7 +17,10 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.imaging import RenderedPings, Simulator
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -32,7 +35,7 @@ FLIGHT = Trajectory.between(Pose(0, 0, 2.5, np.radians(35), 0, 0.1), Pose(0.5, 0
 
 
 @pytest.fixture(scope="module")
-def world(variant: str) -> Any:
+def world(variant: str) -> mi.Scene:
     """Shapes with and without tables, textures in Python and in C++."""
     import mitsuba as mi
 
@@ -50,7 +53,7 @@ def world(variant: str) -> Any:
     )
 
 
-# ---------------------------------------------------------------- binning again, from the docstring of binning.py
+# ---------------------------------------------------------------- a second binning, from the docstring of binning.py
 
 
 def fixed_point_bits(sonar: Sonar) -> int:
@@ -99,7 +102,7 @@ def bin_in_numpy(echoes: Echoes, sonar: Sonar) -> tuple[np.ndarray, dict[str, np
 
 
 @pytest.mark.parametrize("name", SONARS)
-def test_fused_image_equals_numpy_on_the_stored_echoes(world: Any, tmp_path: Path, name: str) -> None:
+def test_fused_image_equals_numpy_on_the_stored_echoes(world: mi.Scene, tmp_path: Path, name: str) -> None:
     sonar = SONARS[name]
     simulator = Simulator(world, sonar)
     list(simulator.pings(FLIGHT.poses[4:7]))  # what follows is a replay of this launch
@@ -114,21 +117,21 @@ def test_fused_image_equals_numpy_on_the_stored_echoes(world: Any, tmp_path: Pat
             np.testing.assert_array_equal(getattr(pings.counts, what)[k], wanted, err_msg=what)
 
 
-def assert_same_pings(got: Any, wanted: Any) -> None:
+def assert_same_pings(got: Sequence[RenderedPings], wanted: Sequence[RenderedPings]) -> None:
     """All batches joined."""
     for name in ("levels", "height_m"):
         parts = [np.concatenate([getattr(pings, name) for pings in batches]) for batches in (got, wanted)]
-        np.testing.assert_array_equal(*parts, err_msg=name)
+        np.testing.assert_array_equal(parts[0], parts[1], err_msg=name)
     for name in ("inside", "nearer", "farther", "missed"):
         parts = [np.concatenate([getattr(pings.counts, name) for pings in batches]) for batches in (got, wanted)]
-        np.testing.assert_array_equal(*parts, err_msg=name)
+        np.testing.assert_array_equal(parts[0], parts[1], err_msg=name)
     for name in wanted[0].labels:
         parts = [np.concatenate([pings.labels[name] for pings in batches]) for batches in (got, wanted)]
-        np.testing.assert_array_equal(*parts, err_msg=name)
+        np.testing.assert_array_equal(parts[0], parts[1], err_msg=name)
 
 
 @pytest.mark.parametrize("name", ["physical", "thesis"])
-def test_one_launch_ten_launches_or_three(world: Any, name: str) -> None:
+def test_one_launch_ten_launches_or_three(world: mi.Scene, name: str) -> None:
     sonar = SONARS[name]
     whole = list(Simulator(world, sonar).pings(FLIGHT.poses))
     assert len(whole) == 1
@@ -149,7 +152,7 @@ def threads() -> Iterator[None]:
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["physical", "thesis"])
-def test_one_thread_or_two(world: Any, name: str) -> None:
+def test_one_thread_or_two(world: mi.Scene, name: str) -> None:
     found = []
     for count in (1, 2):
         dr.set_thread_count(count)
@@ -177,7 +180,7 @@ def test_threads_may_change_between_launches() -> None:
     """)
 
 
-def test_again_gives_the_same(world: Any) -> None:
+def test_again_gives_the_same(world: mi.Scene) -> None:
     first, second = (list(Simulator(world, SONARS["physical"]).pings(FLIGHT.poses, labels=True)) for _ in range(2))
     assert_same_pings(first, second)
     other = list(Simulator(world, SONARS["physical"].replace(seed=1)).pings(FLIGHT.poses))
@@ -185,7 +188,7 @@ def test_again_gives_the_same(world: Any) -> None:
 
 
 @pytest.mark.parametrize("name", SONARS)
-def test_every_ray_is_counted_once(world: Any, name: str) -> None:
+def test_every_ray_is_counted_once(world: mi.Scene, name: str) -> None:
     sonar = SONARS[name]
     counts = next(Simulator(world, sonar).pings(FLIGHT.poses)).counts
     parts = [getattr(counts, what) for what in ("inside", "nearer", "farther", "missed")]
@@ -225,7 +228,7 @@ def test_faint_echoes_keep_their_digits(exponent: int) -> None:
     assert levels[1] / levels[0] == pytest.approx(1e-6, rel=1e-5)
 
 
-def wall(distance: float) -> Any:
+def wall(distance: float) -> mi.Scene:
     """A wall across +y at exactly that distance from the origin."""
     import mitsuba as mi
 

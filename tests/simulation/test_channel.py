@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import pytest
-from helpers import box, diffuse, floor, plate, scene, sphere
+from channel_scenes import LEVEL, C, cells_floor, points, received_from, scatterers_of, simulator
+from helpers import diffuse, floor, plate, scene
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
@@ -15,73 +18,20 @@ from mitsonar.motion.composition import steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.simulation.channel import ChannelSimulator, Paths, frequency_response, impulse_response
-from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated, delay_static
+from mitsonar.simulation.channel import ChannelSimulator, Paths, impulse_response
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-C = 1500.0
-LEVEL = Pose(0, 0, 10)
-CELLS = {"type": "cell_noise", "cells": 512.0, "seed": 5}
-EVERYWHERE = FieldOfView(shape="all")
 
-
-def received_from(place: tuple[float, float, float] = (0, 0, 0), **field: Any) -> Hydrophone:
-    return Hydrophone(name="one", position=place, field=FieldOfView(**field) if field else EVERYWHERE)
-
-
-def cells_floor(half: float = 14.0, cells: float = 512.0) -> dict[str, Any]:
-    return floor(diffuse({**CELLS, "cells": cells}), half)
-
-
-def simulator(sonar: ChannelSonar, **shapes: Any) -> ChannelSimulator:
-    return ChannelSimulator(scene(**shapes), sonar)
-
-
-def points(made: ChannelSimulator) -> NDArray[np.float64]:
-    return np.asarray(made.tracer.source.scatterers.place, dtype=float)
-
-
-def one_response(made: ChannelSimulator, pose: Pose = LEVEL, velocity: Any = None) -> NDArray[np.complex128]:
+def one_response(
+    made: ChannelSimulator, pose: Pose = LEVEL, velocity: Sequence[float] | None = None
+) -> NDArray[np.complex128]:
     (part,) = made.pings([pose], None if velocity is None else [velocity])
     return np.asarray(part.response[0], np.complex128)
-
-
-# ---------------------------------------------------------------- delays
-
-
-def test_exact_delay_solves_its_equation() -> None:
-    rng = np.random.default_rng(1)
-    to_point, velocity = rng.normal(0, 8, (3, 500)), rng.uniform(-3, 3, (3, 500))
-    from_receiver = to_point + rng.normal(0, 0.3, (3, 500))
-    delay = delay_exact(to_point, from_receiver, velocity, C)
-    out, back = np.linalg.norm(to_point, axis=0), np.linalg.norm(from_receiver - velocity * delay, axis=0)
-    assert np.abs(out + back - C * delay).max() < 1e-12 * C
-    still = delay_exact(to_point, from_receiver, np.zeros((3, 500)), C)
-    assert np.abs(still - delay_static(to_point, from_receiver, C)).max() < 1e-17
-
-
-def test_iteration_gains_a_factor_of_v_over_c_each_round() -> None:
-    """Eq. 5.5-5.14 repeated: error against the exact root, fitted on log axes."""
-    point, velocity = np.array([3.0, 4.0, -10.0]), np.array([2.0, -1.0, 0.0])
-    exact = delay_exact(point, point, velocity, C)
-    errors = [abs(delay_iterated(point, point, velocity, C, rounds) - exact) for rounds in range(4)]
-    closing = -velocity @ point / np.linalg.norm(point) / C  # what a round multiplies the error by
-    assert np.polyfit(range(4), np.log(errors), 1)[0] == pytest.approx(np.log(abs(closing)), abs=0.1)
-    assert errors[2] * 320e3 < 1e-4  # turns of the highest carrier: two rounds do, as the thesis says
-
-
-def test_delays_hold_their_phase_at_320_khz_and_25_m() -> None:
-    """Against 50 digits: float64 leaves 1e-10 turns."""
-    mpmath = pytest.importorskip("mpmath")
-    mpmath.mp.dps = 50
-    p, b, v = (15.1234567, 3.7654321, -19.5), (15.0234567, 3.7654321, -19.5), (1.9, -0.7, 0.0)
-    tau0 = mpmath.sqrt(sum(mpmath.mpf(x) ** 2 for x in p)) / 1500
-    q = [mpmath.mpf(x) - mpmath.mpf(w) * tau0 for x, w in zip(b, v, strict=True)]
-    qv, qq, vv = (sum(x * y for x, y in zip(a, c, strict=True)) for a, c in ((q, v), (q, q), (v, v)))
-    vv = sum(mpmath.mpf(x) ** 2 for x in v)
-    exact = tau0 + (mpmath.sqrt(qv**2 + (mpmath.mpf(1500) ** 2 - vv) * qq) - qv) / (mpmath.mpf(1500) ** 2 - vv)
-    assert abs(float(delay_exact(p, b, v, C) - exact)) * 320e3 < 1e-10
 
 
 # ---------------------------------------------------------------- one plate, two receivers
@@ -117,7 +67,7 @@ def test_two_receivers_differ_in_phase_as_their_ways_do() -> None:
     assert abs(np.angle(np.exp(1j * difference))) < 1e-4
 
 
-def test_a_vehicle_that_moves_hears_later_or_sooner() -> None:
+def test_a_moving_vehicle_receives_later_or_sooner() -> None:
     sonar = ChannelSonar(receivers=(received_from(),), points_per_m2=1e4)
     made = simulator(sonar, plate=plate((0, 7, 0), (0, 0, 1), half=0.005))
     still, moving = made.paths(LEVEL), made.paths(LEVEL, [0, 2, 0, 0])
@@ -137,161 +87,10 @@ def test_turning_swings_receivers_around() -> None:
     assert turned.delay_s[0] > made.paths(LEVEL).delay_s[0]
 
 
-# ---------------------------------------------------------------- the transform
-
-
-def echoes(count: int = 3000, seed: int = 3) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rng = np.random.default_rng(seed)
-    return rng.uniform(0.012, 0.024, count), rng.uniform(0, 1, count)
-
-
-@pytest.mark.parametrize("carrier", [80e3, 320e3])
-def test_frequency_response_is_the_direct_sum(carrier: float) -> None:
-    """Eq. 5.15, double precision, relative error under 1e-6 (found: 1e-9)."""
-    sonar = ChannelSonar(carrier_hz=carrier)
-    delay, amplitude = echoes()
-    frequency, found = frequency_response(delay, amplitude, sonar)
-    direct = np.exp(-2j * np.pi * np.outer(sonar.carrier_hz + frequency, delay)) @ amplitude
-    assert len(frequency) == 721
-    assert np.abs(found - direct).max() < 1e-8 * np.abs(direct).max()
-
-
-@pytest.mark.gpu
-def test_sums_on_the_device_are_those_of_the_host() -> None:
-    from mitsonar.simulation import nonuniform_fft
-
-    pytest.importorskip("cufinufft")
-    rng = np.random.default_rng(0)
-    turn, strength = rng.uniform(-np.pi, np.pi, 5000), rng.normal(size=(5000, 2)) @ [1, 1j]
-    k = np.arange(-360, 361)
-    direct = np.exp(-1j * np.outer(k, turn)) @ strength
-    assert np.abs(nonuniform_fft._on_the_device(turn, strength, 721) - direct).max() < 1e-7 * np.abs(direct).max()
-
-
-def test_response_is_the_sum_of_pulses_and_nothing_wraps() -> None:
-    """Two routes: padded transform, and pulses written down in time; echoes at the very beginning too."""
-    sonar = ChannelSonar()
-    delay, amplitude = echoes(200)
-    delay[:3] = 1e-5, 4e-5, 3e-4
-    pulses = sonar.pulse(sonar.delay_s[:, None] - delay) @ (amplitude * np.exp(-2j * np.pi * sonar.carrier_hz * delay))
-    found = impulse_response(delay, amplitude, sonar)
-    assert np.abs(found - pulses).max() < 2e-6 * np.abs(pulses).max()
-    unpadded = np.fft.ifft(
-        np.exp(-2j * np.pi * np.fft.fftfreq(800, 1 / 8000) * 1e-5) * sonar.raised_cosine(np.fft.fftfreq(800, 1 / 8000))
-    )
-    assert np.abs(unpadded[-20:]).max() > 1e-3  # what padding crops
-    assert np.abs(impulse_response([1e-5], [1.0], sonar)[-20:]).max() < 1e-5
-
-
-def test_mean_energy_of_a_tap_is_that_of_its_echoes() -> None:
-    """With random phases; z-test over 400 draws."""
-    sonar = ChannelSonar()
-    delay, amplitude = echoes(300)
-    rng = np.random.default_rng(9)
-    draws = np.array(
-        [np.abs(impulse_response(delay, amplitude * np.exp(2j * np.pi * rng.random(300)), sonar)) ** 2 for _ in range(400)]
-    )
-    wanted = sonar.pulse(sonar.delay_s[:, None] - delay) ** 2 @ amplitude**2
-    inside = slice(110, 180)
-    z = (draws.mean(axis=0) - wanted)[inside] / (draws.std(axis=0)[inside] / 20)
-    assert np.abs(z).max() < 4.5
-    assert abs(z.mean()) < 4.5 / np.sqrt(10)  # neighbouring taps share echoes
-
-
-# ---------------------------------------------------------------- scatterers of the world
-
-
-def test_every_cell_has_one_point_inside_it_whoever_looks() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
-    place = points(made)
-    assert len(place) == 64**2
-    cell = np.floor((place[:, :2] / 28 + 0.5) * 64).astype(int)
-    assert len(np.unique(cell, axis=0)) == 64**2
-    within = (place[:, :2] / 28 + 0.5) * 64 - cell
-    for axis in within.T:  # uniform in the cell: Kolmogorov's distance
-        assert np.abs(np.sort(axis) - (np.arange(64**2) + 0.5) / 64**2).max() < 1.63 / 64
-    other = simulator(ChannelSonar(seed=8, range_max=20.0), floor=cells_floor(cells=64.0))
-    assert np.array_equal(points(other), place)
-    different = simulator(ChannelSonar(), floor=floor(diffuse({**CELLS, "cells": 64.0, "seed": 6}), 14.0))
-    assert not np.array_equal(points(different), place)
-
-
-@pytest.mark.parametrize("shape", ["rectangle", "mesh", "sphere"])
-def test_strengths_add_up_to_reflectivity_times_area(shape: str) -> None:
-    kinds = {
-        "rectangle": (floor(diffuse(0.3), 2.0), 16.0),
-        "mesh": (box((0, 0, 0), (1, 2, 3), diffuse(0.3)), 88.0),
-        "sphere": (sphere((0, 0, 0), 1.5, diffuse(0.3)), 4 * np.pi * 2.25),
-    }
-    body, area = kinds[shape]
-    made = simulator(ChannelSonar(), body=body)
-    assert made.tracer.source.scatterers.strength.sum() == pytest.approx(0.3 * area, rel=0.03 if shape == "sphere" else 1e-5)
-
-
-def test_a_textured_floor_has_the_strength_of_its_cells() -> None:
-    made = simulator(ChannelSonar(), floor=cells_floor())
-    assert made.tracer.source.scatterers.strength.sum() == pytest.approx(0.5 * 28**2, rel=0.01)
-
-
-def test_what_a_field_of_view_asks_for_holds_all_that_it_hears() -> None:
-    field = FieldOfView(heading_deg=40.0, tilt_deg=35.0, across_deg=17.0, along_deg=60.0)
-    for one in (
-        field,
-        field.model_copy(update={"shape": "circular"}),
-        FieldOfView(tilt_deg=90.0, across_deg=100.0, along_deg=170.0),
-    ):
-        sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=one),))
-        made = simulator(sonar, floor=cells_floor(), body=box((3, 4, 1), (1, 1, 1)))
-        pose = np.array([1.0, -2.0, 6.0, 0.2, -0.1, 0.7])
-        stored = made.tracer.source.scatterers
-        asked = made.tracer.source.asked(pose, 0)
-        from mitsonar.motion.pose import vehicle_rotation
-
-        way = stored.place - pose[:3]
-        unit = way / np.linalg.norm(way, axis=1)[:, None]
-        local = unit @ vehicle_rotation(pose).as_matrix()[0] @ one.axes.T
-        front = np.einsum("pi,pi->p", stored.normal, unit) < 0
-        receives = np.flatnonzero((one.sensitivity(*local.T) > 0) & front)
-        assert len(receives) > 100
-        assert np.isin(receives, asked).all()
-        assert len(asked) < 0.8 * len(stored)
-
-
-def test_bodies_hide_what_is_behind_them() -> None:
-    sonar = ChannelSonar(receivers=(received_from(),))
-    bare = simulator(sonar, floor=cells_floor()).paths(LEVEL)
-    hidden = simulator(sonar, floor=cells_floor(), lid=box((0, 0, 5), (1.0, 1.0, 0.01), diffuse(0.0))).paths(LEVEL)
-    shadow = (2 * 1.0 * 10 / 4.99) ** 2
-    assert 1 - len(hidden.delay_s) / len(bare.delay_s) == pytest.approx(shadow / 28**2, rel=0.1)
-    assert hidden.delay_s.min() > 2 * 10.19 / C  # straight below nothing is left
-
-
-def test_energy_is_that_of_the_imaging_sonar() -> None:
-    """Two routes to the energy of the floor: echoes of a receiver at the transmitter, and pixels of an image."""
-    from mitsonar.instruments.imaging_sonar import Sonar
-    from mitsonar.simulation.imaging import Simulator
-
-    field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)
-    sonar = ChannelSonar(receivers=(Hydrophone(name="one", field=field),), points_per_m2=2000.0)
-    ground = scene(floor=floor(diffuse(0.5), 16.0))
-    received = ChannelSimulator(ground, sonar).paths(LEVEL)
-    fan = Sonar(
-        azimuth_fov_deg=20.0,
-        elevation_fov_deg=30.0,
-        beams=20,
-        range_min=5.0,
-        range_max=25.0,
-        bearing="cone",
-        rays_per_beam=400,
-    )
-    (pings,) = Simulator(ground, fan).pings([Pose(0, 0, 10, np.radians(50))])
-    assert (received.amplitude**2).sum() == pytest.approx(pings.levels.sum(), rel=0.01)
-
-
 # ---------------------------------------------------------------- from ping to ping
 
 
-def rough_floor(half: float = 9.0, cells: int = 160, rms: float = 0.05) -> Any:
+def rough_floor(half: float = 9.0, cells: int = 160, rms: float = 0.05) -> mi.Mesh:
     """A mesh of random heights, as wide as ``2 half``."""
     import mitsuba as mi
 
@@ -319,7 +118,8 @@ def correlations(
 ) -> NDArray[np.complex128]:
     """Correlation coefficients of responses with those ``steps`` ahead, over all places ``(receivers, steps)``."""
     places = np.zeros((1, 2)) if places is None else places
-    product = energy = 0.0
+    product: NDArray[np.complex128] = np.zeros((), np.complex128)
+    energy: NDArray[np.float64] = np.zeros(())
     for place in places:
         poses = np.zeros((len(steps) + 1, 6))
         poses[:, :2], poses[:, 2] = place, 8.0
@@ -335,7 +135,7 @@ def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
     sonar = ChannelSonar(range_max=20.0)
     made = simulator(sonar, floor=rough_floor())
     found = correlations(made, STEPS_M)[0]
-    echo = made.tracer.source.scatterers
+    echo = scatterers_of(made)
     field = sonar.receivers[0].field
     responses = []
     for ahead in (0.0, *STEPS_M):
@@ -409,7 +209,7 @@ def test_correlation_does_not_depend_on_the_density_of_points() -> None:
     assert alike > 0.99
 
 
-# ---------------------------------------------------------------- what is told, and refused
+# ---------------------------------------------------------------- reports and refusals
 
 
 def test_the_same_bits_however_many_pings_are_asked_for() -> None:
@@ -419,12 +219,12 @@ def test_the_same_bits_however_many_pings_are_asked_for() -> None:
     for first in (0, 7, 19):
         (alone,) = made.pings(flown.poses[first : first + 1], velocity[first : first + 1])
         assert np.array_equal(alone.response[0], together[first])
-    again = simulator(ChannelSonar(), floor=cells_floor()).responses(flown, velocity).response
-    assert np.array_equal(again, together)
+    repeated = simulator(ChannelSonar(), floor=cells_floor()).responses(flown, velocity).response
+    assert np.array_equal(repeated, together)
 
 
 @pytest.mark.parametrize("model", ["scatterers", "rays"])
-def test_what_comes_from_too_far_is_dropped_and_counted(model: Any) -> None:
+def test_echoes_from_too_far_are_dropped_and_counted(model: Literal["scatterers", "rays"]) -> None:
     far = ChannelSonar(model=model, range_max=12.0, frequency_step_hz=10.0)
     (near_part,), (far_part,) = (
         simulator(sonar, floor=cells_floor()).pings([LEVEL]) for sonar in (ChannelSonar(model=model), far)
@@ -453,12 +253,12 @@ def test_no_surface_to_carry_scatterers() -> None:
 
 
 @pytest.mark.parametrize("velocity", [[[0, 0, 0]], [[np.nan, 0, 0, 0]], [[1000, 0, 0, 0]]])
-def test_velocities_that_cannot_be(velocity: Any) -> None:
+def test_velocities_that_cannot_be(velocity: list[list[float]]) -> None:
     with pytest.raises(MitsonarError, match="velocity"):
         list(simulator(ChannelSonar(), floor=cells_floor(cells=32.0)).pings([LEVEL], velocity))
 
 
-def test_responses_are_saved_whole(tmp_path: Any) -> None:
+def test_responses_are_saved_whole(tmp_path: Path) -> None:
     made = simulator(ChannelSonar(receivers=four_receivers(across_deg=20.0)[:2]), floor=cells_floor(cells=64.0))
     flown, velocity = steady(LEVEL, (1.0, -0.5, 0.2), 3, 20.0)
     responses = made.responses(flown, velocity)
@@ -487,15 +287,12 @@ def test_another_instrument_may_use_the_same_scatterers() -> None:
     ground, sonar = scene(floor=cells_floor()), ChannelSonar()
     first, other = ChannelSimulator(ground, sonar), sonar.replace(carrier_hz=40e3)
     shared = ChannelSimulator(ground, other, like=first)
-    assert shared.tracer.source.scatterers is first.tracer.source.scatterers
+    assert scatterers_of(shared) is scatterers_of(first)
     assert np.array_equal(one_response(shared), one_response(ChannelSimulator(ground, other)))
-    assert (
-        ChannelSimulator(ground, sonar.replace(seed=3), like=first).tracer.source.scatterers
-        is not first.tracer.source.scatterers
-    )
+    assert scatterers_of(ChannelSimulator(ground, sonar.replace(seed=3), like=first)) is not scatterers_of(first)
 
 
-def test_a_trajectory_alone_stands_still() -> None:
+def test_a_trajectory_alone_is_at_rest() -> None:
     made = simulator(ChannelSonar(), floor=cells_floor(cells=64.0))
     flown = Trajectory(np.array([LEVEL]), np.zeros(1))
     assert np.array_equal(made.responses(flown).response, made.responses(flown, np.zeros((1, 4))).response)

@@ -1,14 +1,15 @@
-"""Black frames are not given in silence: what was met, where the sonar looks, what may be wrong."""
+"""Empty frames are reported: what the rays hit, the view of the sonar, what may be wrong."""
 
 from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from helpers import Command, diffuse, floor, scene, sphere
+from numpy.typing import ArrayLike
 
 from mitsonar.errors import MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -16,11 +17,14 @@ from mitsonar.motion.pose import Pose
 from mitsonar.simulation.empty_frames import angle_hint, view_of
 from mitsonar.simulation.imaging import Simulator
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 SONAR = Sonar(beams=8, range_bins=64, rays_per_beam=100, rays_across=1, range_min=1.0, range_max=5.0)
 GOOD = Pose(0, 0, 2.5, np.radians(35))
 
 
-def warned(loaded: Any, poses: Any, sonar: Sonar = SONAR) -> list[str]:
+def warned(loaded: mi.Scene, poses: ArrayLike, sonar: Sonar = SONAR) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         Simulator(loaded, sonar).render(poses)

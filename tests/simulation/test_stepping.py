@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 import pytest
 from helpers import diffuse, floor, scene, sphere
+from numpy.typing import ArrayLike
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
@@ -19,7 +21,12 @@ from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.imaging import Simulator
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
+
+Model: TypeAlias = Literal["physical", "thesis"]
 
 SONAR = Sonar(beams=12, range_bins=64, rays_per_beam=300, rays_across=2, seed=7)
 PITCH = np.radians(35)
@@ -28,13 +35,13 @@ NOISE = NOISE_MODELS["high"]
 
 
 @pytest.fixture(scope="module")
-def ground(variant: str) -> Any:
+def ground(variant: str) -> mi.Scene:
     """A floor of random cells with a sphere on it."""
     cells = {"type": "cell_noise", "cells": 2000.0, "seed": 3}
     return scene(floor=floor(diffuse(cells), 20), ball=sphere((0, 3.5, 0.2), 0.2, diffuse(0.9)))
 
 
-def stepped(simulator: Simulator, poses: Any = POSES, **words: Any) -> list[SonarFrames]:
+def stepped(simulator: Simulator, poses: Iterable[ArrayLike] = POSES, **words: Any) -> list[SonarFrames]:
     return [simulator.step(pose, **words) for pose in poses]
 
 
@@ -57,7 +64,7 @@ def assert_same(steps: list[SonarFrames], whole: SonarFrames) -> None:
 @pytest.mark.parametrize("model", ["physical", "thesis"])
 @pytest.mark.parametrize("jitter", [True, False])
 @pytest.mark.parametrize("labels", [True, False])
-def test_stepping_is_one_run_with_the_same_gain(ground: Any, model: Any, jitter: bool, labels: bool) -> None:
+def test_stepping_is_one_run_with_the_same_gain(ground: mi.Scene, model: Model, jitter: bool, labels: bool) -> None:
     """With noise: both are drawn from the number of the ping."""
     sonar = SONAR.replace(model=model, jitter=jitter)
     gain = 1 / Simulator(ground, sonar).render(POSES).level_scale
@@ -67,7 +74,7 @@ def test_stepping_is_one_run_with_the_same_gain(ground: Any, model: Any, jitter:
 
 
 @pytest.mark.parametrize("model", ["physical", "thesis"])
-def test_without_a_gain_the_first_frame_sets_it_and_a_run_told_so_is_the_same(ground: Any, model: Any) -> None:
+def test_without_a_gain_the_first_frame_sets_it_and_a_run_told_so_is_the_same(ground: mi.Scene, model: Model) -> None:
     simulator = Simulator(ground, SONAR.replace(model=model))
     steps = stepped(simulator, noise=NOISE)
     first = Simulator(ground, SONAR.replace(model=model)).render(POSES[:1])
@@ -75,7 +82,7 @@ def test_without_a_gain_the_first_frame_sets_it_and_a_run_told_so_is_the_same(gr
     assert_same(steps, Simulator(ground, SONAR.replace(model=model)).render(POSES, noise=NOISE, gain=simulator.gain))
 
 
-def test_pings_of_a_loop_differ_where_rendering_each_alone_repeats_itself(ground: Any) -> None:
+def test_pings_of_a_loop_differ_where_rendering_each_alone_repeats_itself(ground: mi.Scene) -> None:
     """What was wrong: the number of the frame was always 0, and each call set its own gain."""
     still = [POSES[0]] * 3
     frames = stepped(Simulator(ground, SONAR), still, noise=NOISE)
@@ -88,14 +95,14 @@ def test_pings_of_a_loop_differ_where_rendering_each_alone_repeats_itself(ground
     assert len({frame.level_scale for frame in stepped(Simulator(ground, SONAR))}) == 1
 
 
-def test_rendering_in_between_does_not_disturb_a_loop(ground: Any) -> None:
+def test_rendering_in_between_does_not_disturb_a_loop(ground: mi.Scene) -> None:
     simulator, wanted = Simulator(ground, SONAR), stepped(Simulator(ground, SONAR), noise=NOISE)
     for pose, frame in zip(POSES, wanted, strict=True):
         simulator.render(POSES[:2])
         np.testing.assert_array_equal(simulator.step(pose, noise=NOISE).image, frame.image)
 
 
-def test_reset_begins_a_new_loop(ground: Any) -> None:
+def test_reset_begins_a_new_loop(ground: mi.Scene) -> None:
     simulator = Simulator(ground, SONAR)
     first = stepped(simulator, noise=NOISE)
     kept = simulator.gain
@@ -108,7 +115,7 @@ def test_reset_begins_a_new_loop(ground: Any) -> None:
         np.testing.assert_array_equal(one.time_s, other.time_s)
 
 
-def test_a_loop_that_begins_in_empty_water_sets_its_gain_on_the_first_echoes(ground: Any) -> None:
+def test_a_loop_that_begins_in_empty_water_sets_its_gain_on_the_first_echoes(ground: mi.Scene) -> None:
     up = Pose(0, 0, 2.5, -1.2)
     simulator = Simulator(ground, SONAR)
     frames = stepped(simulator, [up, *POSES])
@@ -119,13 +126,13 @@ def test_a_loop_that_begins_in_empty_water_sets_its_gain_on_the_first_echoes(gro
     np.testing.assert_array_equal(np.concatenate([frame.image for frame in frames]), whole.image)
 
 
-def test_times_follow_the_rate_or_are_told(ground: Any) -> None:
+def test_times_follow_the_rate_or_are_told(ground: mi.Scene) -> None:
     simulator = Simulator(ground, SONAR)
     times = [float(simulator.step(POSES[0], time_s=time).time_s[0]) for time in (None, 0.37, None)]
     np.testing.assert_array_equal(times, [0.0, 0.37, 2 / SONAR.frame_rate_hz])
 
 
-def test_what_a_step_refuses(ground: Any) -> None:
+def test_what_a_step_refuses(ground: mi.Scene) -> None:
     simulator = Simulator(ground, SONAR)
     with pytest.raises(MitsonarError, match=r"a step takes one pose .*got \(5, 6\)"):
         simulator.step(POSES)
@@ -135,7 +142,7 @@ def test_what_a_step_refuses(ground: Any) -> None:
     assert simulator.step(POSES[1]).level_scale == 0.5
 
 
-def test_a_loop_warns_once_of_each_thing(ground: Any) -> None:
+def test_a_loop_warns_once_of_each_thing(ground: mi.Scene) -> None:
     up, simulator = Pose(0, 0, 2.5, -1.2), Simulator(ground, SONAR)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -152,7 +159,7 @@ def test_a_loop_warns_once_of_each_thing(ground: Any) -> None:
 
 
 @pytest.mark.parametrize("model", ["scatterers", "rays"])
-def test_stepped_channels_are_those_of_one_run(model: Any) -> None:
+def test_stepped_channels_are_those_of_one_run(model: Literal["scatterers", "rays"]) -> None:
     """A velocity is told to each step: one pose alone does not say it."""
     sonar = ChannelSonar.create(model=model, range_max=9.0, points_per_m2=200.0)
     world = scene(floor=floor(diffuse({"type": "cell_noise", "cells": 300.0, "seed": 5}), 8))

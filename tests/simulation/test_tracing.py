@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,12 +14,15 @@ from mitsonar.records.echoes import CHANNELS, Echoes
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import sonar_in
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 pytestmark = pytest.mark.usefixtures("variant")
 
 POSE = Pose(1.0, 2.0, 3.0, 0.5, -0.2, 2.2)
 
 
-def echoes(loaded: Any, sonar: Sonar, pose: Pose = POSE, ping: int = 0) -> Echoes:
+def echoes(loaded: mi.Scene, sonar: Sonar, pose: Pose = POSE, ping: int = 0) -> Echoes:
     """One ping, film order."""
     return Simulator(loaded, sonar).tracer.film_echoes(pose, ping)
 

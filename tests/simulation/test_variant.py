@@ -29,7 +29,7 @@ def test_unknown_names_are_answered_by_the_nearest(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.skipif(dr.has_backend(dr.JitBackend.CUDA), reason="there is a CUDA device")
+@pytest.mark.skipif(bool(dr.has_backend(dr.JitBackend.CUDA)), reason="there is a CUDA device")
 def test_cuda_that_is_absent_is_said() -> None:
     with pytest.raises(MitsonarError, match=r"cuda_ad_mono needs an NVIDIA driver, and none was found: use llvm_ad_mono"):
         ensure_variant("cuda_ad_mono")

@@ -1,10 +1,11 @@
-"""Views of one trace: segments add up to the whole, a receiver hears what geometry says."""
+"""Views of one trace: segments add up to the whole, a receiver measures what geometry predicts."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from helpers import axes, box, diffuse, direction, floor, plate, scene
+from numpy.typing import ArrayLike
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -15,7 +16,7 @@ from mitsonar.simulation.imaging import Simulator
 pytestmark = pytest.mark.usefixtures("variant")
 
 DOWN = Pose(0, 0, 0, np.pi / 2, 0, -np.pi / 2)
-"""A looking-down mount: bearing along the vehicle, elevation across it, negative to starboard (SPEC.md, section 2)."""
+"""A looking-down mount: bearing along the vehicle, elevation across it, negative to starboard."""
 
 
 def looking_down(**fields: object) -> Sonar:
@@ -23,11 +24,11 @@ def looking_down(**fields: object) -> Sonar:
     return Sonar(**{**given, "range_min": 2.0, "range_max": 6.1, "range_bins": 64, **fields})
 
 
-def levels(simulator: Simulator, poses: object) -> dict[str, np.ndarray]:
+def levels(simulator: Simulator, poses: ArrayLike) -> dict[str, np.ndarray]:
     """Levels of each view."""
     batches = list(simulator.render_views(poses))
     return {
-        view.name: np.concatenate([looks[place].levels for looks in batches]) for place, view in enumerate(simulator.views)
+        view.name: np.concatenate([views[place].levels for views in batches]) for place, view in enumerate(simulator.views)
     }
 
 
@@ -183,7 +184,7 @@ def test_footprints_fill_the_bins_of_a_floor_evenly() -> None:
     assert abs(few.sum() / many.sum() - 1) < 2e-3
 
 
-def test_what_the_receiver_cannot_see_is_not_heard() -> None:
+def test_what_the_receiver_cannot_see_is_not_received() -> None:
     """A wall between the two hides the transmitter's half of the floor; beams outside B's field of view stay dark."""
     transmitter, receiver = pair("thesis", Pose(1.2, 0, 0))
     pose = [Pose.from_degrees([0, 0, 2.5, 35, 0, 0])]
@@ -197,7 +198,7 @@ def test_what_the_receiver_cannot_see_is_not_heard() -> None:
 
 
 def test_the_other_side_of_a_sheet_is_silent() -> None:
-    """A receiver behind a sheet that the transmitter lights from the front hears nothing of it."""
+    """A receiver behind a sheet that the transmitter lights from the front has no echo of it."""
     transmitter, receiver = pair("thesis", Pose(0, 9, 0, 0, 0, np.pi))
     world = scene(sheet=plate((0, 4.5, 0), (0, -1, 0), half=0.8))
     assert levels(Simulator(world, transmitter, views=[receiver]), [Pose(0, 0, 0)])["b"].sum() == 0
