@@ -19,18 +19,9 @@ from mitsonar.config.data_recipe import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.motion_errors import in_units
-from mitsonar.training.document_tables import (
-    NOISES,
-    Found,
-    Reached,
-    RowScore,
-    load_tables,
-    rows_named,
-    table_figure,
-    table_lines,
-    table_named,
-    tables_with,
-)
+from mitsonar.training.document_tables import NOISES, load_tables, rows_named, table_named, tables_with
+from mitsonar.training.reproduced_tables import table_figure, table_lines
+from mitsonar.training.row_results import Found, Reached, RowScore
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytest.importorskip("lightning", reason="Lightning is not installed: install mitsonar[learn]")
@@ -251,7 +242,7 @@ def test_a_table_with_times_tells_them_beside_the_thesis_s() -> None:
     name = "portion-quadrants-vector"
     both = {"none": timed, "high": score(7.0)}
     lines = table_lines(table_named("4.12"), {name: Found(recipe=name, validation=both, unseen=both, reached=REACHED)})
-    assert "thesis, ms | here, ms" in " | ".join(cell.strip() for cell in lines[2].split("|"))
+    assert "Almanza-Medina, ms | here, ms" in " | ".join(cell.strip() for cell in lines[2].split("|"))
     (line,) = [line for line in lines if line.startswith("| four quadrants, vectors") and "portion" not in line]
     assert [cell.strip() for cell in line.split("|")][-3:-1] == ["27", "5.72"]
     (line,) = [line for line in lines if line.startswith("| whole view, images") and "portion" not in line]

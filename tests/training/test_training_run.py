@@ -46,7 +46,8 @@ from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
 from mitsonar.training.training_data import Order, _Together, finished, material_of  # noqa: E402
-from mitsonar.training.training_run import TrainingReport, _score, train  # noqa: E402
+from mitsonar.training.training_journal import TrainingReport, _score  # noqa: E402
+from mitsonar.training.training_run import train  # noqa: E402
 
 FIELDS: dict[str, Any] = {
     "network": {"name": "posenet", "width": 0.03},
