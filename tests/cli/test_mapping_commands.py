@@ -86,7 +86,7 @@ def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered
     out = tmp_path / "odometry"
     done = mitsonar("odometry", rendered, "-o", out, "--estimator", "direct")
     assert done.returncode == 0, done
-    assert "11 motions by direct (pitch; height where no first echoes show), 0 not believed and bridged" in done.stdout
+    assert "11 motions by direct (pitch; height where no first echoes show), 0 invalid and bridged" in done.stdout
     assert "end-point error" in done.stdout
     found = table(out)
     assert found["path length"] == pytest.approx(np.linalg.norm(DRIVEN[:, :2], axis=1).sum(), rel=1e-6)
@@ -171,7 +171,7 @@ def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_p
     done = mitsonar("odometry", tmp_path / "gap.npz", "-o", tmp_path / "out")
     assert done.returncode == 0, done
     assert "warning: 4 of 19 motions (21 %) are not believed and were bridged" in done.stderr
-    assert "4 not believed and bridged" in done.stdout
+    assert "4 invalid and bridged" in done.stdout
     frames.image[...] = 0
     frames.save(tmp_path / "dark.npz")
     refused(mitsonar("odometry", tmp_path / "dark.npz", "-o", tmp_path / "dark"), "none of 19 motions is believed")

@@ -150,7 +150,7 @@ def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> No
     folder = tmp_path / "my world's $5"
     done = mitsonar("world", "flat-objects", "--size-m", 4, "-o", folder)
     assert done.returncode == 0, done.stderr
-    printed = done.stdout.partition("see it with: ")[2].strip()
+    printed = done.stdout.partition("render it with: ")[2].strip()
     words = subprocess.run(
         ["sh", "-c", f'for word in {printed}; do echo "$word"; done'], capture_output=True, text=True, check=True
     )
@@ -163,7 +163,7 @@ def test_a_data_sets_command_is_quoted(mitsonar: Command, tmp_path: Path) -> Non
     told += ["--set", "world={family: flat-objects, size_m: 20}", "--set", "flight.jump_m=null"]
     done = mitsonar("dataset", "make", "rocky-field", "-o", tmp_path / "a b.zarr", *told)
     assert done.returncode == 0, done.stderr
-    assert shlex.split(done.stdout.partition("look at it: ")[2]) == [
+    assert shlex.split(done.stdout.partition("show it: ")[2]) == [
         "mitsonar",
         "dataset",
         "show",

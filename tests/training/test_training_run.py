@@ -429,7 +429,7 @@ def test_a_run_that_was_stopped_before_it_validated_asks_for_more_minutes(made: 
     with pytest.raises(KeyboardInterrupt):
         train(told, made, tmp_path / "run", threads=1, stop=lambda: True)
     with pytest.raises(
-        MitsonarError, match=r"stopped before it validated once, and has had its 1e-09 minutes .* resume it with more"
+        MitsonarError, match=r"stopped before it validated once, and has used its 1e-09 minutes .* resume it with more"
     ):
         train(told, made, tmp_path / "run", resume=True, minutes=1e-9)
     assert train(told, made, tmp_path / "run", resume=True, minutes=5).trained["steps"] == 3
