@@ -65,7 +65,7 @@ def compare_all(asked: argparse.Namespace) -> None:
 
 
 def run(*words: object) -> None:
-    """A command of mitsonar on one core."""
+    """Run a command of mitsonar on one core."""
     command = [sys.executable, "-m", "mitsonar", *map(str, words)]
     print("$ mitsonar", *map(str, words), flush=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}

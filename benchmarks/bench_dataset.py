@@ -128,7 +128,7 @@ def note(what: Any) -> Any:
 
 
 def machine() -> dict[str, Any]:
-    """What it ran on."""
+    """Describe the machine and the versions."""
     names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
     return {
         "cpu": names[0] if names else platform.machine(),
@@ -141,7 +141,7 @@ def machine() -> dict[str, Any]:
 
 
 def changed(size: Size) -> list[str]:
-    """Changes of a recipe on the command line."""
+    """Return the changes of a recipe as words of the command line."""
     return [word for change in size.changes for word in ("--set", change)]
 
 
@@ -151,7 +151,7 @@ def command(words: list[str]) -> None:
 
 
 def in_a_process(*words: str) -> Any:
-    """What this script, started anew, prints: its memory is its own then."""
+    """Run this script in a process of its own, so that its memory can be measured, and return what it prints."""
     out = subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.PIPE, text=True).stdout
     return json.loads(out.splitlines()[-1])
 
@@ -217,7 +217,7 @@ def making(recipe: str, workers: int, size: Size, folder: Path) -> dict[str, Any
 
 
 def rendered(recipe: str, workers: int, samples: int, size: Size) -> dict[str, Any]:
-    """Samples a second that training would get, over some worlds; when the first comes, a buffer of others is there."""
+    """Measure rendered samples a second over some worlds. The buffer is full when the first sample comes."""
     import yaml
 
     from mitsonar import RenderedPairs, load_recipe
@@ -245,7 +245,7 @@ def rendered(recipe: str, workers: int, samples: int, size: Size) -> dict[str, A
 
 
 def reading(url: Path, size: Size) -> Iterator[dict[str, Any]]:
-    """Samples a second out of a store, in batches, arrangements taking turns."""
+    """Measure samples a second from a store, in batches, for each arrangement in turn."""
     import torch
 
     from mitsonar import SonarPairs
@@ -295,7 +295,7 @@ def largest_field(folder: Path, rocks: int) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """The same in Markdown."""
+    """Format the results as Markdown."""
     m = result["machine"]
     lines = [f"{m['cpu']}, {m['cores']} cores; Mitsuba {m['mitsuba']}, Zarr {m['zarr']}, torch {m['torch']}, {m['date']}"]
     if result["make"]:

@@ -84,7 +84,7 @@ def cpu() -> str:
 
 
 def field_of(seed: int, size: Size = FULL) -> Any:
-    """A field of flat objects (Almanza-Medina, 5.4.1)."""
+    """Make a field of flat objects (Almanza-Medina, 5.4.1)."""
     with tempfile.TemporaryDirectory() as folder:
         path, parameters = create_family("flat-objects", **size.world).prepare(seed, Path(folder) / "world")
         return load_scene(path, **parameters)
@@ -214,7 +214,7 @@ def templates_of(sonar: ChannelSonar, steps: int) -> tuple[NDArray[np.complex64]
 
 
 def most_alike(response: NDArray[np.complex64], templates: NDArray[np.complex64], tried: NDArray[np.float64]) -> Any:
-    """The velocity whose template is most like a response ``(receivers, taps)``, between the tried ones by a parabola."""
+    """Return the velocity whose template best correlates with a response ``(receivers, taps)``, with a parabola."""
     steps = round(len(tried) ** 0.5)
     alike = (np.abs(np.einsum("vrt,rt->vr", templates.conj(), response)) ** 2).sum(axis=1).reshape(steps, steps)
     best = np.array(np.unravel_index(alike.argmax(), alike.shape))

@@ -112,12 +112,12 @@ def main() -> None:
 
 
 def workers(processes: int) -> AbstractContextManager[Any]:
-    """A pool of processes that answer :func:`told`."""
+    """Create a pool of processes that run :func:`estimate_of`."""
     return multiprocessing.get_context("spawn").Pool(processes)
 
 
 def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
-    """A recipe over scenes that no network saw."""
+    """Return a recipe of scenes that no network has seen."""
     return load_recipe(name, {"seed": SEED, "channel.model": asked.model, **(SMALL if asked.quick else {})})
 
 
@@ -125,7 +125,7 @@ def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
 
 
 def made(asked: argparse.Namespace, name: str) -> list[ImpulseResponses]:
-    """Samples of a data set's kind, from OUT or new."""
+    """Load the samples of a data set from OUT, or make them."""
     recipe, samples = recipe_of(asked, name), asked.samples
     path = asked.out / f"{name}-{asked.model}-{samples}.npz"
     if not path.exists():
@@ -149,7 +149,7 @@ _LAST: dict[Any, ChannelSimulator] = {}
 
 
 def fresh(recipe: Recipe, samples: int) -> Iterator[ImpulseResponses]:
-    """The first sequences of the first scenes of a recipe."""
+    """Make the first sequences of the first scenes of a recipe."""
     sonar = recipe.channel_sonar
     for scene in scenes_of(recipe, recipe.sequences)[:SCENES]:
         simulator = simulator_of(recipe, scene)
@@ -175,7 +175,7 @@ def simulator_of(recipe: Recipe, scene: Any) -> ChannelSimulator:
 
 
 def told(work: tuple[str, dict[str, Any], ImpulseResponses]) -> list[float]:
-    """Answer of an estimator: motion, standard deviations, whether it believes, seconds."""
+    """Run an estimator, and return motion, standard deviations, validity and seconds."""
     name, options, responses = work
     begun = time.perf_counter()
     try:
@@ -204,7 +204,7 @@ def truth(samples: list[ImpulseResponses]) -> NDArray[np.float64]:
 
 
 def said(answers: NDArray[np.float64], true: NDArray[np.float64]) -> str:
-    """RMSE of all, median, believed share and their RMSE, milliseconds."""
+    """Format RMSE and median of all, share and RMSE of valid estimates, and milliseconds."""
     error = in_units(answers[:, :3] - true)
     rmse, median = np.sqrt((error**2).mean(axis=0)), np.median(np.abs(error), axis=0)
     sure = answers[:, 6] > 0
@@ -257,7 +257,7 @@ def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponse
 
 
 def noise(asked: argparse.Namespace) -> None:
-    """The standard row, and ten pings, in noise; leaks; perturbed."""
+    """Evaluate the standard row and ten pings with noise, leaks and perturbations."""
     print(
         "| data | noise or change | estimator | RMSE | median | believed: RMSE | ms |\n|---|---|---|---|---|---|---|",
         flush=True,
@@ -294,12 +294,12 @@ def noisy(one: ImpulseResponses, number: int, snr_db: float) -> ImpulseResponses
 
 
 def again(one: ImpulseResponses) -> ImpulseResponses:
-    """The first ping in place of all."""
+    """Replace all pings by the first one."""
     return replace(one, response=np.repeat(one.response[:1], len(one), axis=0))
 
 
 def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponses:
-    """The first ping, and those of another scene after it."""
+    """Join the first ping with the later pings of another scene."""
     return replace(one, response=np.concatenate([one.response[:1], other.response[1:]]))
 
 
@@ -307,7 +307,7 @@ def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponse
 
 
 def course_of(asked: argparse.Namespace, name: str, around: Pose) -> Trajectory:
-    """A course, or its first positions."""
+    """Return a course, or its first positions."""
     flown = course(name, around)
     return Trajectory(flown.poses[:4], flown.time_s[:4]) if asked.quick else flown
 

@@ -22,7 +22,7 @@ ARIS = "{preset: aris3000, model: thesis, bearing: azimuth, gain_exponent: 0, ra
 
 
 def window(near: float, far: float) -> tuple[str, str]:
-    """The window in which the floor lies."""
+    """Return the range window of the floor."""
     return f"sonar.range_min={near}", f"sonar.range_max={far}"
 
 
@@ -88,7 +88,7 @@ def compare_all(asked: argparse.Namespace) -> None:
 
 
 def make(data: Path, recipe: str, *changes: str) -> None:
-    """The data set, where it is missing."""
+    """Make the data set, if it is missing."""
     sets = [word for change in changes for word in ("--set", change)]
     run("dataset", "make", recipe, *sets, "--seed", SEED, "-o", data)
 

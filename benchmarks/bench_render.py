@@ -91,7 +91,7 @@ def note(what: Any) -> None:
 
 
 def machine() -> dict[str, Any]:
-    """What it ran on."""
+    """Describe the machine and the versions."""
     import os
 
     names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
@@ -107,7 +107,7 @@ def machine() -> dict[str, Any]:
 
 
 def instrument(beams: int, rays: int, model: str) -> mitsonar.Sonar:
-    """The DIDSON's window and field of view with this grid; one ray across a beam."""
+    """Return a sonar with the window and field of view of the DIDSON, this grid, and one ray across a beam."""
     return mitsonar.Sonar(beams=beams, rays_per_beam=rays, rays_across=1, model=model)  # type: ignore[arg-type]
 
 
@@ -123,7 +123,7 @@ def medians(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float
 
 
 def limit(scene: Any, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], None]:
-    """The ray tracer alone, on the rays of these poses, as one frozen launch."""
+    """Return a function that traces the rays of these poses alone, as one frozen launch."""
     import drjit as dr
 
     from mitsonar.simulation.tracing import Rays, Tracer
@@ -196,7 +196,7 @@ def has_open3d() -> bool:
 
 
 def open3d_frames(seabed: Seabed, sonar: mitsonar.Sonar) -> Callable[[np.ndarray], np.ndarray]:
-    """What a user would write: RaycastingScene, rays and bins in NumPy, the thesis model."""
+    """Return a baseline in Open3D and NumPy: RaycastingScene, rays and bins, the model `thesis`."""
     import open3d as o3d
 
     from mitsonar.motion.pose import vehicle_rotation
@@ -308,7 +308,7 @@ def render_for_memory(frames: int, rays: int) -> None:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """The same in Markdown."""
+    """Format the results as Markdown."""
     m = result["machine"]
     lines = [
         f"{m['cpu']}, {m['cores']} cores, {m['variant']}" + (f" (LLVM {m['llvm']})" if m["llvm"] else ""),

@@ -106,12 +106,12 @@ COARSE_HULL = {
 
 
 def coarse(asked: argparse.Namespace, changes: dict[str, Any] = COARSE) -> dict[str, Any]:
-    """Changes of a data set's recipe."""
+    """Return changes of the recipe of a data set."""
     return changes if asked.quick else {}
 
 
 def short(asked: argparse.Namespace) -> dict[str, Any]:
-    """Changes of a training's recipe."""
+    """Return changes of the recipe of a training."""
     return {"epochs": 1, "batch": 4} if asked.quick else {}
 
 
@@ -141,7 +141,7 @@ def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None 
 
 
 def many(asked: argparse.Namespace) -> Path:
-    """What ours learns from in the thesis's model: 20,000 pairs."""
+    """Make the training data in the model `thesis`: 20,000 pairs."""
     return data(asked, "many10", asked.sequences, scenes=groups(asked, asked.sequences, 125))
 
 
@@ -188,7 +188,7 @@ def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged:
 
 
 def leak(asked: argparse.Namespace) -> None:
-    """The chapter's way to validate, and another."""
+    """Compare the validation of the chapter with a split by sequence."""
     print(HEAD)
     learnt = data(asked, "thousand10", 6 if asked.quick else 250, segments=["whole", "starboard", *QUADRANTS, *CONES])
     judged_by = unseen(asked, segments=["whole", "starboard", *QUADRANTS, *CONES])
@@ -260,7 +260,7 @@ def ours(asked: argparse.Namespace) -> None:
 
 
 def heights(asked: argparse.Namespace) -> None:
-    """The direct way, on frames of the chapter's height data sets."""
+    """Evaluate the direct estimator on frames of the height data sets of the chapter."""
     print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | believed | ms |\n" + 9 * "|---" + "|")
     for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
         path = asked.out / f"{recipe}.zarr"
@@ -272,7 +272,7 @@ def heights(asked: argparse.Namespace) -> None:
 
 
 def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
-    """A line of the direct way on every fifth frame."""
+    """Print a line of the direct estimator on every fifth frame."""
     store = DataStore.open(str(path))
     first = open_views(str(path), [store.recipe.views[0].name], "vector", sequence=0).with_noise(load_noise(noise), 1)
     time_s, poses, height_m = (store.read(array) for array in ("time_s", "pose", "height_m"))
@@ -296,7 +296,7 @@ def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
 
 
 def paths(asked: argparse.Namespace) -> None:
-    """The two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
+    """Estimate the two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
     if not asked.rows:
         raise SystemExit("paths needs --rows: folders of trained networks of c1..c4 from 10 m, with commas between them")
     path = asked.out / "runs10.zarr"
@@ -364,7 +364,7 @@ def halves(asked: argparse.Namespace) -> None:
 
 
 def lamprey(path: Path) -> SonarFrames:
-    """The recording lamprey2 of a DIDSON at rest as beams and bins, as if its window were that of the simulated one."""
+    """Load the recording lamprey2 of a DIDSON at rest as beams and bins, as if its window were that of the simulated one."""
     fans = np.load(path)["frames"].astype(np.float32)
     sonar = load_recipe("ship-hull").instrument
     radius, bearing = np.meshgrid(np.linspace(37, 809.5, sonar.range_bins), sonar.bearing_rad, indexing="ij")

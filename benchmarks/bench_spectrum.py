@@ -77,7 +77,7 @@ def quick(noise: str) -> None:
 
 
 def both(data: str, noise: str, frames: int, poses: int) -> None:
-    """What tells shifts, and with poses the limit of motions."""
+    """Print the information on shifts, and with poses the bound of motions."""
     level = load_noise(noise)
     shifts(DataStore.open(data), level, frames)
     if poses:
@@ -85,7 +85,7 @@ def both(data: str, noise: str, frames: int, poses: int) -> None:
 
 
 def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
-    """What tells shifts, by fineness."""
+    """Print the information on shifts by spatial frequency."""
     spectra, levels = [], []
     for number in np.linspace(0, len(store) - 1, frames).astype(int):
         for tile in tiles(store.read("image", int(number))):
@@ -107,7 +107,7 @@ def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
 
 
 def motions(data: str, noise: NoiseModel, poses: int) -> None:
-    """The limit of the motion between two frames of a scene that is not known, over the first poses of some pairs."""
+    """Compute the bound of the motion between two frames of an unknown scene, at the first poses of some pairs."""
     pairs = SonarPairs(data, part="all")
     wanted = pairs.first[np.linspace(0, len(pairs) - 1, poses).astype(int)]
     gain = float(pairs.store.about["gain"])

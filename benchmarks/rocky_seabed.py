@@ -54,7 +54,7 @@ def rocky_seabed(a_side: int = 52, seed: int = 0) -> Seabed:
 
 
 def mitsuba_scene(seabed: Seabed) -> Any:
-    """The seabed as a Mitsuba scene: one mesh with a reflectivity a face, on a floor of independent cells."""
+    """Return the seabed as a Mitsuba scene: one mesh with a reflectivity a face, on a floor of independent cells."""
     import mitsuba as mi
 
     rocks = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_reflectivity"}}

@@ -124,7 +124,7 @@ def traced(house: Path, out: Path, words: list[str]) -> None:
 
 
 def counts(house: Path) -> Iterable[tuple[str, str]]:
-    """What can be counted without running anything."""
+    """Count what needs no run."""
     sources = {path: path.read_text(encoding="utf-8") for part in EVERYTHING for path in files_of(house / part)}
     package = {path: text for path, text in sources.items() if path.relative_to(house).parts[0] in PACKAGE}
     trees = {path: ast.parse(text) for path, text in package.items()}

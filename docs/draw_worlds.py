@@ -32,7 +32,7 @@ SHOWN = {
 
 
 def from_above(scene: Any, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
-    """A photograph, as if the water were clear; north is up."""
+    """Render a photograph, as if the water were clear. North is up."""
     import mitsuba as mi
 
     sun = {"type": "directional", "direction": [0.8, -0.5, -0.7], "irradiance": {"type": "uniform", "value": 3.0}}

@@ -88,7 +88,7 @@ def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def row(parameter: Any, context: Any) -> str:
-    """A line of the table of a command."""
+    """Format a line of the table of a command."""
     if parameter.param_type_name == "argument":
         names = f"`{parameter.metavar or parameter.name.upper()}`"
     else:
@@ -103,7 +103,7 @@ def row(parameter: Any, context: Any) -> str:
 
 
 def kind(parameter: Any, context: Any) -> str:
-    """The type of an option's value as its help shows it: INT, FLOAT, TEXT ..."""
+    """Return the type of an option's value as its help shows it: INT, FLOAT, TEXT ..."""
     words = {"int": "INT", "float": "FLOAT", "path": "PATH"}
     shown = str(parameter.display_type(context)).strip("<>").split()
     return words.get(shown[0].lower() if shown else "", "TEXT")

@@ -89,7 +89,7 @@ def notebook_markdown(source: str) -> str:
 
 
 def _result(output: dict[str, Any]) -> str:
-    """What a cell printed or drew, as Markdown."""
+    """Format the output of a cell as Markdown."""
     data = output.get("data", {})
     if "image/png" in data:
         picture = base64.b64encode(base64.b64decode(data["image/png"])).decode()

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
 
 from rich.markup import escape
-
-if TYPE_CHECKING:
-    pass
-
 
 __all__ = ["with_plain_brackets"]
 
