@@ -76,15 +76,8 @@ def compare_all(asked: argparse.Namespace) -> None:
                 compare(asked.out / f"networks-{name}-perturbed", *common, *few, "--estimators", methods)
         elif asked.elsewhere:  # networks that know one geometry only would refuse these
             make(data, *ELSEWHERE[name], *(SMALL if asked.quick else ()))
-            levels = (
-                "--noise",
-                "high" if asked.quick else "none,high",
-                "--limit",
-                min(5, asked.elsewhere),
-                "--pairs",
-                asked.elsewhere,
-            )
-            compare(asked.out / f"networks-{name}", *common, *levels, "--estimators", elsewhere)
+            levels = ("--noise", "high" if asked.quick else "none,high", "--limit", min(5, asked.elsewhere))
+            compare(asked.out / f"networks-{name}", *common, *levels, "--pairs", asked.elsewhere, "--estimators", elsewhere)
 
 
 def make(data: Path, recipe: str, *changes: str) -> None:

@@ -100,10 +100,10 @@ def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
         shares = [float((information * (band == k)).sum() / information.sum()) for k in range(BANDS)]
         print(f"{name}: " + ", ".join(f"{share:.0%} in {k / 8:.3g}..{(k + 1) / 8:.3g}" for k, share in enumerate(shares)))
         for kind, response in SLOPES.items():
-            h = response(w) + 0 * signal[0]
-            told = (h * w * signal / level).sum()
+            h = np.asarray(response(w) + 0 * signal[0])
+            sensitivity = (h * w * signal / level).sum()
             spread = (h**2 * (2 * signal / level + 1)).sum()
-            print(f"  slopes by {kind}: errors {np.sqrt(information.sum() * spread) / told:.2f} of the bound")
+            print(f"  slopes by {kind}: errors {np.sqrt(information.sum() * spread) / sensitivity:.2f} of the bound")
 
 
 def motions(data: str, noise: NoiseModel, poses: int) -> None:
@@ -145,19 +145,19 @@ def spectra_of(seen: Derivative, noise: NoiseModel) -> tuple[NDArray[np.float64]
 
 
 def derivative_of(sonar: Sonar, pose: Pose, height: float) -> NDArray[np.float64]:
-    """How the middles of those tiles move with the motion, in bins and beams ``(rows, columns, 2, 3)``."""
+    """Return the derivatives of the tile centres by the motion, in bins and beams ``(rows, columns, 2, 3)``."""
     ground = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, height, pose.pitch, pose.roll)
     cell = np.array([sonar.bin_m, np.diff(sonar.bearing_rad).mean()])
     every = slice(TILE // 2, 1 - TILE // 2, TILE // 2)
-    return np.nan_to_num(ground.derivative / cell[:, None])[every, every]
+    return np.asarray(np.nan_to_num(ground.derivative / cell[:, None])[every, every])
 
 
-def least(told: NDArray[np.float64], moving: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least standard deviations of the motion ``(3,)``, from what each frequency of each tile tells of its phase."""
+def least(phase_information: NDArray[np.float64], moving: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the bound of the motion ``(3,)``, from the information on the phase of each frequency of each tile."""
     w = 2 * np.pi * np.fft.fftfreq(TILE)
     w[TILE // 2] = 0  # the finest has no phase
     axes = np.stack(np.meshgrid(w, w, indexing="ij"))
-    shifts = np.einsum("aij,bij,rcij->rcab", axes, axes, told / 4)  # each cell is in four tiles
+    shifts = np.einsum("aij,bij,rcij->rcab", axes, axes, phase_information / 4)  # each cell is in four tiles
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.einsum("rcak,rcab,rcbl->kl", moving, shifts, moving)))))
 
 

@@ -46,7 +46,7 @@ def arrow(axis: Axes, start: NDArray[np.float64], end: NDArray[np.float64], colo
     (a, b), tip = on_paper(np.array([start, end])), on_paper(np.array([start + 1.2 * (end - start)]))[0]
     axis.annotate("", b, a, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2.2, "shrinkA": 0, "shrinkB": 0})
     side = "center" if abs(tip[0] - a[0]) < 0.2 else "left" if tip[0] > a[0] else "right"
-    axis.text(*tip, text, color=colour, fontsize=10, ha=side, va="center")
+    axis.text(tip[0], tip[1], text, color=colour, fontsize=10, ha=side, va="center")
 
 
 def triad(

@@ -22,7 +22,7 @@ from mitsonar.simulation.scene import sonar_in
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.worlds.families import create_family
 
-SHOWN = {
+SHOWN: dict[str, tuple[dict[str, object], float]] = {
     "rocky-field": ({}, 4.0),
     "ship-hull": ({}, 4.0),
     "pattern": ({}, 6.0),
@@ -49,7 +49,7 @@ def from_above(scene: Any, middle: tuple[float, float], half_m: float, pixels: i
     shapes = {f"shape{number}": shape for number, shape in enumerate(scene.shapes())}
     lit = mi.load_dict({"type": "scene", "sun": sun, "sky": sky, **shapes})
     picture = np.array(mi.render(lit, sensor=camera, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=spp))
-    return np.clip(picture[..., 0], 0, 1) ** (1 / 2.2)
+    return np.asarray(np.clip(picture[..., 0], 0, 1) ** (1 / 2.2))
 
 
 def footprint_outline(sonar: mitsonar.Sonar, pose: Pose) -> tuple[np.ndarray, np.ndarray]:

@@ -41,13 +41,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Lead links between files of the repository to their pages."""
     place = page.file.src_uri
     return relinked(markdown, next((source for source, made in PAGES.items() if made == place), f"docs/{place}"), place)
 
 
-def on_page_content(content: str, **_: Any) -> str:
+def on_page_content(content: str, **_: object) -> str:
     """Turn formulas into MathML, which browsers draw without a script, and roles of docstrings into code."""
 
     def drawn(found: re.Match[str]) -> str:

@@ -138,7 +138,7 @@ def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) 
     assert not (tmp_path / "bare" / "true.tum").exists()
     same = [(tmp_path / name / "estimated.tum").read_bytes() for name in ("known", "bare")]
     assert same[0] == same[1]
-    maps = []
+    maps: list[NDArray[np.float32]] = []
     for name, options in (("known", []), ("bare", []), ("bare", told)):
         out = tmp_path / f"{len(maps)}.tif"
         done = mitsonar("mosaic", tmp_path / f"{name}.npz", tmp_path / name, "-o", out, "--cell-mm", 20, *options)
@@ -289,7 +289,9 @@ def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Comman
         assert done.returncode == 0, done.stderr
         path = OdometryFolder.open(out).true
         assert path is not None
-        np.testing.assert_allclose(path.poses, SonarFrames.load(drawn).poses, atol=1e-7)
+        poses = SonarFrames.load(drawn).poses
+        assert poses is not None
+        np.testing.assert_allclose(path.poses, poses, atol=1e-7)
         options = ["--frame", "mitsonar" if frame == "ned" else frame]  # which is for files, not for a folder
         done = mitsonar("mosaic", drawn, out, "-o", tmp_path / f"{frame}.tif", "--cell-mm", 20, *options)
         assert done.returncode == 0, done.stderr

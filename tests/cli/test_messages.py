@@ -6,6 +6,7 @@ import pickle
 import shlex
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from drawn_frames import over_ground, sway
@@ -129,7 +130,7 @@ def test_the_table_names_options_that_there_are() -> None:
 
     from mitsonar.cli import application
 
-    tree = typer.main.get_command(application())
+    tree: Any = typer.main.get_command(application())
     for name, options in OPTIONS.items():
         command = tree.commands["world"].get_command(None, "mesh") if name == "mesh" else tree.commands[name]
         there = {option for parameter in command.params for option in parameter.opts}

@@ -37,6 +37,7 @@ from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.networks.onnx_export import onnx_of  # noqa: E402
 from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
+from mitsonar.training.training_types import JsonObject  # noqa: E402
 
 SAYS = np.array([0.004, -0.006, np.radians(0.1)])
 """What the networks here answer, whatever they see."""
@@ -65,7 +66,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def checkpoint(made: Path) -> Checkpoint:
-    about = {"metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}, "trained": {"pairs": 100}}
+    about: JsonObject = {"metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}, "trained": {"pairs": 100}}
     return constant(SonarPairs(made, part="all", labels="normx10"), **about)
 
 
@@ -98,10 +99,11 @@ def test_it_answers_what_the_network_says(checkpoint: Checkpoint, pairs: SonarPa
 
 def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
     """Frames reach the network as the data set's own arrangement gives them, fans too."""
-    for name, words in {
+    arrangements: dict[str, JsonObject] = {
         "posenet": {"layout": "stack"},
         "posenet_dual": {"coordinates": "both", "cartesian_rows": 64},
-    }.items():
+    }
+    for name, words in arrangements.items():
         own = SonarPairs(made, part="all", one_a_sequence=True, labels="quantised", **words)
         inputs, label = own[0]
         batch = tuple(part[None] for part in inputs) if isinstance(inputs, tuple) else inputs[None]
@@ -262,7 +264,7 @@ def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: Son
     assert (checkpoint.network, checkpoint.recipe["data"]) == ("corrnet", "rocky-field")
     assert checkpoint.trained["pairs"] > 10_000
     estimator = create_estimator("corrnet")
-    assert estimator_from("corrnet:force=0").digest == checkpoint.digest  # type: ignore[attr-defined]
+    assert estimator_from("corrnet:force=0").digest == checkpoint.digest
     frames = pairs.sonar_frames(2)
     there = pickle.loads(pickle.dumps(estimator)).estimate(frames)
     assert there.motion == estimator.estimate(frames).motion

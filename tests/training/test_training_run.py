@@ -45,7 +45,7 @@ from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
-from mitsonar.training.training_data import Order, _Together, finished, material_of  # noqa: E402
+from mitsonar.training.training_data import Order, Validation, _Together, finished, material_of  # noqa: E402
 from mitsonar.training.training_journal import TrainingReport, _score  # noqa: E402
 from mitsonar.training.training_run import train  # noqa: E402
 
@@ -280,6 +280,13 @@ def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest
     assert [sample["frames"][0] for sample in batches] == [sample["frames"][0] for sample in tail]
 
 
+def numbers_of(validation: Validation) -> list[int]:
+    """The numbers of stored samples."""
+    numbers = [row for row in validation.rows if isinstance(row, int)]
+    assert len(numbers) == len(validation)
+    return numbers
+
+
 def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
     half = material_of(recipe(part_of_data=0.5, split={"train": 0.5, "validation": 0.5}), made, render=False)
     whole = material_of(recipe(split={"train": 0.5, "validation": 0.5}), made, render=False)
@@ -289,9 +296,11 @@ def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
     assert 0 < half.epoch < whole.epoch == 40
     sequences = half.samples.sequence
     validation = half.validation
-    assert max(validation.samples.first[validation.rows]) + 2 <= 50
+    assert isinstance(validation.samples, SonarPairs)
+    assert max(validation.samples.first[numbers_of(validation)]) + 2 <= 50
     chosen = whole.validation
-    assert len({sequences[chosen.samples.first[row]] for row in chosen.rows}) == len(chosen.rows) == 5  # one a sequence
+    assert isinstance(chosen.samples, SonarPairs)
+    assert len({sequences[chosen.samples.first[row]] for row in numbers_of(chosen)}) == len(chosen) == 5  # one a sequence
 
 
 # ---------------------------------------------------------------- runs
@@ -456,9 +465,9 @@ def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
         train(told, made, out, resume=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
-    for words in ({}, {"resume": True}, {"overwrite": True}):
+    for resume, overwrite in ((False, False), (True, False), (False, True)):
         with pytest.raises(MitsonarError, match=r"holds other things \(thesis\.txt\) and is kept"):
-            train(told, made, tmp_path / "mine", **words)
+            train(told, made, tmp_path / "mine", resume=resume, overwrite=overwrite)
 
 
 def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
@@ -471,7 +480,8 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     assert isinstance(learnt.samples, SonarPairs)
     first = int(learnt.samples.first[learnt.numbers[20]])  # begins one sample and ends none, where a sequence begins
     frame = first - first % 5
-    zarr.open_group(str(url), mode="r+")["image"][frame, 17, 5] = np.nan
+    stored: Any = zarr.open_group(str(url), mode="r+")["image"]
+    stored[frame, 17, 5] = np.nan
     order = list(Order(learnt.numbers, 8, 0, 0, 9, (0, 1)))
     step = next(k for k, batch in enumerate(order) if frame in learnt.samples.first[[number for _, number in batch]])
     with pytest.raises(MitsonarError) as caught:
