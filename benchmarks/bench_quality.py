@@ -17,7 +17,7 @@ import math
 import time
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -146,7 +146,7 @@ class Ground:
         return min(times)
 
 
-def plane(reflectance: Any) -> mi.Scene:
+def plane(reflectance: object) -> mi.Scene:
     """Make a scene of the plane z = 0."""
     import mitsuba as mi
 

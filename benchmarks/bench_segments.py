@@ -23,7 +23,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ from bench_impulse import cpu
 
 from mitsonar import load_recipe
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.config.training_recipe import load_training_recipe
+from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.estimation.height.direct_height import DirectHeight
@@ -105,12 +105,12 @@ COARSE_HULL = {
 """What `--quick` changes in data sets."""
 
 
-def coarse(asked: argparse.Namespace, changes: dict[str, Any] = COARSE) -> dict[str, Any]:
+def coarse(asked: argparse.Namespace, changes: dict[str, object] = COARSE) -> dict[str, object]:
     """Return changes of the recipe of a data set."""
     return changes if asked.quick else {}
 
 
-def short(asked: argparse.Namespace) -> dict[str, Any]:
+def short(asked: argparse.Namespace) -> dict[str, object]:
     """Return changes of the recipe of a training."""
     return {"epochs": 1, "batch": 4} if asked.quick else {}
 
@@ -118,7 +118,7 @@ def short(asked: argparse.Namespace) -> dict[str, Any]:
 # ---------------------------------------------------------------- data
 
 
-def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -> Path:
+def data(asked: argparse.Namespace, name: str, sequences: int, **changes: object) -> Path:
     """Make, or resume, vectors from 10 m up at 1024 levels."""
     words = {
         "store": "vectors",
@@ -133,7 +133,7 @@ def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -
     return path
 
 
-def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: Any) -> Path:
+def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: object) -> Path:
     """Make pairs over other scenes, one a sequence."""
     count = asked.unseen if asked.quick else pairs or asked.unseen
     scenes = [{"count": -(-count // 50), "sequences": 50}]
@@ -162,7 +162,9 @@ PHYSICAL = {"sonar.model": "physical", "segments": CONES + QUADRANTS}
 # ---------------------------------------------------------------- trainings
 
 
-def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged: dict[str, tuple[Path, str]]) -> None:
+def row(
+    asked: argparse.Namespace, name: str, recipe: TrainingRecipe, learnt: Path, judged: dict[str, tuple[Path, str]]
+) -> None:
     """One training, and a line for each of what it is judged by."""
     run = asked.out / "runs" / name
     checkpoint = train(recipe, learnt, run, resume=run.exists(), minutes=asked.minutes, threads=asked.threads)
@@ -211,7 +213,7 @@ class Ours(NamedTuple):
 
     views: list[str]
     levels: int = 1024
-    noise: Any = "none"
+    noise: str | list[str] = "none"
     model: str = "thesis"
     times: float = 1
 

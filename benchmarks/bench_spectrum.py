@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ BANDS = 4
 WINDOW = np.outer(np.hanning(TILE + 2)[1:-1], np.hanning(TILE + 2)[1:-1])
 WINDOW /= np.sqrt(np.mean(WINDOW**2))
 
-SLOPES = {
+SLOPES: dict[str, Callable[[NDArray[np.floating]], NDArray[np.floating]]] = {
     "differences of neighbours": lambda w: np.sin(w),
     "the same, smoothed over three": lambda w: np.sin(w) * (1 + np.cos(w)) / 2,
     "fourth order": lambda w: (8 * np.sin(w) - np.sin(2 * w)) / 6,

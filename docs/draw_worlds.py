@@ -10,7 +10,7 @@ import argparse
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -22,6 +22,9 @@ from mitsonar.simulation.scene import sonar_in
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.worlds.families import create_family
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 SHOWN: dict[str, tuple[dict[str, object], float]] = {
     "rocky-field": ({}, 4.0),
     "ship-hull": ({}, 4.0),
@@ -31,7 +34,7 @@ SHOWN: dict[str, tuple[dict[str, object], float]] = {
 """Options of each family, and half the edge of what is drawn from above [m]."""
 
 
-def from_above(scene: Any, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
+def from_above(scene: mi.Scene, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
     """Render a photograph, as if the water were clear. North is up."""
     import mitsuba as mi
 

@@ -17,6 +17,9 @@ from mkdocs.structure.pages import Page
 
 __all__ = ["on_files", "on_page_content", "on_page_markdown"]
 
+CellOutput = dict[str, Any]
+"""An output of a notebook cell, as the file stores it."""
+
 ROOT = Path(__file__).parent.parent
 
 NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks")
@@ -88,7 +91,7 @@ def notebook_markdown(source: str) -> str:
     return "\n\n".join(parts)
 
 
-def _result(output: dict[str, Any]) -> str:
+def _result(output: CellOutput) -> str:
     """Format the output of a cell as Markdown."""
     data = output.get("data", {})
     if "image/png" in data:

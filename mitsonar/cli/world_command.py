@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["worlds"]
 
+Click = Any
+"""A command or context of Click, or of Typer's copy of it."""
+
 FieldValue = int | float | str
 """Value of an option, before the numbers of a tuple are parsed."""
 
@@ -37,7 +40,8 @@ class _Families(TyperGroup):
     """Imports the families only when one of these commands is called, which keeps `mitsonar --help` fast."""
 
     @functools.cached_property
-    def known(self) -> Any:
+    def known(self) -> Click:
+        """Create the commands of all families."""
         from mitsonar.worlds.families import FAMILIES
 
         app = typer.Typer()
@@ -46,14 +50,14 @@ class _Families(TyperGroup):
         app.command("mesh")(mesh)
         return with_plain_brackets(typer.main.get_command(app))
 
-    def list_commands(self, ctx: Any) -> list[str]:
+    def list_commands(self, ctx: Click) -> list[str]:
         return list(self.known.list_commands(ctx))
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+    def resolve_command(self, ctx: Click, args: list[str]) -> Click:
         self.commands = self.known.commands  # for the suggestions after a wrong name
         return super().resolve_command(ctx, args)
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+    def get_command(self, ctx: Click, cmd_name: str) -> Click:
         return self.known.get_command(ctx, cmd_name)
 
 

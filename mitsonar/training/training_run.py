@@ -80,10 +80,9 @@ def train(
     Raises:
         MitsonarError: contradictory arguments, before training begins; or a loss that is not finite.
     """
-    run = _Run(
-        _changed(recipe, scale, pairs, precision), data, RunFolder(Path(out), writes=leads()), render, resume, overwrite
-    )
+    recipe, folder = _changed(recipe, scale, pairs, precision), RunFolder(Path(out), writes=leads())
     hardware = _Hardware(accelerator, devices, strategy, threads, workers)
+    run = _Run(recipe, data, folder, render, resume, overwrite)
     return run.train(hardware, Pace(minutes, state_minutes, progress, stop))
 
 
