@@ -12,7 +12,6 @@ a killed benchmark goes on.
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import multiprocessing
 import os
@@ -24,11 +23,11 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -36,6 +35,28 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from trajectory_jobs import (
+    BRAKED,
+    COARSE,
+    CREEPING,
+    FAST,
+    FIELD_M,
+    FIELD_SEED,
+    FRAMES,
+    HEIGHT_M,
+    PITCH_DEG,
+    RECIPES,
+    RUNS,
+    SETTINGS,
+    SLOW,
+    TABLE_21,
+    TEXTURES,
+    Job,
+    Setting,
+    Table,
+    jobs,
+)
+from trajectory_pictures import draw
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data_recipe import load_recipe, shipped_recipes
@@ -43,129 +64,20 @@ from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.io.whole_files import write_whole
-from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
 from mitsonar.mapping.trajectory_smoothing import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import assess
-from mitsonar.plotting.fan_figure import GAMMA
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 PARTS = ("table21", "trajectories")
 WORKERS = 2
 
-# ---------------------------------------------------------------- what is run
-
-TEXTURES = ("gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock")
-RUNS = ("legs", "diagonal", "turn")
-"""Seabeds and runs in the order of table 2.1; the last three seabeds are stand-ins for photographs."""
-
-TABLE_21 = {
-    "gaussian": ((4.40, 0.95, 0.010), (2.27, 0.86, 0.030), (10.63, 2.88, 0.31)),
-    "perlin_high": ((11.86, 3.33, 0.060), (6.19, 1.70, 0.080), (13.06, 1.13, 0.41)),
-    "perlin_low": ((9.03, 2.45, 0.040), (4.29, 1.28, 0.060), (13.39, 1.17, 0.38)),
-    "photo_sand": ((12.29, 3.93, 0.050), (5.93, 2.49, 0.070), (11.00, 0.55, 0.39)),
-    "photo_gravel": ((15.98, 4.83, 0.050), (12.59, 4.69, 0.100), (7.55, 0.71, 0.41)),
-    "photo_rock": ((13.78, 3.95, 0.050), (11.56, 4.24, 0.090), (7.44, 0.78, 0.41)),
-}
-"""RMSE of Almanza-Medina for each run: sideways mm, forward mm, yaw deg (printed there with forward first)."""
-
-
-class Setting(NamedTuple):
-    """A row's method and data; one of so many pairs is used."""
-
-    method: str
-    model: str
-    noise: str
-    every: int = 1
-
-
-SETTINGS = (
-    Setting("direct", "thesis", "chapter2"),
-    Setting("direct", "physical", "none"),
-    Setting("direct", "thesis", "none"),
-    Setting("flow", "thesis", "chapter2", 2),
-    Setting("ecc", "thesis", "chapter2", 2),
-    Setting("direct", "physical", "chapter2"),
-)
-
-RECIPES = {"thesis": "rocky-field", "physical": "rocky-field-physical"}
-"""Where the sonar of each model is described."""
-
-HEIGHT_M, PITCH_DEG = 2.5, 35.0
-FIELD_M, FIELD_SEED, FRAMES = 50.0, 904, 904
-COARSE = {"rays_per_beam": 300, "rays_across": 1}
-"""What `--quick` changes in a sonar."""
-
-"""The field of the trajectories; the recipes' worlds have other seeds (hashes of the data set's seed and the scene)."""
-
-SLOW, FAST, CREEPING, BRAKED = 0.105, 0.378, 0.063, 0.357
-"""Speeds of 3.5.1 [m/s]."""
-
-NOISE_OF = {
-    "sideways": "none",
-    "forward": "none",
-    "braking": "none",
-    "diagonal": "chapter2",
-    "legs": "chapter2",
-}
-"""Runs, and the noise that Almanza-Medina added to them."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """One run of one method; ``frames`` is how many are used at most, 0 for all; ``coarse`` takes few rays and few rocks."""
-
-    part: str
-    run: str
-    texture: str
-    method: str
-    model: str
-    noise: str
-    every: int
-    frames: int
-    coarse: bool = False
-
-    @property
-    def name(self) -> str:
-        """Return the name of its files."""
-        words = (self.part, self.run, self.texture, self.method.replace(", ", "-").replace(" ", "-"), self.model, self.noise)
-        return "-".join([*words, *([str(self.frames)] if self.frames else [])])
-
-
 Result = dict[str, Any]
 """Numbers and texts of one job, as a line of ``results.jsonl`` holds them."""
-
-
-class Table(NamedTuple):
-    """Rows of table 2.1: seabeds and settings."""
-
-    textures: tuple[str, ...]
-    settings: tuple[Setting, ...]
-
-
-def jobs(parts: Iterable[str], frames: int, every: int, table: Table, coarse: bool) -> Iterator[Job]:
-    """List all jobs, the most important first."""
-    if "trajectories" in parts:
-        yield from (trajectory_job(run, model, frames, coarse) for model in RECIPES for run in NOISE_OF)
-    if "table21" in parts:
-        for setting in table.settings:
-            own = setting._replace(every=setting.every * every)
-            yield from (Job("table21", run, texture, *own, frames, coarse) for texture in table.textures for run in RUNS)
-
-
-def trajectory_job(run: str, model: str, frames: int, coarse: bool = False) -> Job:
-    """Return the job of a trajectory."""
-    texture = "gaussian" if run in RUNS else "rocky-field"
-    return Job("trajectories", run, texture, "direct", model, NOISE_OF[run], 1, frames, coarse)
 
 
 # ---------------------------------------------------------------- command
@@ -474,125 +386,6 @@ def trajectory_table(rows: list[Result]) -> Iterator[str]:
             cells += [" / ".join(f"{value:.3f}" for value in slope), str(row["failures"])]
             cells += [f"{path['told_mm']:.0f}" if "told_mm" in path else ""]
             yield f"| {' | '.join(cells)} |"
-
-
-# ---------------------------------------------------------------- pictures
-
-
-def draw(out: Path, pictures: Path, frames: int) -> None:
-    """Draw mosaics along true and estimated paths, and the errors of the paths."""
-    pictures.mkdir(parents=True, exist_ok=True)
-    for model in RECIPES:
-        save_small(pictures / f"pattern_mosaics_{model}.png", pattern_figure(out, model, frames))
-    save_small(pictures / "rocky_mosaics.png", rocky_figure(out, frames))
-    save_small(pictures / "trajectory_errors.png", drift_figure(out, frames))
-
-
-def save_small(path: Path, figure: Figure) -> None:
-    """Save a PNG of 160 colours. Noise does not compress, and true colour would be three times the size."""
-    from PIL import Image
-
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=75)
-    Image.open(drawn).convert("RGB").quantize(160, method=Image.Quantize.MAXCOVERAGE).save(
-        small, format="png", optimize=True
-    )
-    write_whole(path, small.getvalue())
-
-
-def paths_of(out: Path, job: Job, name: str) -> tuple[SonarFrames, dict[str, Trajectory]]:
-    """Load frames, true and estimated path of a run."""
-    frames = SonarFrames.load(out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz")
-    assert frames.poses is not None
-    path = Trajectory.load_tum(out / f"{job.name}-{name}.tum")
-    return frames, {"true": Trajectory(frames.poses, frames.time_s), "estimated": path}
-
-
-def mosaic_along(frames: SonarFrames, path: Trajectory) -> Mosaic:
-    """Build the mosaic of all frames along a path, with the illumination compensated."""
-    some = frames.select(np.unique(np.linspace(0, len(frames) - 1, ILLUMINATION_FRAMES).astype(int)))
-    return build_mosaic(frames, path.poses, frames.height_m, cell_m=0.015, illumination=illumination(some))
-
-
-def pattern_figure(out: Path, model: str, frames: int) -> Figure:
-    """Draw mosaics of both runs over the pattern: true poses left, estimated poses right."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.5, 12.0), layout="constrained")
-    for row, run in enumerate(("diagonal", "legs")):
-        maps = {}
-        made, paths = paths_of(out, trajectory_job(run, model, frames), "Kalman")
-        maps["true poses"] = made, {"true": paths["true"]}, paths["true"]
-        maps["direct, Kalman"] = made, paths, paths["estimated"]
-        for column, (name, (made, paths, path)) in enumerate(maps.items()):
-            axes = figure.add_subplot(2, 2, 2 * row + column + 1)
-            show(axes, mosaic_along(made, path), paths)
-            axes.set(xlim=(-4.0, 4.5), ylim=(-5.2, 2.8), title=f"{run}: {name}")
-    figure.suptitle(f"{model} model, Gaussian seabed, noise of chapter 2")
-    return figure
-
-
-def rocky_figure(out: Path, frames: int) -> Figure:
-    """Draw mosaics of the runs over the rocky field: sideways along true and estimated poses, the others along estimated."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(17.0, 10.5), layout="constrained")
-    grid = figure.add_gridspec(2, 3, width_ratios=(12.8, 4, 4))
-    panels = [("sideways", "true", grid[0, 0]), ("sideways", "estimated", grid[1, 0])]
-    panels += [("forward", "estimated", grid[:, 1]), ("braking", "estimated", grid[:, 2])]
-    for run, name, cell in panels:
-        made, paths = paths_of(out, trajectory_job(run, "thesis", frames), "raw")
-        axes = figure.add_subplot(cell)
-        show(axes, mosaic_along(made, paths[name]), paths)
-        axes.set_title(f"{run}, {name} poses")
-    figure.suptitle("rocky field, model `thesis`, no noise; direct, frame by frame")
-    return figure
-
-
-COLOURS = {"true": "limegreen", "estimated": "red"}
-
-
-def show(axes: Axes, mosaic: Mosaic, paths: dict[str, Trajectory]) -> None:
-    """Draw a mosaic with paths over it."""
-    from matplotlib.colors import PowerNorm
-
-    level = mosaic.mean
-    norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.7)))
-    axes.set_facecolor("0.9")
-    axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
-    for name, path in paths.items():
-        width = 3.0 if name == "true" else 1.2
-        axes.plot(path.poses[:, 0], path.poses[:, 1], color=COLOURS[name], linewidth=width, label=name)
-    axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
-    axes.legend(loc="best", fontsize="small")
-
-
-def drift_figure(out: Path, frames: int) -> Figure:
-    """Draw the errors along and across the path and of the heading, over the distance."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
-    runs = [run for run in NOISE_OF if run != "legs"]
-    axes = figure.subplots(3, len(runs), sharex="col", squeeze=False)
-    for column, run in enumerate(runs):
-        for model, colour in (("thesis", "tab:blue"), ("physical", "tab:orange")):
-            _, paths = paths_of(out, trajectory_job(run, model, frames), "raw")
-            true, off = paths["true"].poses, paths["estimated"].poses - paths["true"].poses
-            step = np.diff(true[:, :2], axis=0)
-            way = np.concatenate([[0], np.cumsum(np.linalg.norm(step, axis=1))])
-            ahead = step[0] / np.linalg.norm(step[0])
-            values = (1e3 * off[:, :2] @ ahead, 1e3 * off[:, :2] @ [ahead[1], -ahead[0]], np.degrees(off[:, 5]))
-            for row, value in enumerate(values):
-                axes[row, column].plot(way, value, color=colour, label=f"direct, {model}")
-        axes[0, column].set_title(f"{run}, noise: {NOISE_OF[run]}")
-        axes[2, column].set_xlabel("driven (m)")
-    for row, name in enumerate(("along the way (mm)", "to starboard of it (mm)", "heading (deg)")):
-        axes[row, 0].set_ylabel(name)
-    for one in axes.flat:
-        one.grid(alpha=0.3)
-    for one in (axes[0, 0], axes[0, -1]):
-        one.legend(fontsize="small")
-    return figure
 
 
 if __name__ == "__main__":
