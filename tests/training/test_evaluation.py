@@ -173,14 +173,14 @@ def test_what_it_does_not_doubt(checkpoint: Checkpoint, pairs: SonarPairs) -> No
         assert ImageNetwork(checkpoint).estimate(fine).valid
 
 
-def test_answers_beyond_the_box_are_not_believed(made: Path, pairs: SonarPairs) -> None:
+def test_answers_beyond_the_box_are_invalid(made: Path, pairs: SonarPairs) -> None:
     own = SonarPairs(made, part="all")
-    for size, believed in ((0.0235, True), (0.0245, False), (np.nan, False)):
+    for size, valid in ((0.0235, True), (0.0245, False), (np.nan, False)):
         trained = constant(own, [0.0, -size, 0.0])
         if np.isnan(size):
             trained = replace(constant(own), weights={k: v * float("inf") for k, v in constant(own).weights.items()})
         found = ImageNetwork(trained).estimate(pairs.sonar_frames(2))
-        assert found.valid == believed, found
+        assert found.valid == valid, found
     assert "not finite" in found.reason
     assert "forward -24.5 mm is beyond the motions of training, -20..20 mm" in (
         ImageNetwork(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
@@ -345,10 +345,10 @@ def test_odometry_and_compare_take_checkpoints(
     assert done.returncode == 0, done.stderr
     _, row = json.loads(done.stdout)["tables"][0]["rows"]
     truth = SonarPairs(made, part="all", one_a_sequence=True)
-    believed = [ImageNetwork(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
-    answers = np.where(np.array(believed)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
+    valid = [ImageNetwork(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
+    answers = np.where(np.array(valid)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
     errors = in_units(answers - np.array([motions(truth.pose[truth.frame_numbers(k)])[0] for k in range(len(truth))]))
-    assert row["failures"] == believed.count(False) <= 2
+    assert row["failures"] == valid.count(False) <= 2
     assert np.allclose(row["rmse"], np.sqrt((errors**2).mean(axis=0)), rtol=1e-5)
     again = mitsonar(*table, "-o", tmp_path / "table", "--json")
     assert json.loads(again.stdout)["tables"][0]["rows"][1] == row

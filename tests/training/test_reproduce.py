@@ -1,4 +1,4 @@
-"""The thesis's tables again: every row has a recipe that fits, numbers stand beside the thesis's, a kill costs nothing."""
+"""Tables of Almanza-Medina: every row has a recipe, printed numbers are beside ours, and a stopped run resumes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ RECIPES = sorted({row.recipe for name, table in TABLES.items() if name[0] == "3"
 # ---------------------------------------------------------------- the recipes
 
 
-def test_every_row_has_a_recipe_and_every_network_of_the_thesis_its_rows() -> None:
+def test_every_row_has_a_recipe_and_every_network_of_the_document_its_rows() -> None:
     assert list(TABLES) == [
         "3.1",
         "3.2",
@@ -77,7 +77,7 @@ def test_every_row_has_a_recipe_and_every_network_of_the_thesis_its_rows() -> No
 
 
 def test_the_numbers_are_those_of_the_reference() -> None:
-    """Typed from SPEC.md, section 6, not from the tables."""
+    """The numbers are typed from the document, not from the tables."""
     wanted = {
         ("3.1", "sfmnet-quantised"): "4.86 / 2.36 / .084 | 5.43 / 3.05 / .098",
         ("3.1", "posenet-quantised"): "2.81 / 1.44 / .049 | 11.32 / 6.42 / .199",
@@ -238,7 +238,7 @@ def test_a_table_of_heights_says_them_in_cm_and_of_their_interval() -> None:
     np.testing.assert_allclose(sorted(w for w in widths if np.isfinite(w)), [1, 1, 119.1 / 90, 121.7 / 90, 24 / 7, 24 / 7])
 
 
-def test_a_table_with_times_tells_them_beside_the_thesis_s() -> None:
+def test_a_table_with_times_shows_them_beside_those_printed() -> None:
     timed = score(5.0).model_copy(update={"ms": 5.72})
     name = "portion-quadrants-vector"
     both = {"none": timed, "high": score(7.0)}

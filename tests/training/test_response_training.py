@@ -42,7 +42,7 @@ FIELDS: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """Two small scenes of ten sequences of three pings, without turns."""
-    url = tmp_path_factory.mktemp("made") / "heard.zarr"
+    url = tmp_path_factory.mktemp("made") / "responses.zarr"
     make_dataset(impulse_recipe(scenes=[{"count": 2, "sequences": 10}], flight={"yaw_deg": 0.0}), str(url))
     return url
 

@@ -149,7 +149,7 @@ def test_rates_by_hand() -> None:
 
 
 def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
-    """The thesis's training, from three lines; keys changed with dots; and back from what a run keeps."""
+    """The training of Almanza-Medina, from three lines; keys changed with dots; and back from what a run keeps."""
     path = tmp_path / "mine.yaml"
     path.write_text("network: posenet\ndata: mine-data.yaml\nnoise: low\n")
     told = load_training_recipe(path, {"network.width": 0.5, "validate.pairs": 7})
