@@ -5,8 +5,8 @@
 
 `table21`: three runs over six seabeds (recipe pattern-runs), every consecutive pair, or one of N. `trajectories`: 904 frames
 over a rocky field that no recipe has, and two runs over the pattern; drift, and mosaics along true and estimated paths. Two
-processes of one thread each. Every finished run is a line of DIR/results.jsonl, with its estimates in an .npz beside it, so that
-a killed benchmark resumes.
+processes of one thread each. Every finished run is a line of DIR/results.jsonl, with its estimates in an .npz
+beside it, so that a killed benchmark resumes.
 """
 
 from __future__ import annotations
