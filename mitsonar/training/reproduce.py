@@ -47,10 +47,7 @@ UNSEEN_SEED = 7919
 """Added to the seed of a data set, so that its worlds are not those of training."""
 
 UNSEEN_SEQUENCES = (100, 1000)
-"""Fewest and most sequences of unseen scenes. Between these limits it is a twentieth of the training sequences.
-
-The fewest are ten scenes, if the recipe has as many.
-"""
+"""Fewest (ten scenes) and most sequences of unseen scenes; between, a twentieth of the training sequences."""
 
 
 @dataclass(frozen=True)
