@@ -59,13 +59,13 @@ def compare_all(asked: argparse.Namespace) -> None:
         levels = ("--noise", "high" if asked.quick else "none,low,high", "--limit", min(10, asked.pairs))
         run("compare", *common, *levels, "--prior", "--estimators", METHODS, "--pairs", asked.pairs, "-o", asked.out / name)
         if asked.perturbed:
-            few = ("--pairs", asked.perturbed, "--noise", "none", "--limit", 0, "--perturb")
+            few: tuple[object, ...] = ("--pairs", asked.perturbed, "--noise", "none", "--limit", 0, "--perturb")
             few += () if name.endswith("physical") else ("--jitter",)  # the physical model's rays move already
             run("compare", *common, *few, "--estimators", PERTURBED, "-o", asked.out / f"{name}-perturbed")
 
 
 def run(*words: object) -> None:
-    """A command of mitsonar on one core."""
+    """Run a command of mitsonar on one core."""
     command = [sys.executable, "-m", "mitsonar", *map(str, words)]
     print("$ mitsonar", *map(str, words), flush=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}

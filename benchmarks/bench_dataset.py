@@ -27,6 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 
+Row = dict[str, Any]
+"""One row of a result: numbers and texts by name."""
+
 
 class Size(NamedTuple):
     """How much is done.
@@ -103,8 +106,8 @@ def main() -> None:
         return print(json.dumps(largest_field(Path(args.field[0]), (QUICK if args.quick else FULL).rocks)))
     parts = args.only.split(",")
     size = QUICK if args.quick else FULL
-    again = ("--quick",) if args.quick else ()
-    result: dict[str, Any] = {"machine": machine(), "make": [], "rendered": [], "read": []}
+    quick = ("--quick",) if args.quick else ()
+    result: Row = {"machine": machine(), "make": [], "rendered": [], "read": []}
     with tempfile.TemporaryDirectory(prefix="bench-dataset-") as folder:
         made = Path(folder) / "read.zarr"
         for recipe, workers in size.crews if "make" in parts else ():
@@ -112,23 +115,23 @@ def main() -> None:
         for recipe, workers in size.crews if "rendered" in parts else ():
             crew = 0 if workers == 1 else workers
             words = ("--rendered", recipe, str(crew), str(size.samples))
-            result["rendered"].append(note(in_a_process(*again, *words)))
+            result["rendered"].append(note(in_a_process(*quick, *words)))
         if "read" in parts:
             command(["dataset", "make", "rocky-field", *changed(size), "--sequences", str(size.stored), "-o", str(made)])
             result["read"] = [note(row) for row in reading(made, size)]
         if "field" in parts:
-            result["field"] = note(in_a_process(*again, "--field", str(Path(folder) / "field")))
+            result["field"] = note(in_a_process(*quick, "--field", str(Path(folder) / "field")))
     print(json.dumps(result, indent=2) if args.json else tables(result))
 
 
-def note(what: Any) -> Any:
+def note(what: Row) -> Row:
     """Progress, out of the way of what is printed."""
     print(what, file=sys.stderr, flush=True)
     return what
 
 
-def machine() -> dict[str, Any]:
-    """What it ran on."""
+def machine() -> Row:
+    """Describe the machine and the versions."""
     names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
     return {
         "cpu": names[0] if names else platform.machine(),
@@ -141,7 +144,7 @@ def machine() -> dict[str, Any]:
 
 
 def changed(size: Size) -> list[str]:
-    """Changes of a recipe on the command line."""
+    """Return the changes of a recipe as words of the command line."""
     return [word for change in size.changes for word in ("--set", change)]
 
 
@@ -150,10 +153,11 @@ def command(words: list[str]) -> None:
     subprocess.run([sys.executable, "-m", "mitsonar", *words], check=True, stdout=subprocess.DEVNULL)
 
 
-def in_a_process(*words: str) -> Any:
-    """What this script, started anew, prints: its memory is its own then."""
+def in_a_process(*words: str) -> Row:
+    """Run this script in a process of its own, so that its memory can be measured, and return what it prints."""
     out = subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.PIPE, text=True).stdout
-    return json.loads(out.splitlines()[-1])
+    row: Row = json.loads(out.splitlines()[-1])
+    return row
 
 
 def memory(process: psutil.Process) -> float:
@@ -170,7 +174,7 @@ def memory(process: psutil.Process) -> float:
 # ---------------------------------------------------------------- parts
 
 
-def making(recipe: str, workers: int, size: Size, folder: Path) -> dict[str, Any]:
+def making(recipe: str, workers: int, size: Size, folder: Path) -> Row:
     """Seconds, memory and bytes of the command, for two sizes; what a frame more costs."""
     seconds, peaks = [], []
     for sequences in size.sequences:
@@ -216,15 +220,15 @@ def making(recipe: str, workers: int, size: Size, folder: Path) -> dict[str, Any
     }
 
 
-def rendered(recipe: str, workers: int, samples: int, size: Size) -> dict[str, Any]:
-    """Samples a second that training would get, over some worlds; when the first comes, a buffer of others is there."""
+def rendered(recipe: str, workers: int, samples: int, size: Size) -> Row:
+    """Measure rendered samples a second over some worlds. The buffer is full when the first sample comes."""
     import yaml
 
     from mitsonar import RenderedPairs, load_recipe
 
     changes = {key: yaml.safe_load(value) for key, _, value in (change.partition("=") for change in size.changes)}
-    words = {"seed": 1, "length": samples, "buffer": size.buffer, "gain": 1.0 if recipe == "rocky-field" else 0.05}
-    pairs = RenderedPairs(load_recipe(recipe, changes), **words)
+    gain = 1.0 if recipe == "rocky-field" else 0.05
+    pairs = RenderedPairs(load_recipe(recipe, changes), seed=1, length=samples, buffer=size.buffer, gain=gain)
     process, peak, taken = psutil.Process(), 0.0, 0
     begun = first = time.perf_counter()
     for number, (_, label) in enumerate(pairs.loader(size.batch, workers=workers)):
@@ -244,14 +248,14 @@ def rendered(recipe: str, workers: int, samples: int, size: Size) -> dict[str, A
     }
 
 
-def reading(url: Path, size: Size) -> Iterator[dict[str, Any]]:
-    """Samples a second out of a store, in batches, arrangements taking turns."""
+def reading(url: Path, size: Size) -> Iterator[Row]:
+    """Measure samples a second from a store, in batches, for each arrangement in turn."""
     import torch
 
     from mitsonar import SonarPairs
 
     torch.set_num_threads(min(2, torch.get_num_threads()))
-    kinds: dict[str, dict[str, Any]] = {
+    kinds: dict[str, Row] = {
         "polar, no noise": {},
         "polar, high noise": {"noise": "high"},
         "Cartesian, no noise": {"coordinates": "cartesian"},
@@ -270,7 +274,7 @@ def reading(url: Path, size: Size) -> Iterator[dict[str, Any]]:
         yield {"arrangement": name, "pairs a second": 1 / float(np.median(values[1:]))}
 
 
-def largest_field(folder: Path, rocks: int) -> dict[str, Any]:
+def largest_field(folder: Path, rocks: int) -> Row:
     """Seconds to build, write and load a field of rocks, and the memory of it all."""
     from mitsonar.simulation.scene import load_scene
     from mitsonar.worlds.rocky_field import RockyField
@@ -294,8 +298,8 @@ def largest_field(folder: Path, rocks: int) -> dict[str, Any]:
     }
 
 
-def tables(result: dict[str, Any]) -> str:
-    """The same in Markdown."""
+def tables(result: Row) -> str:
+    """Format the results as Markdown."""
     m = result["machine"]
     lines = [f"{m['cpu']}, {m['cores']} cores; Mitsuba {m['mitsuba']}, Zarr {m['zarr']}, torch {m['torch']}, {m['date']}"]
     if result["make"]:

@@ -23,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ from numpy.typing import NDArray
 from mitsonar import ChannelSimulator, ChannelSonar, load_scene
 from mitsonar.simulation.variant import ensure_variant, use_threads
 from mitsonar.worlds.families import create_family
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 HEIGHT_M, FASTEST, APART_S = 10.0, 2.0, 0.05
 
@@ -83,8 +86,8 @@ def cpu() -> str:
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
 
-def field_of(seed: int, size: Size = FULL) -> Any:
-    """A field of flat objects (Almanza-Medina, 5.4.1)."""
+def field_of(seed: int, size: Size = FULL) -> mi.Scene:
+    """Make a field of flat objects (Almanza-Medina, 5.4.1)."""
     with tempfile.TemporaryDirectory() as folder:
         path, parameters = create_family("flat-objects", **size.world).prepare(seed, Path(folder) / "world")
         return load_scene(path, **parameters)
@@ -126,7 +129,7 @@ def speed(size: Size) -> None:
         print(f"  largest memory after {pings} more pings: {', '.join(f'{mib:.0f}' for mib in sizes)} MiB")
 
 
-def rate_of(simulator: ChannelSimulator, poses: Any, velocity: Any) -> tuple[float, float]:
+def rate_of(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: NDArray[np.float64]) -> tuple[float, float]:
     """Responses a second, and their mean number of echoes."""
     begun = time.perf_counter()
     parts = list(simulator.pings(poses, velocity))
@@ -150,7 +153,7 @@ def shares(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: ND
 
     tracer = simulator.tracer
     received = simulator.paths(poses[0], velocity[0])
-    parts: dict[str, Callable[[], Any]] = {
+    parts: dict[str, Callable[[], object]] = {
         "which points": lambda: tracer.source.asked(poses[0], 0),
         "these, tracing, delays": lambda: tracer.trace(poses[0], velocity[0], 0, FOR_RESPONSES),
         "transform (one thread)": lambda: impulse_response(received.delay_s, received.amplitude, simulator.sonar),
@@ -158,7 +161,7 @@ def shares(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: ND
     print("  " + ", ".join(f"{name} {1e3 * median_seconds(part):.2f} ms" for name, part in parts.items()))
 
 
-def median_seconds(part: Callable[[], Any]) -> float:
+def median_seconds(part: Callable[[], object]) -> float:
     times = []
     for _ in range(15):
         begun = time.perf_counter()
@@ -213,19 +216,21 @@ def templates_of(sonar: ChannelSonar, steps: int) -> tuple[NDArray[np.complex64]
     return response / np.linalg.norm(response, axis=2, keepdims=True), tried
 
 
-def most_alike(response: NDArray[np.complex64], templates: NDArray[np.complex64], tried: NDArray[np.float64]) -> Any:
-    """The velocity whose template is most like a response ``(receivers, taps)``, between the tried ones by a parabola."""
+def most_alike(
+    response: NDArray[np.complex64], templates: NDArray[np.complex64], tried: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the velocity whose template best correlates with a response ``(receivers, taps)``, with a parabola."""
     steps = round(len(tried) ** 0.5)
     alike = (np.abs(np.einsum("vrt,rt->vr", templates.conj(), response)) ** 2).sum(axis=1).reshape(steps, steps)
     best = np.array(np.unravel_index(alike.argmax(), alike.shape))
     answer = []
     for axis in (0, 1):
         line = alike[:, best[1]] if axis == 0 else alike[best[0]]
-        place = int(np.clip(best[axis], 1, steps - 2))
-        low, mid, high = line[place - 1 : place + 2]
+        peak = int(np.clip(best[axis], 1, steps - 2))
+        low, mid, high = line[peak - 1 : peak + 2]
         curve = low - 2 * mid + high
         offset = float(np.clip(0.5 * (low - high) / curve, -1, 1)) if curve < 0 else 0.0
-        answer.append(tried[0, 0] + (place + offset) * 2 * FASTEST / (steps - 1))
+        answer.append(tried[0, 0] + (peak + offset) * 2 * FASTEST / (steps - 1))
     return np.array(answer)
 
 

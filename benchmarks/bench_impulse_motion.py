@@ -1,4 +1,4 @@
-"""Motion from impulse responses: table 5.2 and 5.3, noise, leaks, what is told wrongly, and the six courses of table 5.6.
+"""Motion from impulse responses: table 5.2 and 5.3, noise, leaks, wrong assumptions, and the six courses of table 5.6.
 
     python benchmarks/bench_impulse_motion.py rows --out bench/impulse [--samples 100] [--only NAME] [--model rays]
     python benchmarks/bench_impulse_motion.py noise --out bench/impulse
@@ -6,11 +6,11 @@
     python benchmarks/bench_impulse_motion.py figure --out bench/impulse
     python benchmarks/bench_impulse_motion.py --quick      # all four, five samples of a small field, kept nowhere
 
-Samples are made as the data sets `impulse-*` make them, over 5 scenes that no network saw (seed 4201), and kept in OUT: a
-run that is broken off goes on. `rows`: every row of table 5.2 by each estimator, the thesis's figure and the bound of the
-law beside it. `noise`: the standard row at signal to noise ratios, two pings of different scenes, one ping twice, and a
-height or sound speed told wrongly. `courses`: trajectories 1 to 6 over flat objects, positions 50 ms apart, each motion from
-ten pings (--pings 2: from the pings at both positions; motions that fit alike are then told apart by their neighbours).
+Samples are made like those of the data sets `impulse-*`, over 5 scenes that no network has seen (seed 4201). OUT keeps them,
+so that a stopped run is resumed. `rows`: every row of table 5.2 by each estimator, with the figure of Almanza-Medina and the
+bound. `noise`: the standard row at signal-to-noise ratios, two pings of different scenes, one ping twice, and a wrong height
+or sound speed. `courses`: trajectories 1 to 6 over flat objects, with positions 50 ms apart and each motion from ten pings
+(--pings 2: from the pings at both positions; neighbours then resolve ambiguous motions).
 `figure`: figure 5.11, the sinusoid by impulse responses, and by images of a DIDSON 2.5 m above the same field (`direct`).
 """
 
@@ -26,6 +26,7 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from multiprocessing.pool import Pool
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ ROWS = {
     "impulse-yaw-narrow": "-",
     "impulse-yaw-ten": "-",
 }
-"""Data sets, and the RMSE of the thesis's network in its own simulator (`rays`), sideways / forward [mm]."""
+"""Data sets, and the RMSE of the network of Almanza-Medina in its own simulator (`rays`), sideways / forward [mm]."""
 
 SMALL = {
     "world": {"family": "flat-objects", "size_m": 30.0, "seabed_cells": 300, "rectangles": 20, "ellipses": 20},
@@ -111,13 +112,13 @@ def main() -> None:
         figure(asked)
 
 
-def workers(processes: int) -> AbstractContextManager[Any]:
-    """A pool of processes that answer :func:`told`."""
+def workers(processes: int) -> AbstractContextManager[Pool]:
+    """Create a pool of processes that run :func:`estimate_of`."""
     return multiprocessing.get_context("spawn").Pool(processes)
 
 
 def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
-    """A recipe over scenes that no network saw."""
+    """Return a recipe of scenes that no network has seen."""
     return load_recipe(name, {"seed": SEED, "channel.model": asked.model, **(SMALL if asked.quick else {})})
 
 
@@ -125,7 +126,7 @@ def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
 
 
 def made(asked: argparse.Namespace, name: str) -> list[ImpulseResponses]:
-    """Samples of a data set's kind, from OUT or new."""
+    """Load the samples of a data set from OUT, or make them."""
     recipe, samples = recipe_of(asked, name), asked.samples
     path = asked.out / f"{name}-{asked.model}-{samples}.npz"
     if not path.exists():
@@ -144,12 +145,12 @@ def made(asked: argparse.Namespace, name: str) -> list[ImpulseResponses]:
     ]
 
 
-_LAST: dict[Any, ChannelSimulator] = {}
+_LAST: dict[object, ChannelSimulator] = {}
 """A simulator of each scene that is open: rows over the same scene share its scatterers."""
 
 
 def fresh(recipe: Recipe, samples: int) -> Iterator[ImpulseResponses]:
-    """The first sequences of the first scenes of a recipe."""
+    """Make the first sequences of the first scenes of a recipe."""
     sonar = recipe.channel_sonar
     for scene in scenes_of(recipe, recipe.sequences)[:SCENES]:
         simulator = simulator_of(recipe, scene)
@@ -174,8 +175,8 @@ def simulator_of(recipe: Recipe, scene: Any) -> ChannelSimulator:
 # ---------------------------------------------------------------- estimates
 
 
-def told(work: tuple[str, dict[str, Any], ImpulseResponses]) -> list[float]:
-    """Answer of an estimator: motion, standard deviations, whether it believes, seconds."""
+def estimate_of(work: tuple[str, dict[str, bool], ImpulseResponses]) -> list[float]:
+    """Run an estimator, and return motion, standard deviations, validity and seconds."""
     name, options, responses = work
     begun = time.perf_counter()
     try:
@@ -187,13 +188,13 @@ def told(work: tuple[str, dict[str, Any], ImpulseResponses]) -> list[float]:
 
 
 def estimates(
-    asked: argparse.Namespace, label: str, name: str, samples: list[ImpulseResponses], **options: Any
+    asked: argparse.Namespace, label: str, name: str, samples: list[ImpulseResponses], **options: bool
 ) -> NDArray[np.float64]:
     """Answers ``(samples, 8)``, from OUT or new."""
     path = asked.out / f"{label}-{name}.json"
     if not path.exists():
         work = [(name, options, one) for one in samples]
-        answers = asked.pool.map(told, work, chunksize=max(1, len(work) // (4 * asked.processes)))
+        answers = asked.pool.map(estimate_of, work, chunksize=max(1, len(work) // (4 * asked.processes)))
         path.write_text(json.dumps(answers))
     return np.array(json.loads(path.read_text()))
 
@@ -203,19 +204,20 @@ def truth(samples: list[ImpulseResponses]) -> NDArray[np.float64]:
     return np.array([motions(one.poses[[0, -1]])[0] for one in samples if one.poses is not None])
 
 
-def said(answers: NDArray[np.float64], true: NDArray[np.float64]) -> str:
-    """RMSE of all, median, believed share and their RMSE, milliseconds."""
+def cells_of(answers: NDArray[np.float64], true: NDArray[np.float64]) -> str:
+    """Format RMSE and median of all, share and RMSE of valid estimates, and milliseconds."""
     error = in_units(answers[:, :3] - true)
     rmse, median = np.sqrt((error**2).mean(axis=0)), np.median(np.abs(error), axis=0)
-    sure = answers[:, 6] > 0
-    believed = np.sqrt((error[sure] ** 2).mean(axis=0)) if sure.any() else np.full(3, np.nan)
+    valid = answers[:, 6] > 0
+    rmse_valid = np.sqrt((error[valid] ** 2).mean(axis=0)) if valid.any() else np.full(3, np.nan)
     seconds = float(np.median(answers[:, 7]))
-    columns = [" / ".join(f"{value:.3g}" for value in row) for row in (rmse, median, believed)]
-    return f"{columns[0]} | {columns[1]} | {sure.mean():.0%}: {columns[2]} | {1e3 * seconds:.0f}"
+    columns = [" / ".join(f"{value:.3g}" for value in row) for row in (rmse, median, rmse_valid)]
+    return f"{columns[0]} | {columns[1]} | {valid.mean():.0%}: {columns[2]} | {1e3 * seconds:.0f}"
 
 
 HEAD = (
-    "| data | estimator | RMSE sideways mm / forward mm / yaw deg | median | believed: RMSE | ms | thesis | bound, rms |\n"
+    "| data | estimator | RMSE sideways mm / forward mm / yaw deg | median | valid: RMSE | ms | Almanza-Medina | "
+    "bound, rms |\n"
     "|---|---|---|---|---|---|---|---|"
 )
 
@@ -234,7 +236,7 @@ def rows(asked: argparse.Namespace) -> None:
             bound = bound_of(asked, name, used, turning) if estimator == "likelihood" and asked.model == "scatterers" else ""
             figure = ROWS[name] if estimator == "likelihood" else ""
             mine = true[some] if estimator == "likelihood" else true
-            print(f"| {name} ({len(used)}) | {estimator} | {said(answers, mine)} | {figure} | {bound} |", flush=True)
+            print(f"| {name} ({len(used)}) | {estimator} | {cells_of(answers, mine)} | {figure} | {bound} |", flush=True)
 
 
 def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponses], turning: bool) -> str:
@@ -247,9 +249,9 @@ def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponse
             span = float(one.time_s[-1] - one.time_s[0])
             stds.append(channel_crlb(one.sonar, 10.0, true, pings=len(one), span_s=span, free=free).tolist())
         path.write_text(json.dumps(stds))
-    stds = np.array(json.loads(path.read_text()))
-    scale = np.array([1e3, 1e3, 180 / np.pi])[: stds.shape[1]]
-    rms, median = np.sqrt((stds**2).mean(axis=0)) * scale, np.median(stds, axis=0) * scale
+    bounds = np.array(json.loads(path.read_text()))
+    scale = np.array([1e3, 1e3, 180 / np.pi])[: bounds.shape[1]]
+    rms, median = np.sqrt((bounds**2).mean(axis=0)) * scale, np.median(bounds, axis=0) * scale
     return " / ".join(f"{value:.3g}" for value in rms) + " (median " + " / ".join(f"{v:.3g}" for v in median) + ")"
 
 
@@ -257,9 +259,9 @@ def bound_of(asked: argparse.Namespace, name: str, samples: list[ImpulseResponse
 
 
 def noise(asked: argparse.Namespace) -> None:
-    """The standard row, and ten pings, in noise; leaks; perturbed."""
+    """Evaluate the standard row and ten pings with noise, leaks and perturbations."""
     print(
-        "| data | noise or change | estimator | RMSE | median | believed: RMSE | ms |\n|---|---|---|---|---|---|---|",
+        "| data | noise or change | estimator | RMSE | median | valid: RMSE | ms |\n|---|---|---|---|---|---|---|",
         flush=True,
     )
     for name in asked.only or ("impulse-standard", "impulse-ten-80khz"):
@@ -268,7 +270,7 @@ def noise(asked: argparse.Namespace) -> None:
         cases: dict[str, list[ImpulseResponses]] = {}
         for snr in (30.0, 20.0, 10.0, 0.0):
             cases[f"{snr:g} dB"] = [noisy(one, number, snr) for number, one in enumerate(samples)]
-        cases["one ping, again and again"] = [again(one) for one in samples]
+        cases["one ping, again and again"] = [repeated(one) for one in samples]
         cases["pings of two scenes"] = [
             strangers(one, samples[number - 2 * len(samples) // 5]) for number, one in enumerate(samples)
         ]
@@ -285,7 +287,7 @@ def noise(asked: argparse.Namespace) -> None:
                     continue
                 label = f"{name}-{asked.model}-{asked.samples}-{case.replace(' ', '_').replace('%', 'pc')}"
                 answers = estimates(asked, label, estimator, changed)
-                print(f"| {name} | {case} | {estimator} | {said(answers, true)} |", flush=True)
+                print(f"| {name} | {case} | {estimator} | {cells_of(answers, true)} |", flush=True)
 
 
 def noisy(one: ImpulseResponses, number: int, snr_db: float) -> ImpulseResponses:
@@ -293,13 +295,13 @@ def noisy(one: ImpulseResponses, number: int, snr_db: float) -> ImpulseResponses
     return replace(one, response=with_noise(one.response, np.arange(len(one)) + 1000 * number, snr_db, SEED))
 
 
-def again(one: ImpulseResponses) -> ImpulseResponses:
-    """The first ping in place of all."""
+def repeated(one: ImpulseResponses) -> ImpulseResponses:
+    """Replace all pings by the first one."""
     return replace(one, response=np.repeat(one.response[:1], len(one), axis=0))
 
 
 def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponses:
-    """The first ping, and those of another scene after it."""
+    """Join the first ping with the later pings of another scene."""
     return replace(one, response=np.concatenate([one.response[:1], other.response[1:]]))
 
 
@@ -307,7 +309,7 @@ def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponse
 
 
 def course_of(asked: argparse.Namespace, name: str, around: Pose) -> Trajectory:
-    """A course, or its first positions."""
+    """Return a course, or its first positions."""
     flown = course(name, around)
     return Trajectory(flown.poses[:4], flown.time_s[:4]) if asked.quick else flown
 
@@ -315,7 +317,7 @@ def course_of(asked: argparse.Namespace, name: str, around: Pose) -> Trajectory:
 def courses(asked: argparse.Namespace) -> None:
     """Table 5.6: motion by motion, and where the path ends."""
     print(
-        "| course | estimator | RMSE sideways mm / forward mm | believed | path m | end error cm | of the path |\n"
+        "| course | estimator | RMSE sideways mm / forward mm | valid | path m | end error cm | of the path |\n"
         "|---|---|---|---|---|---|---|",
         flush=True,
     )
@@ -346,8 +348,8 @@ def courses(asked: argparse.Namespace) -> None:
 
 
 def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseResponses) -> NDArray[np.float64]:
-    """Motions ``(n, 7)`` from ping to ping as odometry has them: told apart by their neighbours, bridged where none is
-    believed; the last column whether it is."""
+    """Estimate motions ``(n, 7)`` from ping to ping as odometry does. Neighbours resolve ambiguous motions, and invalid ones
+    are bridged. The last column is the validity."""
     path = asked.out / f"{label}-{name}.json"
     if not path.exists():
         found = odometry(ResponseSource(label, responses), create_estimator(name), workers=asked.processes)
@@ -384,7 +386,7 @@ def figure(asked: argparse.Namespace) -> None:
             flush=True,
         )
         axes.plot(*poses[:, :2].T, lw=1.2, label=f"{name}: ends {100 * end:.1f} cm off")
-    print(f"images: {int((~seen.believed).sum())} of {len(true)} motions not believed, bridged", flush=True)
+    print(f"images: {int((~seen.believed).sum())} of {len(true)} motions invalid and bridged", flush=True)
     axes.set(xlabel="starboard (m)", ylabel="forward (m)", aspect="equal", title="Trajectory 5 (sinusoid), no noise")
     axes.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3)
     axes.grid(alpha=0.3)

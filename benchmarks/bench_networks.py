@@ -22,7 +22,7 @@ ARIS = "{preset: aris3000, model: thesis, bearing: azimuth, gain_exponent: 0, ra
 
 
 def window(near: float, far: float) -> tuple[str, str]:
-    """The window in which the floor lies."""
+    """Return the range window of the floor."""
     return f"sonar.range_min={near}", f"sonar.range_max={far}"
 
 
@@ -76,19 +76,12 @@ def compare_all(asked: argparse.Namespace) -> None:
                 compare(asked.out / f"networks-{name}-perturbed", *common, *few, "--estimators", methods)
         elif asked.elsewhere:  # networks that know one geometry only would refuse these
             make(data, *ELSEWHERE[name], *(SMALL if asked.quick else ()))
-            levels = (
-                "--noise",
-                "high" if asked.quick else "none,high",
-                "--limit",
-                min(5, asked.elsewhere),
-                "--pairs",
-                asked.elsewhere,
-            )
-            compare(asked.out / f"networks-{name}", *common, *levels, "--estimators", elsewhere)
+            levels = ("--noise", "high" if asked.quick else "none,high", "--limit", min(5, asked.elsewhere))
+            compare(asked.out / f"networks-{name}", *common, *levels, "--pairs", asked.elsewhere, "--estimators", elsewhere)
 
 
 def make(data: Path, recipe: str, *changes: str) -> None:
-    """The data set, where it is missing."""
+    """Make the data set, if it is missing."""
     sets = [word for change in changes for word in ("--set", change)]
     run("dataset", "make", recipe, *sets, "--seed", SEED, "-o", data)
 

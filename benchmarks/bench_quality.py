@@ -17,7 +17,7 @@ import math
 import time
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import yaml
@@ -65,7 +65,7 @@ def main() -> None:
 
 
 def qualities(name: str, pings: int, reference_pings: int, repeats: int) -> dict[str, dict[str, float]]:
-    """The rows of a preset, by quality."""
+    """Measure the rows of a preset, by quality."""
     ground = Ground(name, reference_pings)
     rows: dict[str, dict[str, float]] = {}
     for quality in QUALITIES:
@@ -146,8 +146,8 @@ class Ground:
         return min(times)
 
 
-def plane(reflectance: Any) -> mi.Scene:
-    """The plane z = 0."""
+def plane(reflectance: object) -> mi.Scene:
+    """Make a scene of the plane z = 0."""
     import mitsuba as mi
 
     bsdf = {"type": "diffuse", "reflectance": reflectance}
@@ -179,7 +179,7 @@ def away_from_ends(sonar: mitsonar.Sonar, height: float, pitch: float, margin: i
 
 
 def two_digits_up(value: float) -> float:
-    """The next larger number of two digits: what is stated holds."""
+    """Round up to two digits, so that the stated bound holds."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")
 

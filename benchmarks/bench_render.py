@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable
 from datetime import date
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rocky_seabed import Seabed, mitsuba_scene, poses_over, rocky_seabed
@@ -28,8 +28,16 @@ from rocky_seabed import Seabed, mitsuba_scene, poses_over, rocky_seabed
 import mitsonar
 from mitsonar.simulation.variant import backend, ensure_variant
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 GRIDS = ((96, 700, 200), (512, 114, 200), (3000, 461, 20))
 """Beams, rays a beam, poses a launch."""
+DrJit = Any
+"""A Dr.Jit array of the active variant, or a structure or scene of it."""
+
+Row = dict[str, Any]
+"""One row of a result: numbers and texts by name."""
 
 
 class Size(NamedTuple):
@@ -41,7 +49,7 @@ class Size(NamedTuple):
         repeats: of each figure.
         error: rms error of the bins that is to be reached.
         exact: rays a beam that count as the truth.
-        frames: of the runs whose memory is told.
+        frames: numbers of frames of the runs whose memory is measured.
     """
 
     a_side: int
@@ -73,7 +81,7 @@ def main() -> None:
         parser.error("Open3D is missing: pip install 'mitsonar[bench]', or give --without-open3d")
     seabed = rocky_seabed(size.a_side)
     scene = mitsuba_scene(seabed)
-    result: dict[str, Any] = {"machine": machine(), "triangles": len(seabed.faces) + 2, "batch": [], "single": []}
+    result: Row = {"machine": machine(), "triangles": len(seabed.faces) + 2, "batch": [], "single": []}
     for beams, rays, poses in GRIDS:
         result["batch"].append(batch(scene, seabed, beams, rays, max(2, poses // size.part), size.repeats))
         note(result["batch"][-1])
@@ -85,13 +93,13 @@ def main() -> None:
     print(json.dumps(result, indent=2) if args.json else tables(result))
 
 
-def note(what: Any) -> None:
+def note(what: object) -> None:
     """Progress, out of the way of what is printed."""
     print(what, file=sys.stderr, flush=True)
 
 
-def machine() -> dict[str, Any]:
-    """What it ran on."""
+def machine() -> Row:
+    """Describe the machine and the versions."""
     import os
 
     names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
@@ -107,11 +115,11 @@ def machine() -> dict[str, Any]:
 
 
 def instrument(beams: int, rays: int, model: str) -> mitsonar.Sonar:
-    """The DIDSON's window and field of view with this grid; one ray across a beam."""
-    return mitsonar.Sonar(beams=beams, rays_per_beam=rays, rays_across=1, model=model)  # type: ignore[arg-type]
+    """Return a sonar with the window and field of view of the DIDSON, this grid, and one ray across a beam."""
+    return mitsonar.Sonar(beams=beams, rays_per_beam=rays, rays_across=1, model=model)
 
 
-def medians(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+def medians(work: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
     """Median seconds of each, taking turns, after two rounds that do not count."""
     times: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(repeats + 2):
@@ -122,8 +130,8 @@ def medians(work: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float
     return {name: float(np.median(values[2:])) for name, values in times.items()}
 
 
-def limit(scene: Any, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], None]:
-    """The ray tracer alone, on the rays of these poses, as one frozen launch."""
+def limit(scene: mi.Scene, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], None]:
+    """Return a function that traces the rays of these poses alone, as one frozen launch."""
     import drjit as dr
 
     from mitsonar.simulation.tracing import Rays, Tracer
@@ -134,7 +142,7 @@ def limit(scene: Any, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], 
     index = Rays.numbered(sonar, len(poses))
 
     @dr.freeze
-    def launch(index: Any, scene: Any, rows: Any, keys: Any) -> Any:
+    def launch(index: DrJit, scene: DrJit, rows: DrJit, keys: DrJit) -> DrJit:
         rays = Rays(sonar, index)
         ray, _ = tracer.rays_of(rays, rows, keys)
         return scene.ray_intersect_preliminary(ray, coherent=True).t
@@ -146,13 +154,13 @@ def limit(scene: Any, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable[[], 
     return call
 
 
-def batch(scene: Any, seabed: Seabed, beams: int, rays: int, count: int, repeats: int) -> dict[str, Any]:
+def batch(scene: mi.Scene, seabed: Seabed, beams: int, rays: int, count: int, repeats: int) -> Row:
     """Rays a second of the limit, of both models with their images in NumPy, and of Open3D with NumPy binning."""
     poses = poses_over(count)
     thesis, physical = (instrument(beams, rays, model) for model in ("thesis", "physical"))
     simulators = [mitsonar.Simulator(scene, sonar, rays_per_launch=2**31) for sonar in (thesis, physical)]
     few = poses[: max(2, min(10, count, 2_000_000 // thesis.rays))]
-    work: dict[str, Callable[[], Any]] = {
+    work: dict[str, Callable[[], object]] = {
         "limit": limit(scene, thesis, poses),
         "limit, jittered rays": limit(scene, physical, poses),
         "thesis": lambda: list(simulators[0].pings(poses)),
@@ -175,12 +183,12 @@ def batch(scene: Any, seabed: Seabed, beams: int, rays: int, count: int, repeats
     }
 
 
-def single(scene: Any, beams: int, rays: int, repeats: int) -> dict[str, Any]:
+def single(scene: mi.Scene, beams: int, rays: int, repeats: int) -> Row:
     """Milliseconds of one ping, image in NumPy, beside one bare trace."""
     poses = poses_over(1)
     sonars = [instrument(beams, rays, model) for model in ("thesis", "physical")]
     simulators = [mitsonar.Simulator(scene, sonar) for sonar in sonars]
-    work: dict[str, Callable[[], Any]] = {
+    work: dict[str, Callable[[], object]] = {
         "limit": limit(scene, sonars[0], poses),
         "thesis": lambda: next(simulators[0].pings(poses)),
         "physical": lambda: next(simulators[1].pings(poses)),
@@ -196,7 +204,7 @@ def has_open3d() -> bool:
 
 
 def open3d_frames(seabed: Seabed, sonar: mitsonar.Sonar) -> Callable[[np.ndarray], np.ndarray]:
-    """What a user would write: RaycastingScene, rays and bins in NumPy, the thesis model."""
+    """Return a baseline in Open3D and NumPy: RaycastingScene, rays and bins, the model `thesis`."""
     import open3d as o3d
 
     from mitsonar.motion.pose import vehicle_rotation
@@ -229,16 +237,16 @@ def open3d_frames(seabed: Seabed, sonar: mitsonar.Sonar) -> Callable[[np.ndarray
         rock = hit["geometry_ids"].numpy() == rocks
         face = np.where(rock, hit["primitive_ids"].numpy(), 0)
         value = np.where(rock, seabed.reflectivity[face], cells[uv[:, 0], uv[:, 1]]) * cosine
-        place = (distance - sonar.range_min) / sonar.bin_m
-        inside = (place >= 0) & (place < sonar.range_bins)
-        cell = place[inside].astype(int) * sonar.beams + beam[inside]
+        position = (distance - sonar.range_min) / sonar.bin_m
+        inside = (position >= 0) & (position < sonar.range_bins)
+        cell = position[inside].astype(int) * sonar.beams + beam[inside]
         size = sonar.range_bins * sonar.beams
         return np.bincount(cell, weights=value[inside], minlength=size).reshape(sonar.range_bins, -1)
 
     return frame
 
 
-def one_percent(size: Size) -> dict[str, Any]:
+def one_percent(size: Size) -> Row:
     """Rays a beam, and milliseconds a ping, until a flat floor's bins err by 1 % rms, for points and for footprints.
 
     Raises:
@@ -249,14 +257,14 @@ def one_percent(size: Size) -> dict[str, Any]:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100.0)}
     scene = mi.load_dict({"type": "scene", "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}}})
     pose = np.array([[0, 0, 2.5, np.radians(35), 0, 0]])
-    found: dict[str, Any] = {}
+    found: Row = {}
     for name, changes in (
         ("thesis, points", {"model": "thesis"}),
         ("physical, footprints, jittered", {}),
         ("physical, footprints, grid", {"jitter": False}),
     ):
         for rays in (25, 50, 100, 200, 350, 700, 1400, 2800, 5600, 11200, 22400, 44800, 89600):
-            sonar = mitsonar.Sonar(rays_per_beam=rays, **{"rays_across": 1, **changes})  # type: ignore[arg-type]
+            sonar = mitsonar.Sonar(rays_per_beam=rays, **{"rays_across": 1, **changes})
             simulator = mitsonar.Simulator(scene, sonar)
             error = bin_error(next(simulator.pings(pose)).levels[0], simulator, size.exact)
             if error <= size.error:
@@ -281,7 +289,7 @@ def bin_error(levels: np.ndarray, simulator: mitsonar.Simulator, rays: int) -> f
     return float(np.sqrt(np.mean((ratio / ratio.mean() - 1) ** 2)))
 
 
-def memory(frames: int) -> dict[str, Any]:
+def memory(frames: int) -> Row:
     """Peak memory of a render to disk of so many frames, in a process of its own."""
     command = [sys.executable, __file__, "--frames-memory", str(frames), "100"]
     out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -307,8 +315,8 @@ def render_for_memory(frames: int, rays: int) -> None:
     print(json.dumps({"peak MiB": peak, "ms a frame, written": 1000 * (time.perf_counter() - start) / frames}))
 
 
-def tables(result: dict[str, Any]) -> str:
-    """The same in Markdown."""
+def tables(result: Row) -> str:
+    """Format the results as Markdown."""
     m = result["machine"]
     lines = [
         f"{m['cpu']}, {m['cores']} cores, {m['variant']}" + (f" (LLVM {m['llvm']})" if m["llvm"] else ""),

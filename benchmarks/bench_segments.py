@@ -8,11 +8,11 @@
     python benchmarks/bench_segments.py --quick            # all five, a few coarse pairs, one epoch, kept nowhere
 
 The chapter's figures and its table are made by `mitsonar reproduce 4.12`, 4.14, 4.15 and 4.5. Here: `leak`, PoseNetVec on
-1,000 pairs of circular segments from 10 m, its pairs dealt out one by one as the thesis shuffles them, and by sequence; each
-validated on its own 5 % and on pairs of scenes that nobody learnt from. `ours`, ProfileNet on many pairs of other scenes,
-in both models, with and without noise, with rays that move anew in each ping, and where two pings share no rays. `heights`,
-the direct way over rocks and hulls. `paths`, the two of 4.4.4. `halves`, networks of two halves of simulated hulls (4.4.5),
-and what they say of real frames. What is in OUT is kept, so that a run that was broken off goes on.
+1,000 pairs of circular segments from 10 m, split one by one as in Almanza-Medina, and by sequence. Both are validated on
+their own 5 % and on pairs of unseen scenes. `ours`, ProfileNet on many pairs of other scenes, in both models, with and
+without noise, with jittered rays, and with pings that share no rays. `heights`, the direct estimator over rocks and hulls.
+`paths`, the two paths of 4.4.4. `halves`, networks of two halves of simulated hulls (4.4.5), and their estimates on real
+frames. OUT keeps all results, so that a stopped run is resumed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ from bench_impulse import cpu
 
 from mitsonar import load_recipe
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.config.training_recipe import load_training_recipe
+from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.estimation.height.direct_height import DirectHeight
@@ -105,21 +105,21 @@ COARSE_HULL = {
 """What `--quick` changes in data sets."""
 
 
-def coarse(asked: argparse.Namespace, changes: dict[str, Any] = COARSE) -> dict[str, Any]:
-    """Changes of a data set's recipe."""
+def coarse(asked: argparse.Namespace, changes: dict[str, object] = COARSE) -> dict[str, object]:
+    """Return changes of the recipe of a data set."""
     return changes if asked.quick else {}
 
 
-def short(asked: argparse.Namespace) -> dict[str, Any]:
-    """Changes of a training's recipe."""
+def short(asked: argparse.Namespace) -> dict[str, object]:
+    """Return changes of the recipe of a training."""
     return {"epochs": 1, "batch": 4} if asked.quick else {}
 
 
 # ---------------------------------------------------------------- data
 
 
-def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -> Path:
-    """Vectors from 10 m up at 1024 levels, made or gone on with."""
+def data(asked: argparse.Namespace, name: str, sequences: int, **changes: object) -> Path:
+    """Make, or resume, vectors from 10 m up at 1024 levels."""
     words = {
         "store": "vectors",
         "segments": QUADRANTS + CONES,
@@ -128,20 +128,20 @@ def data(asked: argparse.Namespace, name: str, sequences: int, **changes: Any) -
         **coarse(asked),
         **changes,
     }
-    path = asked.out / f"{name}.zarr"
+    path: Path = asked.out / f"{name}.zarr"
     make_dataset(load_recipe("looking-down-10m", words), str(path), sequences=sequences, workers=asked.workers)
     return path
 
 
-def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: Any) -> Path:
-    """Pairs, each of a sequence of its own, over other scenes."""
+def unseen(asked: argparse.Namespace, name: str = "unseen10", pairs: int | None = None, **changes: object) -> Path:
+    """Make pairs over other scenes, one a sequence."""
     count = asked.unseen if asked.quick else pairs or asked.unseen
     scenes = [{"count": -(-count // 50), "sequences": 50}]
     return data(asked, name, count, **{"seed": 7919, "scenes": scenes, "flight.pings": 2, **changes})
 
 
 def many(asked: argparse.Namespace) -> Path:
-    """What ours learns from in the thesis's model: 20,000 pairs."""
+    """Make the training data in the model `thesis`: 20,000 pairs."""
     return data(asked, "many10", asked.sequences, scenes=groups(asked, asked.sequences, 125))
 
 
@@ -162,7 +162,9 @@ PHYSICAL = {"sonar.model": "physical", "segments": CONES + QUADRANTS}
 # ---------------------------------------------------------------- trainings
 
 
-def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged: dict[str, tuple[Path, str]]) -> None:
+def row(
+    asked: argparse.Namespace, name: str, recipe: TrainingRecipe, learnt: Path, judged: dict[str, tuple[Path, str]]
+) -> None:
     """One training, and a line for each of what it is judged by."""
     run = asked.out / "runs" / name
     checkpoint = train(recipe, learnt, run, resume=run.exists(), minutes=asked.minutes, threads=asked.threads)
@@ -188,7 +190,7 @@ def row(asked: argparse.Namespace, name: str, recipe: Any, learnt: Path, judged:
 
 
 def leak(asked: argparse.Namespace) -> None:
-    """The chapter's way to validate, and another."""
+    """Compare the validation of the chapter with a split by sequence."""
     print(HEAD)
     learnt = data(asked, "thousand10", 6 if asked.quick else 250, segments=["whole", "starboard", *QUADRANTS, *CONES])
     judged_by = unseen(asked, segments=["whole", "starboard", *QUADRANTS, *CONES])
@@ -211,7 +213,7 @@ class Ours(NamedTuple):
 
     views: list[str]
     levels: int = 1024
-    noise: Any = "none"
+    noise: str | list[str] = "none"
     model: str = "thesis"
     times: float = 1
 
@@ -260,8 +262,8 @@ def ours(asked: argparse.Namespace) -> None:
 
 
 def heights(asked: argparse.Namespace) -> None:
-    """The direct way, on frames of the chapter's height data sets."""
-    print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | believed | ms |\n" + 9 * "|---" + "|")
+    """Evaluate the direct estimator on frames of the height data sets of the chapter."""
+    print("| data | noise | frames | RMSE cm | of the interval | median cm | bias cm | valid | ms |\n" + 9 * "|---" + "|")
     for recipe, interval in (("height-rocky", 9.0), ("height-hull", 0.35)):
         path = asked.out / f"{recipe}.zarr"
         changes = coarse(asked, COARSE if recipe == "height-rocky" else COARSE_HULL)
@@ -272,23 +274,23 @@ def heights(asked: argparse.Namespace) -> None:
 
 
 def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
-    """A line of the direct way on every fifth frame."""
+    """Print a line of the direct estimator on every fifth frame."""
     store = DataStore.open(str(path))
     first = open_views(str(path), [store.recipe.views[0].name], "vector", sequence=0).with_noise(load_noise(noise), 1)
     time_s, poses, height_m = (store.read(array) for array in ("time_s", "pose", "height_m"))
     whole = replace(first, time_s=time_s, poses=poses, sonar_poses=poses, height_m=height_m)  # all sequences in one
-    said, spent = [], []
+    heights, spent = [], []
     for number in range(0, len(poses), 5):
         frame = whole.read([number])
         begun = time.process_time()
-        said.append(measured(frame, DirectHeight())[1][0])
+        heights.append(measured(frame, DirectHeight())[1][0])
         spent.append(1e3 * (time.process_time() - begun))
-    believed = np.array([one.valid for one in said])
-    error = 100 * (np.array([one.height_m for one in said]) - poses[::5, 2])[believed]
+    valid = np.array([one.valid for one in heights])
+    error = 100 * (np.array([one.height_m for one in heights]) - poses[::5, 2])[valid]
     rmse = np.sqrt((error**2).mean())
     return (
-        f"| {name} | {noise} | {len(said)} | {rmse:.2f} | {rmse / interval_m:.2f} % | {np.median(np.abs(error)):.2f} | "
-        f"{error.mean():+.2f} | {100 * believed.mean():.0f} % | {np.median(spent):.0f} |"
+        f"| {name} | {noise} | {len(heights)} | {rmse:.2f} | {rmse / interval_m:.2f} % | {np.median(np.abs(error)):.2f} | "
+        f"{error.mean():+.2f} | {100 * valid.mean():.0f} % | {np.median(spent):.0f} |"
     )
 
 
@@ -296,7 +298,7 @@ def height_row(path: Path, name: str, noise: str, interval_m: float) -> str:
 
 
 def paths(asked: argparse.Namespace) -> None:
-    """The two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
+    """Estimate the two paths of 4.4.4 over each of two scenes, by networks of circular segments from 10 m."""
     if not asked.rows:
         raise SystemExit("paths needs --rows: folders of trained networks of c1..c4 from 10 m, with commas between them")
     path = asked.out / "runs10.zarr"
@@ -304,7 +306,7 @@ def paths(asked: argparse.Namespace) -> None:
         load_recipe("looking-down-runs", {"sonar.range_bins": 1024, **coarse(asked)}), str(path), workers=asked.workers
     )
     print(
-        "| network | path | pairs | believed | RMSE sideways / forward mm / yaw deg | end off, mm (of path) |\n"
+        "| network | path | pairs | valid | RMSE sideways / forward mm / yaw deg | end off, mm (of path) |\n"
         + 6 * "|---"
         + "|"
     )
@@ -314,8 +316,8 @@ def paths(asked: argparse.Namespace) -> None:
             source = open_views(str(path), network.views, network.kind, sequence=number)
             out = asked.out / "paths" / f"{Path(run).name}-{number}"
             found = run_odometry(source, run, network, out, overwrite=True)
-            said = dict((label, value) for label, value, _ in found.rows())
-            rmse = " / ".join(f"{value:.3g}" for label, value in said.items() if label.startswith("motion error RMSE"))
+            texts = dict((label, value) for label, value, _ in found.rows())
+            rmse = " / ".join(f"{value:.3g}" for label, value in texts.items() if label.startswith("motion error RMSE"))
             off = np.linalg.norm(found.path.poses[-1][:2] - source.poses[-1, :2])
             length = np.linalg.norm(np.diff(source.poses[:, :2], axis=0), axis=1).sum()
             print(
@@ -357,14 +359,14 @@ def halves(asked: argparse.Namespace) -> None:
             network = estimator_from(f"{asked.out / 'runs' / name}:force=1")
             frames = lamprey(asked.frames)
             pairs = [network.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
-            told = in_units(np.array([one.motion for one in pairs]))
-            believed = sum(one.valid for one in pairs)
-            mean, spread = (" / ".join(f"{v:.3g}" for v in fold(told, axis=0)) for fold in (np.mean, np.std))
-            print(f"{name}, {len(pairs)} pairs of a DIDSON at rest: mean {mean}, spread {spread}, {believed} believed")
+            motions = in_units(np.array([one.motion for one in pairs]))
+            valid = sum(one.valid for one in pairs)
+            mean, spread = (" / ".join(f"{v:.3g}" for v in fold(motions, axis=0)) for fold in (np.mean, np.std))
+            print(f"{name}, {len(pairs)} pairs of a DIDSON at rest: mean {mean}, spread {spread}, {valid} valid")
 
 
 def lamprey(path: Path) -> SonarFrames:
-    """The recording lamprey2 of a DIDSON at rest as beams and bins, as if its window were that of the simulated one."""
+    """Load the recording lamprey2 of a DIDSON at rest as beams and bins, as if its window were that of the simulated one."""
     fans = np.load(path)["frames"].astype(np.float32)
     sonar = load_recipe("ship-hull").instrument
     radius, bearing = np.meshgrid(np.linspace(37, 809.5, sonar.range_bins), sonar.bearing_rad, indexing="ij")

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ BANDS = 4
 WINDOW = np.outer(np.hanning(TILE + 2)[1:-1], np.hanning(TILE + 2)[1:-1])
 WINDOW /= np.sqrt(np.mean(WINDOW**2))
 
-SLOPES = {
+SLOPES: dict[str, Callable[[NDArray[np.floating]], NDArray[np.floating]]] = {
     "differences of neighbours": lambda w: np.sin(w),
     "the same, smoothed over three": lambda w: np.sin(w) * (1 + np.cos(w)) / 2,
     "fourth order": lambda w: (8 * np.sin(w) - np.sin(2 * w)) / 6,
@@ -77,7 +78,7 @@ def quick(noise: str) -> None:
 
 
 def both(data: str, noise: str, frames: int, poses: int) -> None:
-    """What tells shifts, and with poses the limit of motions."""
+    """Print the information on shifts, and with poses the bound of motions."""
     level = load_noise(noise)
     shifts(DataStore.open(data), level, frames)
     if poses:
@@ -85,7 +86,7 @@ def both(data: str, noise: str, frames: int, poses: int) -> None:
 
 
 def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
-    """What tells shifts, by fineness."""
+    """Print the information on shifts by spatial frequency."""
     spectra, levels = [], []
     for number in np.linspace(0, len(store) - 1, frames).astype(int):
         for tile in tiles(store.read("image", int(number))):
@@ -100,14 +101,14 @@ def shifts(store: DataStore, noise: NoiseModel, frames: int) -> None:
         shares = [float((information * (band == k)).sum() / information.sum()) for k in range(BANDS)]
         print(f"{name}: " + ", ".join(f"{share:.0%} in {k / 8:.3g}..{(k + 1) / 8:.3g}" for k, share in enumerate(shares)))
         for kind, response in SLOPES.items():
-            h = response(w) + 0 * signal[0]
-            told = (h * w * signal / level).sum()
+            h = np.asarray(response(w) + 0 * signal[0])
+            sensitivity = (h * w * signal / level).sum()
             spread = (h**2 * (2 * signal / level + 1)).sum()
-            print(f"  slopes by {kind}: errors {np.sqrt(information.sum() * spread) / told:.2f} of the bound")
+            print(f"  slopes by {kind}: errors {np.sqrt(information.sum() * spread) / sensitivity:.2f} of the bound")
 
 
 def motions(data: str, noise: NoiseModel, poses: int) -> None:
-    """The limit of the motion between two frames of a scene that is not known, over the first poses of some pairs."""
+    """Compute the bound of the motion between two frames of an unknown scene, at the first poses of some pairs."""
     pairs = SonarPairs(data, part="all")
     wanted = pairs.first[np.linspace(0, len(pairs) - 1, poses).astype(int)]
     gain = float(pairs.store.about["gain"])
@@ -145,19 +146,19 @@ def spectra_of(seen: Derivative, noise: NoiseModel) -> tuple[NDArray[np.float64]
 
 
 def derivative_of(sonar: Sonar, pose: Pose, height: float) -> NDArray[np.float64]:
-    """How the middles of those tiles move with the motion, in bins and beams ``(rows, columns, 2, 3)``."""
+    """Return the derivatives of the tile centres by the motion, in bins and beams ``(rows, columns, 2, 3)``."""
     ground = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, height, pose.pitch, pose.roll)
     cell = np.array([sonar.bin_m, np.diff(sonar.bearing_rad).mean()])
     every = slice(TILE // 2, 1 - TILE // 2, TILE // 2)
-    return np.nan_to_num(ground.derivative / cell[:, None])[every, every]
+    return np.asarray(np.nan_to_num(ground.derivative / cell[:, None])[every, every])
 
 
-def least(told: NDArray[np.float64], moving: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least standard deviations of the motion ``(3,)``, from what each frequency of each tile tells of its phase."""
+def least(phase_information: NDArray[np.float64], moving: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Compute the bound of the motion ``(3,)``, from the information on the phase of each frequency of each tile."""
     w = 2 * np.pi * np.fft.fftfreq(TILE)
     w[TILE // 2] = 0  # the finest has no phase
     axes = np.stack(np.meshgrid(w, w, indexing="ij"))
-    shifts = np.einsum("aij,bij,rcij->rcab", axes, axes, told / 4)  # each cell is in four tiles
+    shifts = np.einsum("aij,bij,rcij->rcab", axes, axes, phase_information / 4)  # each cell is in four tiles
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(np.einsum("rcak,rcab,rcbl->kl", moving, shifts, moving)))))
 
 

@@ -5,14 +5,13 @@
 
 `table21`: three runs over six seabeds (recipe pattern-runs), every consecutive pair, or one of N. `trajectories`: 904 frames
 over a rocky field that no recipe has, and two runs over the pattern; drift, and mosaics along true and estimated paths. Two
-processes of one thread each. Every finished run is a line of DIR/results.jsonl, and its estimates an .npz beside it, so that
-a killed benchmark goes on.
+processes of one thread each. Every finished run is a line of DIR/results.jsonl, with its estimates in an .npz
+beside it, so that a killed benchmark resumes.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import multiprocessing
 import os
@@ -24,11 +23,11 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -36,6 +35,28 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from trajectory_jobs import (
+    BRAKED,
+    COARSE,
+    CREEPING,
+    FAST,
+    FIELD_M,
+    FIELD_SEED,
+    FRAMES,
+    HEIGHT_M,
+    PITCH_DEG,
+    RECIPES,
+    RUNS,
+    SETTINGS,
+    SLOW,
+    TABLE_21,
+    TEXTURES,
+    Job,
+    Setting,
+    Table,
+    jobs,
+)
+from trajectory_pictures import draw
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data_recipe import load_recipe, shipped_recipes
@@ -43,125 +64,20 @@ from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.io.whole_files import write_whole
-from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
 from mitsonar.mapping.trajectory_smoothing import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import assess
-from mitsonar.plotting.fan_figure import GAMMA
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 PARTS = ("table21", "trajectories")
 WORKERS = 2
 
-# ---------------------------------------------------------------- what is run
-
-TEXTURES = ("gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock")
-RUNS = ("legs", "diagonal", "turn")
-"""Seabeds and runs in the order of table 2.1; the last three seabeds are stand-ins for photographs."""
-
-TABLE_21 = {
-    "gaussian": ((4.40, 0.95, 0.010), (2.27, 0.86, 0.030), (10.63, 2.88, 0.31)),
-    "perlin_high": ((11.86, 3.33, 0.060), (6.19, 1.70, 0.080), (13.06, 1.13, 0.41)),
-    "perlin_low": ((9.03, 2.45, 0.040), (4.29, 1.28, 0.060), (13.39, 1.17, 0.38)),
-    "photo_sand": ((12.29, 3.93, 0.050), (5.93, 2.49, 0.070), (11.00, 0.55, 0.39)),
-    "photo_gravel": ((15.98, 4.83, 0.050), (12.59, 4.69, 0.100), (7.55, 0.71, 0.41)),
-    "photo_rock": ((13.78, 3.95, 0.050), (11.56, 4.24, 0.090), (7.44, 0.78, 0.41)),
-}
-"""RMSE of the thesis for each run: sideways mm, forward mm, yaw deg (it prints forward first)."""
-
-
-class Setting(NamedTuple):
-    """A row's method and data; one of so many pairs is used."""
-
-    method: str
-    model: str
-    noise: str
-    every: int = 1
-
-
-SETTINGS = (
-    Setting("direct", "thesis", "chapter2"),
-    Setting("direct", "physical", "none"),
-    Setting("direct", "thesis", "none"),
-    Setting("flow", "thesis", "chapter2", 2),
-    Setting("ecc", "thesis", "chapter2", 2),
-    Setting("direct", "physical", "chapter2"),
-)
-
-RECIPES = {"thesis": "rocky-field", "physical": "rocky-field-physical"}
-"""Where the sonar of each model is described."""
-
-HEIGHT_M, PITCH_DEG = 2.5, 35.0
-FIELD_M, FIELD_SEED, FRAMES = 50.0, 904, 904
-COARSE = {"rays_per_beam": 300, "rays_across": 1}
-"""What `--quick` changes in a sonar."""
-
-"""The field of the trajectories; the recipes' worlds have other seeds (hashes of the data set's seed and the scene)."""
-
-SLOW, FAST, CREEPING, BRAKED = 0.105, 0.378, 0.063, 0.357
-"""Speeds of 3.5.1 [m/s]."""
-
-NOISE_OF = {
-    "sideways": "none",
-    "forward": "none",
-    "braking": "none",
-    "diagonal": "chapter2",
-    "legs": "chapter2",
-}
-"""Runs and the noise that the thesis added to them."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """One run of one method; ``frames`` is how many are used at most, 0 for all; ``coarse`` takes few rays and few rocks."""
-
-    part: str
-    run: str
-    texture: str
-    method: str
-    model: str
-    noise: str
-    every: int
-    frames: int
-    coarse: bool = False
-
-    @property
-    def name(self) -> str:
-        """Names its files."""
-        words = (self.part, self.run, self.texture, self.method.replace(", ", "-").replace(" ", "-"), self.model, self.noise)
-        return "-".join([*words, *([str(self.frames)] if self.frames else [])])
-
-
-class Table(NamedTuple):
-    """Rows of table 2.1: seabeds and settings."""
-
-    textures: tuple[str, ...]
-    settings: tuple[Setting, ...]
-
-
-def jobs(parts: Iterable[str], frames: int, every: int, table: Table, coarse: bool) -> Iterator[Job]:
-    """All that is to be run, the most important first."""
-    if "trajectories" in parts:
-        yield from (trajectory_job(run, model, frames, coarse) for model in RECIPES for run in NOISE_OF)
-    if "table21" in parts:
-        for setting in table.settings:
-            own = setting._replace(every=setting.every * every)
-            yield from (Job("table21", run, texture, *own, frames, coarse) for texture in table.textures for run in RUNS)
-
-
-def trajectory_job(run: str, model: str, frames: int, coarse: bool = False) -> Job:
-    """The job of a trajectory."""
-    texture = "gaussian" if run in RUNS else "rocky-field"
-    return Job("trajectories", run, texture, "direct", model, NOISE_OF[run], 1, frames, coarse)
+Result = dict[str, Any]
+"""Numbers and texts of one job, as a line of ``results.jsonl`` holds them."""
 
 
 # ---------------------------------------------------------------- command
@@ -205,8 +121,8 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
         print("\n" + "\n".join(trajectory_table([row for row in results if row["part"] == "trajectories"])))
 
 
-def run_all(wanted: list[Job], out: Path) -> list[dict[str, Any]]:
-    """Results of all jobs, in their order; those of an earlier call are read."""
+def run_all(wanted: list[Job], out: Path) -> list[Result]:
+    """Run the jobs, and return all results in their order. Results of an earlier call are read."""
     log = out / "results.jsonl"
     done = {}
     for line in log.read_text().splitlines() if log.exists() else []:
@@ -226,18 +142,18 @@ def run_all(wanted: list[Job], out: Path) -> list[dict[str, Any]]:
     return [done[job] for job in wanted]
 
 
-def run(job: Job, out: Path) -> dict[str, Any]:
-    """One job, in a process of its own."""
+def run(job: Job, out: Path) -> Result:
+    """Run one job in a process of its own."""
     return (run_table21 if job.part == "table21" else run_trajectory)(job, out)
 
 
 def note(text: str) -> None:
-    """Progress, out of the way of what is printed."""
+    """Print progress on standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def machine(frames: int, every: int) -> str:
-    """What it ran on, when, and how much of it."""
+    """Describe the machine, the versions, the date and the scale."""
     names = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
     cpu = names[0] if names else platform.machine()
     scale = f"trajectories: {f'{frames} frames at most' if frames else 'all frames'}; table 2.1: one of {every} pairs"
@@ -250,12 +166,12 @@ def machine(frames: int, every: int) -> str:
 
 
 def pattern_runs(out: Path, model: str) -> Path:
-    """Where the data set of a model lies."""
+    """Return the path of the data set of a model."""
     return out / f"pattern-runs-{model}.zarr"
 
 
 def make_pattern_runs(out: Path, model: str, coarse: bool) -> None:
-    """The shipped recipe with the sonar of a model, made as a user would; coarse: the runs over the first seabed only."""
+    """Make the data set of the shipped recipe with the sonar of a model; coarse: the runs over the first seabed only."""
     fields = yaml.safe_load(shipped_recipes()["pattern-runs"].read_text(encoding="utf-8"))
     fields["sonar"] = yaml.safe_load(shipped_recipes()[RECIPES[model]].read_text(encoding="utf-8"))["sonar"]
     if coarse:
@@ -268,8 +184,8 @@ def make_pattern_runs(out: Path, model: str, coarse: bool) -> None:
     subprocess.run([sys.executable, "-m", "mitsonar", *words], check=True, stdout=sys.stderr)
 
 
-def run_table21(job: Job, out: Path) -> dict[str, Any]:
-    """Consecutive pairs of a run: all, one of so many, or some spread over it."""
+def run_table21(job: Job, out: Path) -> Result:
+    """Estimate consecutive pairs of a run: all, one of ``every``, or ``frames`` evenly spaced."""
     from mitsonar.datasets.torch_pairs import SonarPairs
 
     pairs = SonarPairs(pattern_runs(out, job.model), part="all", split="sequence", noise=job.noise)
@@ -286,7 +202,7 @@ def run_table21(job: Job, out: Path) -> dict[str, Any]:
 
 
 def estimates_of(method: str, pairs: Iterable[SonarFrames]) -> tuple[list[Estimate], float]:
-    """What a method says of pairs of frames, and its milliseconds a pair, the median."""
+    """Estimate the motions of pairs of frames, and the median milliseconds a pair."""
     estimator = create_estimator(method)
     found, taken = [], []
     for frames in pairs:
@@ -296,16 +212,16 @@ def estimates_of(method: str, pairs: Iterable[SonarFrames]) -> tuple[list[Estima
     return found, 1e3 * float(np.median(taken))
 
 
-def scores(found: list[Estimate], true: Array) -> dict[str, Any]:
-    """Errors that tables show; those not believed count as zero motion."""
+def scores(found: list[Estimate], true: Array) -> Result:
+    """Compute the errors of the tables. Invalid estimates count as zero motion."""
     motion = np.array([one.motion for one in found])
     valid = np.array([one.valid for one in found])
     unknown = np.full((3, 3), np.nan)
     covariances = np.array([unknown if one.covariance is None else one.covariance for one in found])
     errors = motion_errors(motion, true, valid, covariances)
     heights = [one.about["height_m"] for one in found if "height_m" in one.about]
-    told = {name: getattr(errors, name).tolist() for name in ("rmse", "median", "bias", "slope", "zero", "believed")}
-    return told | {
+    found_errors = {name: getattr(errors, name).tolist() for name in ("rmse", "median", "bias", "slope", "zero", "believed")}
+    return found_errors | {
         "pairs": errors.pairs,
         "failures": errors.failures,
         "nees": errors.nees,
@@ -314,7 +230,7 @@ def scores(found: list[Estimate], true: Array) -> dict[str, Any]:
 
 
 def keep(job: Job, out: Path, found: list[Estimate], true: Array) -> None:
-    """The estimates, for whoever wants to look closer."""
+    """Save the estimates for closer analysis."""
     unknown = np.full((3, 3), np.nan)
     np.savez_compressed(
         out / f"{job.name}.npz",
@@ -326,18 +242,18 @@ def keep(job: Job, out: Path, found: list[Estimate], true: Array) -> None:
     )
 
 
-def table21(rows: list[dict[str, Any]], every: int, table: Table) -> Iterator[str]:
-    """Markdown: a row a method and seabed, the thesis's and zero's among them."""
-    yield "RMSE sideways mm / forward mm / yaw deg, over the three runs of section 2.3"
+def table21(rows: list[Result], every: int, table: Table) -> Iterator[str]:
+    """Format table 2.1 as Markdown: a row for each method and seabed, with those of Almanza-Medina and of zero motion."""
+    yield "RMSE sideways mm / forward mm / yaw deg, over the three runs of Almanza-Medina, 2.3"
     yield ""
-    yield f"| seabed | method | model | noise | pairs | {' | '.join(RUNS)} | not believed |"
+    yield f"| seabed | method | model | noise | pairs | {' | '.join(RUNS)} | invalid |"
     yield "|---" * (6 + len(RUNS)) + "|"
     by = {
         (row["texture"], Setting(row["method"], row["model"], row["noise"], row["every"]), row["run"]): row for row in rows
     }
     for texture in table.textures:
         cells = [" / ".join(f"{value:.4g}" for value in one) for one in TABLE_21[texture]]
-        yield f"| {texture} | thesis, table 2.1 | its own | chapter2 | 1,547 | {' | '.join(cells)} | |"
+        yield f"| {texture} | Almanza-Medina, table 2.1 | its own | chapter2 | 1,547 | {' | '.join(cells)} | |"
         for setting in table.settings:
             mine = [by[texture, setting._replace(every=setting.every * every), run] for run in RUNS]
             cells = [numbers(row["rmse"]) for row in mine]
@@ -350,7 +266,7 @@ def table21(rows: list[dict[str, Any]], every: int, table: Table) -> Iterator[st
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Sideways / forward / yaw."""
+    """Format sideways / forward / yaw."""
     sideways, forward, yaw = values
     return f"{sideways:.2f} / {forward:.2f} / {yaw:.3f}"
 
@@ -359,7 +275,7 @@ def numbers(values: Iterable[float]) -> str:
 
 
 def driven(run: str, rate_hz: float, frames: int = 0) -> Trajectory:
-    """The poses of the sonar in a run of 3.5.1, or over the pattern; the first ``frames`` of them."""
+    """Return the first ``frames`` poses of the sonar in a run of 3.5.1, or over the pattern."""
     if run in RUNS:
         vehicle = run_poses(run, HEIGHT_M)
     else:
@@ -369,16 +285,16 @@ def driven(run: str, rate_hz: float, frames: int = 0) -> Trajectory:
         if run == "braking":
             speed = np.interp(time_s, [0, half, 2 * half], [CREEPING, BRAKED, CREEPING])
         along = np.concatenate([[0], np.cumsum((speed[1:] + speed[:-1]) / 2)]) / rate_hz
-        place = along - along[-1] / 2
+        centred = along - along[-1] / 2
         vehicle = np.zeros((FRAMES, 6))
-        vehicle[:, 0 if run == "sideways" else 1] = place
+        vehicle[:, 0 if run == "sideways" else 1] = centred
         vehicle[:, 2] = HEIGHT_M
     vehicle = vehicle[: frames or None]
     return Trajectory(mounted(vehicle, Pose.from_degrees([0, 0, 0, PITCH_DEG, 0, 0])), np.arange(len(vehicle)) / rate_hz)
 
 
 def rendered(job: Job) -> SonarFrames:
-    """The frames of a run as a sonar would store them: noisy, in 256 grey values."""
+    """Render the frames of a run as a sonar would store them: noisy, in 256 grey values."""
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
     from mitsonar.worlds.pattern import Pattern
@@ -388,17 +304,17 @@ def rendered(job: Job) -> SonarFrames:
     rocks = {"a_side": (9, 15)} if job.coarse else {}
     family = Pattern(texture="gaussian") if job.run in RUNS else RockyField(size_m=FIELD_M, **rocks)
     with tempfile.TemporaryDirectory(prefix="bench-trajectories-") as folder:
-        path, parameters = family.prepare(FIELD_SEED, Path(folder) / "world")
-        simulator = Simulator(load_scene(path, **parameters), sonar)
+        world, parameters = family.prepare(FIELD_SEED, Path(folder) / "world")
+        simulator = Simulator(load_scene(world, **parameters), sonar)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MitsonarWarning)  # the recipes' window drops what lies beyond, and says so
+        warnings.simplefilter("ignore", MitsonarWarning)  # the window of the recipes drops farther echoes, with a warning
         path = driven(job.run, sonar.frame_rate_hz, job.frames)
         made = simulator.render(path, noise=NOISE_MODELS[job.noise], seed=1)
     return replace(made, image=to_uint8(made.image))
 
 
-def run_trajectory(job: Job, out: Path) -> dict[str, Any]:
-    """Estimates of consecutive frames, the paths they make, how far these are off; frames are kept for mosaics."""
+def run_trajectory(job: Job, out: Path) -> Result:
+    """Estimate consecutive frames, and compute the paths and their errors. Frames are saved for mosaics."""
     frames = rendered(job)
     assert frames.poses is not None
     true = Trajectory(frames.poses, frames.time_s)
@@ -417,7 +333,7 @@ def run_trajectory(job: Job, out: Path) -> dict[str, Any]:
 
 
 def smoothed(found: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
-    """The estimates as they are (those not believed as no motion), and made smooth."""
+    """Return the estimates without smoothing (invalid ones as no motion), and smoothed."""
     series = MotionSeries.from_estimates(found, time_s)
     motion = np.where(series.believed[:, None], series.motions, 0)
     known = None if series.covariances is None else np.where(series.believed[:, None, None], series.covariances, 0)
@@ -426,17 +342,17 @@ def smoothed(found: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
 
 
 def path_errors(path: Trajectory, true: Trajectory, series: MotionSeries, start: Pose) -> dict[str, float]:
-    """Numbers of the table."""
+    """Compute the errors of a path for the table."""
     errors = assess(path, true)
     length = min(1.0, 0.5 * errors.path_m)
     metre = assess(path, true, delta=length, unit="metres")
     off = path.poses[-1, :2] - true.poses[-1, :2]
-    told = (
+    estimated_end = (
         {}
         if series.covariances is None
         else {"told_mm": 1e3 * float(np.sqrt(np.trace(pose_covariances(series, start)[-1, :2, :2])))}
     )
-    return told | {
+    return estimated_end | {
         "path_m": errors.path_m,
         "estimated_path_m": errors.estimated_path_m,
         "end_east_mm": 1e3 * float(off[0]),
@@ -451,12 +367,12 @@ def path_errors(path: Trajectory, true: Trajectory, series: MotionSeries, start:
     }
 
 
-def trajectory_table(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Markdown."""
+def trajectory_table(rows: list[Result]) -> Iterator[str]:
+    """Format the errors of the paths as Markdown."""
     heads = (
         "run | model | noise | method | path m | end east mm | end north mm | end % of path | heading deg | deg per 100 m"
     )
-    heads += " | ATE mm | frame mm | frame deg | 1 m of path mm | slope | not believed | told end, mm"
+    heads += " | ATE mm | frame mm | frame deg | 1 m of path mm | slope | invalid | estimated end error, mm"
     yield f"| {heads} |"
     yield "|---" * (heads.count("|") + 1) + "|"
     for row in rows:
@@ -470,125 +386,6 @@ def trajectory_table(rows: list[dict[str, Any]]) -> Iterator[str]:
             cells += [" / ".join(f"{value:.3f}" for value in slope), str(row["failures"])]
             cells += [f"{path['told_mm']:.0f}" if "told_mm" in path else ""]
             yield f"| {' | '.join(cells)} |"
-
-
-# ---------------------------------------------------------------- pictures
-
-
-def draw(out: Path, pictures: Path, frames: int) -> None:
-    """Mosaics along true and estimated paths, and how the paths go astray."""
-    pictures.mkdir(parents=True, exist_ok=True)
-    for model in RECIPES:
-        save_small(pictures / f"pattern_mosaics_{model}.png", pattern_figure(out, model, frames))
-    save_small(pictures / "rocky_mosaics.png", rocky_figure(out, frames))
-    save_small(pictures / "trajectory_errors.png", drift_figure(out, frames))
-
-
-def save_small(path: Path, figure: Figure) -> None:
-    """A PNG of 160 colours: noise does not compress, and true colour would be three times the size."""
-    from PIL import Image
-
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=75)
-    Image.open(drawn).convert("RGB").quantize(160, method=Image.Quantize.MAXCOVERAGE).save(
-        small, format="png", optimize=True
-    )
-    write_whole(path, small.getvalue())
-
-
-def paths_of(out: Path, job: Job, name: str) -> tuple[SonarFrames, dict[str, Trajectory]]:
-    """Frames, true and estimated path of a run."""
-    frames = SonarFrames.load(out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz")
-    assert frames.poses is not None
-    path = Trajectory.load_tum(out / f"{job.name}-{name}.tum")
-    return frames, {"true": Trajectory(frames.poses, frames.time_s), "estimated": path}
-
-
-def mosaic_along(frames: SonarFrames, path: Trajectory) -> Mosaic:
-    """All frames laid along a path, the fall-off with range taken out."""
-    some = frames.select(np.unique(np.linspace(0, len(frames) - 1, ILLUMINATION_FRAMES).astype(int)))
-    return build_mosaic(frames, path.poses, frames.height_m, cell_m=0.015, illumination=illumination(some))
-
-
-def pattern_figure(out: Path, model: str, frames: int) -> Figure:
-    """Mosaics of both runs over the pattern, true poses left, estimated poses right."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.5, 12.0), layout="constrained")
-    for row, run in enumerate(("diagonal", "legs")):
-        maps = {}
-        made, paths = paths_of(out, trajectory_job(run, model, frames), "Kalman")
-        maps["true poses"] = made, {"true": paths["true"]}, paths["true"]
-        maps["direct, Kalman"] = made, paths, paths["estimated"]
-        for column, (name, (made, paths, path)) in enumerate(maps.items()):
-            axes = figure.add_subplot(2, 2, 2 * row + column + 1)
-            show(axes, mosaic_along(made, path), paths)
-            axes.set(xlim=(-4.0, 4.5), ylim=(-5.2, 2.8), title=f"{run}: {name}")
-    figure.suptitle(f"{model} model, Gaussian seabed, noise of chapter 2")
-    return figure
-
-
-def rocky_figure(out: Path, frames: int) -> Figure:
-    """Mosaics of the runs over the rocky field, the sideways one along true and estimated poses, the others along these."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(17.0, 10.5), layout="constrained")
-    grid = figure.add_gridspec(2, 3, width_ratios=(12.8, 4, 4))
-    places = [("sideways", "true", grid[0, 0]), ("sideways", "estimated", grid[1, 0])]
-    places += [("forward", "estimated", grid[:, 1]), ("braking", "estimated", grid[:, 2])]
-    for run, name, place in places:
-        made, paths = paths_of(out, trajectory_job(run, "thesis", frames), "raw")
-        axes = figure.add_subplot(place)
-        show(axes, mosaic_along(made, paths[name]), paths)
-        axes.set_title(f"{run}, {name} poses")
-    figure.suptitle("rocky field, thesis model, no noise; direct, frame by frame")
-    return figure
-
-
-COLOURS = {"true": "limegreen", "estimated": "red"}
-
-
-def show(axes: Axes, mosaic: Mosaic, paths: dict[str, Trajectory]) -> None:
-    """A mosaic with paths over it."""
-    from matplotlib.colors import PowerNorm
-
-    level = mosaic.mean
-    norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.7)))
-    axes.set_facecolor("0.9")
-    axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
-    for name, path in paths.items():
-        width = 3.0 if name == "true" else 1.2
-        axes.plot(path.poses[:, 0], path.poses[:, 1], color=COLOURS[name], linewidth=width, label=name)
-    axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
-    axes.legend(loc="best", fontsize="small")
-
-
-def drift_figure(out: Path, frames: int) -> Figure:
-    """Errors along and across the way and of the heading over the distance driven."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
-    runs = [run for run in NOISE_OF if run != "legs"]
-    axes = figure.subplots(3, len(runs), sharex="col", squeeze=False)
-    for column, run in enumerate(runs):
-        for model, colour in (("thesis", "tab:blue"), ("physical", "tab:orange")):
-            _, paths = paths_of(out, trajectory_job(run, model, frames), "raw")
-            true, off = paths["true"].poses, paths["estimated"].poses - paths["true"].poses
-            step = np.diff(true[:, :2], axis=0)
-            way = np.concatenate([[0], np.cumsum(np.linalg.norm(step, axis=1))])
-            ahead = step[0] / np.linalg.norm(step[0])
-            values = (1e3 * off[:, :2] @ ahead, 1e3 * off[:, :2] @ [ahead[1], -ahead[0]], np.degrees(off[:, 5]))
-            for row, value in enumerate(values):
-                axes[row, column].plot(way, value, color=colour, label=f"direct, {model}")
-        axes[0, column].set_title(f"{run}, noise: {NOISE_OF[run]}")
-        axes[2, column].set_xlabel("driven (m)")
-    for row, name in enumerate(("along the way (mm)", "to starboard of it (mm)", "heading (deg)")):
-        axes[row, 0].set_ylabel(name)
-    for one in axes.flat:
-        one.grid(alpha=0.3)
-    for one in (axes[0, 0], axes[0, -1]):
-        one.legend(fontsize="small")
-    return figure
 
 
 if __name__ == "__main__":

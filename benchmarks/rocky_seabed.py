@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 __all__ = ["SIZE_M", "Seabed", "mitsuba_scene", "poses_over", "rocky_seabed"]
 
@@ -53,15 +56,15 @@ def rocky_seabed(a_side: int = 52, seed: int = 0) -> Seabed:
     )
 
 
-def mitsuba_scene(seabed: Seabed) -> Any:
-    """The seabed as a Mitsuba scene: one mesh with a reflectivity a face, on a floor of independent cells."""
+def mitsuba_scene(seabed: Seabed) -> mi.Scene:
+    """Return the seabed as a Mitsuba scene: one mesh with a reflectivity a face, on a floor of independent cells."""
     import mitsuba as mi
 
     rocks = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_reflectivity"}}
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(rocks)
     mesh = mi.Mesh("rocks", len(seabed.vertices), len(seabed.faces), props=properties)
-    mesh.add_attribute("face_reflectivity", 1, seabed.reflectivity)
+    mesh.add_attribute("face_reflectivity", 1, seabed.reflectivity)  # type: ignore[arg-type]  # arrays work, despite the stub
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = seabed.vertices.ravel()
     parameters["faces"] = seabed.faces.ravel()
@@ -71,12 +74,13 @@ def mitsuba_scene(seabed: Seabed) -> Any:
         "to_world": mi.ScalarTransform4f().scale(SIZE_M / 2),
         "bsdf": {"type": "diffuse", "reflectance": {"type": "cell_noise", "cells": CELLS}},
     }
-    return mi.load_dict({"type": "scene", "rocks": mesh, "floor": floor})
+    scene: mi.Scene = mi.load_dict({"type": "scene", "rocks": mesh, "floor": floor})
+    return scene
 
 
 def poses_over(count: int, seed: int = 1) -> NDArray[np.float64]:
-    """Random places and headings 2.5 m above the floor, looking 35 deg down, their footprints on the seabed."""
+    """Draw random positions and headings 2.5 m above the floor, at a pitch of 35 deg, with footprints on the seabed."""
     rng = np.random.default_rng(seed)
-    place, heading = rng.uniform(-8.5, 8.5, (count, 2)), rng.uniform(0, 2 * np.pi, count)
+    position, heading = rng.uniform(-8.5, 8.5, (count, 2)), rng.uniform(0, 2 * np.pi, count)
     rest = np.tile([2.5, np.radians(35), 0.0], (count, 1))
-    return np.column_stack([place, rest, heading])
+    return np.column_stack([position, rest, heading])

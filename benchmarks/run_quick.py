@@ -1,8 +1,8 @@
-"""Runs every script of benchmarks/, docs/ and scenes/ with --quick, one after the other: does each still work?
+"""Run every script of benchmarks/, docs/ and scenes/ with --quick, one after the other.
 
     python benchmarks/run_quick.py [NAME ...] [--limit 600]
 
-Prints the seconds of each, and the last lines of those that fail; the exit status is then 1.
+It prints the seconds of each script and the last lines of failed ones. Then the exit status is 1.
 """
 
 from __future__ import annotations

@@ -92,13 +92,13 @@ def traced(house: Path, out: Path, words: list[str]) -> None:
     seen: dict[CodeType, set[int]] = {}
     inside = tuple(str(house / part) + os.sep for part in PACKAGE)
 
-    def enter(frame: FrameType, event: str, _: Any) -> Callable[..., Any] | None:
+    def enter(frame: FrameType, event: str, _: object) -> Callable[..., Any] | None:
         code = frame.f_code
         if not code.co_filename.startswith(inside) or not code.co_flags & inspect.CO_OPTIMIZED:
             return None  # not mitsonar, or the body of a module or a class
         lines = seen.setdefault(code, set())
 
-        def line(frame: FrameType, event: str, _: Any) -> Callable[..., Any]:
+        def line(frame: FrameType, event: str, _: object) -> Callable[..., Any]:
             lines.add(frame.f_lineno)
             return line
 
@@ -124,7 +124,7 @@ def traced(house: Path, out: Path, words: list[str]) -> None:
 
 
 def counts(house: Path) -> Iterable[tuple[str, str]]:
-    """What can be counted without running anything."""
+    """Count what needs no run."""
     sources = {path: path.read_text(encoding="utf-8") for part in EVERYTHING for path in files_of(house / part)}
     package = {path: text for path, text in sources.items() if path.relative_to(house).parts[0] in PACKAGE}
     trees = {path: ast.parse(text) for path, text in package.items()}

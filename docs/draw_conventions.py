@@ -42,23 +42,23 @@ def on_paper(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def arrow(axis: Axes, start: NDArray[np.float64], end: NDArray[np.float64], colour: str, text: str) -> None:
-    """An arrow between two places, its text beyond its tip."""
+    """Draw an arrow between two points, with its text beyond its tip."""
     (a, b), tip = on_paper(np.array([start, end])), on_paper(np.array([start + 1.2 * (end - start)]))[0]
     axis.annotate("", b, a, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 2.2, "shrinkA": 0, "shrinkB": 0})
     side = "center" if abs(tip[0] - a[0]) < 0.2 else "left" if tip[0] > a[0] else "right"
-    axis.text(*tip, text, color=colour, fontsize=10, ha=side, va="center")
+    axis.text(tip[0], tip[1], text, color=colour, fontsize=10, ha=side, va="center")
 
 
 def triad(
     axis: Axes, place: NDArray[np.float64], matrix: NDArray[np.float64], length: float, words: tuple[str, ...]
 ) -> None:
-    """The axes x, y, z, columns of a matrix in mitsonar's world."""
+    """Draw the axes x, y, z, the columns of a matrix in mitsonar's world."""
     for column, colour, letter, word in zip(matrix.T, COLOURS, "xyz", words, strict=True):
         arrow(axis, place, place + length * column, colour, f"{letter} {word}")
 
 
 def fan(axis: Axes, turn: Rotation, place: NDArray[np.float64]) -> None:
-    """What the sonar looks at: from it along its middle plane."""
+    """Draw the view of the sonar along its middle plane."""
     bearing = np.radians(np.linspace(-15, 15, 20))
     rim = np.column_stack([np.sin(bearing), np.cos(bearing), np.zeros(20)]) * 2.6
     corners = on_paper(place + turn.apply(np.vstack([[0, 0, 0], rim])))
@@ -89,7 +89,7 @@ def panel(axis: Axes, convention: Convention) -> None:
 
 
 def drawn() -> Figure:
-    """The three conventions side by side."""
+    """Draw the three conventions side by side."""
     figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
     for axis, convention in zip(axes, CONVENTIONS.values(), strict=True):
         panel(axis, convention)

@@ -10,7 +10,7 @@ import argparse
 import tempfile
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -22,7 +22,10 @@ from mitsonar.simulation.scene import sonar_in
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.worlds.families import create_family
 
-SHOWN = {
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+SHOWN: dict[str, tuple[dict[str, object], float]] = {
     "rocky-field": ({}, 4.0),
     "ship-hull": ({}, 4.0),
     "pattern": ({}, 6.0),
@@ -31,8 +34,8 @@ SHOWN = {
 """Options of each family, and half the edge of what is drawn from above [m]."""
 
 
-def from_above(scene: Any, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
-    """A photograph, as if the water were clear; north is up."""
+def from_above(scene: mi.Scene, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
+    """Render a photograph, as if the water were clear. North is up."""
     import mitsuba as mi
 
     sun = {"type": "directional", "direction": [0.8, -0.5, -0.7], "irradiance": {"type": "uniform", "value": 3.0}}
@@ -49,7 +52,7 @@ def from_above(scene: Any, middle: tuple[float, float], half_m: float, pixels: i
     shapes = {f"shape{number}": shape for number, shape in enumerate(scene.shapes())}
     lit = mi.load_dict({"type": "scene", "sun": sun, "sky": sky, **shapes})
     picture = np.array(mi.render(lit, sensor=camera, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=spp))
-    return np.clip(picture[..., 0], 0, 1) ** (1 / 2.2)
+    return np.asarray(np.clip(picture[..., 0], 0, 1) ** (1 / 2.2))
 
 
 def footprint_outline(sonar: mitsonar.Sonar, pose: Pose) -> tuple[np.ndarray, np.ndarray]:

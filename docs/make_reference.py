@@ -1,6 +1,8 @@
 """Write the two reference pages that follow from the code: docs/reference/command-line.md and python.md.
 
-``python docs/make_reference.py``; a test compares the pages with what this gives.
+    python docs/make_reference.py [--quick]
+
+A test compares the stored pages with those of this script.
 """
 
 from __future__ import annotations
@@ -15,6 +17,9 @@ import typer
 
 import mitsonar
 from mitsonar.cli import application
+
+Click = Any
+"""A command, context or parameter of Click, or of Typer's copy of it."""
 
 FOLDER = Path(__file__).parent / "reference"
 
@@ -52,7 +57,7 @@ def python_page() -> str:
     groups = {**GROUPS, "Others": tuple(name for name in mitsonar.__all__ if name not in known)}
     parts = [
         "# Python",
-        "These names stand in `mitsonar` itself. They are loaded when they are first used: `import mitsonar` loads no "
+        "These names are in `mitsonar` itself. They are loaded when they are first used: `import mitsonar` loads no "
         "Mitsuba and no torch. Errors that a user can cause are `MitsonarError`, with one sentence.",
     ]
     for title, names in groups.items():
@@ -66,8 +71,8 @@ def command_page() -> str:
     """Return the page of the command line: every command with its arguments and options."""
     parts = [
         "# Command line",
-        "`mitsonar COMMAND --help` prints the same. `python -m mitsonar` is the same program. A mistake is answered by one "
-        "sentence and exit code 2.",
+        "`mitsonar COMMAND --help` prints the same. `python -m mitsonar` is the same program. An error ends the program "
+        "with one sentence and exit code 2.",
     ]
     for name, command in commands(typer.main.get_command(application()), "mitsonar"):
         parts += [f"## `{name}`", inspect.cleandoc(command.help or "").replace("\n\n\n", "\n\n")]
@@ -78,8 +83,8 @@ def command_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """All commands below one, with their full names, in the order of the program."""
+def commands(command: Click, name: str) -> Iterator[tuple[str, Click]]:
+    """List all commands below one, with their full names, in the order of the program."""
     if not hasattr(command, "list_commands"):
         yield name, command
         return
@@ -88,8 +93,8 @@ def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield from commands(command.get_command(context, word), f"{name} {word}")
 
 
-def row(parameter: Any, context: Any) -> str:
-    """A line of the table of a command."""
+def row(parameter: Click, context: Click) -> str:
+    """Format a line of the table of a command."""
     if parameter.param_type_name == "argument":
         names = f"`{parameter.metavar or parameter.name.upper()}`"
     else:
@@ -103,8 +108,8 @@ def row(parameter: Any, context: Any) -> str:
     return f"| {names} | {default} | {text} |"
 
 
-def kind(parameter: Any, context: Any) -> str:
-    """The type of an option's value as its help shows it: INT, FLOAT, TEXT ..."""
+def kind(parameter: Click, context: Click) -> str:
+    """Return the type of an option's value as its help shows it: INT, FLOAT, TEXT ..."""
     words = {"int": "INT", "float": "FLOAT", "path": "PATH"}
     shown = str(parameter.display_type(context)).strip("<>").split()
     return words.get(shown[0].lower() if shown else "", "TEXT")

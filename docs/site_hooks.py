@@ -17,6 +17,9 @@ from mkdocs.structure.pages import Page
 
 __all__ = ["on_files", "on_page_content", "on_page_markdown"]
 
+CellOutput = dict[str, Any]
+"""An output of a notebook cell, as the file stores it."""
+
 ROOT = Path(__file__).parent.parent
 
 NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks")
@@ -41,13 +44,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Lead links between files of the repository to their pages."""
     place = page.file.src_uri
     return relinked(markdown, next((source for source, made in PAGES.items() if made == place), f"docs/{place}"), place)
 
 
-def on_page_content(content: str, **_: Any) -> str:
+def on_page_content(content: str, **_: object) -> str:
     """Turn formulas into MathML, which browsers draw without a script, and roles of docstrings into code."""
 
     def drawn(found: re.Match[str]) -> str:
@@ -88,8 +91,8 @@ def notebook_markdown(source: str) -> str:
     return "\n\n".join(parts)
 
 
-def _result(output: dict[str, Any]) -> str:
-    """What a cell printed or drew, as Markdown."""
+def _result(output: CellOutput) -> str:
+    """Format the output of a cell as Markdown."""
     data = output.get("data", {})
     if "image/png" in data:
         picture = base64.b64encode(base64.b64decode(data["image/png"])).decode()

@@ -1,4 +1,4 @@
-"""``python -m mitsonar``."""
+"""The command line as ``python -m mitsonar``."""
 
 from mitsonar.cli import main
 

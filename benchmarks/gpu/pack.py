@@ -87,7 +87,7 @@ def quick() -> None:
 
 
 def listed(path: Path = HERE / "wheels.txt") -> dict[str, list[str]]:
-    """Requirements `name==version` of each section of the list."""
+    """Read the requirements `name==version` of each section of the list."""
     found: dict[str, list[str]] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         words = line.partition("#")[0].strip()
@@ -106,7 +106,7 @@ def fetch(wanted: list[str], out: Path) -> None:
 
 
 def build(out: Path) -> None:
-    """The wheel of this checkout, from a copy: what an earlier build left behind would be packed too."""
+    """Build the wheel of this checkout from a copy, without the remains of earlier builds."""
     others = shutil.ignore_patterns(".*", "out", "build", "dist", "*.egg-info", "__pycache__", "*.zarr")
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(ROOT, Path(folder, "mitsonar"), symlinks=True, ignore=others)
@@ -130,7 +130,7 @@ def slim(wheel: Path, unused: Iterable[str]) -> None:
 
 
 def without_rows(record: bytes, kept: Callable[[str], bool]) -> bytes:
-    """A wheel's RECORD without the rows of files that are gone."""
+    """Return the RECORD of a wheel without the rows of removed files."""
     text = io.StringIO()
     rows = [row for row in csv.reader(record.decode().splitlines()) if row and kept(row[0])]
     csv.writer(text, lineterminator="\n").writerows(rows)

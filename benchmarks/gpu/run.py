@@ -45,14 +45,21 @@ SMALL = 0.01
 """Scales below this one train small networks on coarse data, one row of each table: a check of the steps, no result."""
 
 ALIKE = 0.01
-"""Two devices may differ by this part (rms) where they do not round alike: a ray on an edge falls into the next cell."""
+"""Largest difference of two devices, as a part of the rms. They round differently, and a ray on an edge changes its cell."""
 
 GRACE_S = 60.0
-"""That a command has to write its state, once it was asked to stop."""
+"""Seconds that a command has to write its state once it was asked to stop."""
+
+
+Plain = dict[str, Any]
+"""What a JSON file or a checkpoint holds: values by name."""
+
+Saved = Any
+"""A value of a checkpoint: a tensor, a dictionary, a list, or a plain value."""
 
 
 class Asked(NamedTuple):
-    """What a step is told.
+    """Arguments of a step.
 
     Attributes:
         out: folder of everything.
@@ -68,28 +75,28 @@ class Asked(NamedTuple):
 
     @property
     def variant(self) -> str:
-        """Of Mitsuba."""
+        """Return the variant of Mitsuba."""
         return "cuda_ad_mono" if self.device == "cuda" else "llvm_ad_mono"
 
     @property
     def small(self) -> bool:
-        """Whether this is only a check of the steps."""
+        """Return whether this is only a check of the steps."""
         return self.scale < SMALL
 
 
 class Found(NamedTuple):
-    """What a step found; ``done`` False: it goes on at the next call."""
+    """Result of a step; ``done`` is False if the next call continues it."""
 
-    said: dict[str, Any]
+    said: Plain
     done: bool = True
 
 
 class Failed(Exception):
-    """A step could not be done; the sentence says why."""
+    """A step failed, for the reason in the message."""
 
 
 def main() -> None:
-    """Do what is asked."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", nargs="?", choices=["install", *STEPS], help="one step")
     parser.add_argument("loads", nargs="*", type=Path, help="of install: folders of pack.py")
@@ -160,8 +167,8 @@ def go(names: list[str], out: Path, scale: float, device: str, minutes: float, a
     return states
 
 
-def tried(name: str, asked: Asked) -> dict[str, Any]:
-    """Do a step, whatever becomes of it."""
+def tried(name: str, asked: Asked) -> Plain:
+    """Do a step, and return its state also if it fails."""
     if asked.small and name not in IN_SMALL:
         return {"state": "left out", "found": {"why": f"below a scale of {SMALL:g} one row of each table is tried"}}
     try:
@@ -171,8 +178,8 @@ def tried(name: str, asked: Asked) -> dict[str, Any]:
     return {"state": "done" if found.done else "open", "found": found.said}
 
 
-def opened(out: Path, about: dict[str, Any]) -> dict[str, Any]:
-    """The state of a folder, new or as it was left.
+def opened(out: Path, about: Plain) -> Plain:
+    """Read the state of a folder, or begin a new one.
 
     Raises:
         SystemExit: it was begun with other numbers, or is damaged.
@@ -181,7 +188,7 @@ def opened(out: Path, about: dict[str, Any]) -> dict[str, Any]:
     if not path.exists():
         return {"about": about, "steps": {}}
     try:
-        state: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        state: Plain = json.loads(path.read_text(encoding="utf-8"))
         had = state["about"]
     except (ValueError, KeyError, TypeError):
         raise SystemExit(f"{path} is damaged: remove it, and the steps find what they had done") from None
@@ -190,7 +197,7 @@ def opened(out: Path, about: dict[str, Any]) -> dict[str, Any]:
     return state
 
 
-def keep(out: Path, state: dict[str, Any]) -> None:
+def keep(out: Path, state: Plain) -> None:
     """Write the state, whole or not at all."""
     out.mkdir(parents=True, exist_ok=True)
     part = out / ".state.json.part"
@@ -231,7 +238,7 @@ def command(asked: Asked, name: str, words: list[str], *, goes_on: bool = False,
 
 
 def waited(run: subprocess.Popen[bytes], end: float) -> bool:
-    """Whether a command ended by itself; else it is asked to stop, and killed where it does not."""
+    """Wait for a command, and return whether it ended by itself. Otherwise stop it, and kill it if it does not stop."""
     try:
         run.wait(max(1.0, end - time.monotonic()))
         return True
@@ -246,7 +253,7 @@ def waited(run: subprocess.Popen[bytes], end: float) -> bool:
 
 
 def mitsonar(*words: object) -> list[str]:
-    """A command of mitsonar."""
+    """Return the words of a command of mitsonar."""
     return ["-m", "mitsonar", *map(str, words)]
 
 
@@ -254,9 +261,9 @@ def mitsonar(*words: object) -> list[str]:
 
 
 def look(asked: Asked) -> Found:
-    """What the machine has, and what of the list of wheels it lacks."""
+    """Describe the machine, and list the missing wheels."""
     wanted = [one.partition("==")[0] for wheels in pack.listed().values() for one in wheels]
-    said: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count()}
+    said: Plain = {"python": platform.python_version(), "cores": os.cpu_count()}
     said["missing"] = ", ".join(name for name in wanted if version_of(name) is None) or "nothing"
     said |= {name: version_of(name) for name in ("mitsonar", "mitsuba", "drjit", "torch", "lightning", "cufinufft")}
     for name, words in {
@@ -282,7 +289,7 @@ def version_of(name: str) -> str | None:
 
 
 def answer(words: list[str], asked: Asked) -> str:
-    """What a command prints, or why it prints nothing."""
+    """Return what a command prints, or why it prints nothing."""
     world = {**os.environ, "MITSONAR_VARIANT": asked.variant}
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=world)
@@ -302,7 +309,7 @@ RENDERS = {
 
 
 def same(asked: Asked) -> Found:
-    """The same small scenes on the device twice, which must agree bit for bit, and on the CPU, within `ALIKE`."""
+    """Render scenes twice on the device, with equal bits, and once on the CPU, equal within `ALIKE`."""
     said, wrong = {}, []
     for name in ("thesis", "scatterers") if asked.small else RENDERS:
         first, second, cpu = (made(asked, name, run) for run in ("first", "second", "cpu"))
@@ -320,7 +327,7 @@ def same(asked: Asked) -> Found:
 
 
 def made(asked: Asked, name: str, run: str) -> dict[str, np.ndarray]:
-    """Numbers of a small run; that of the CPU is what all are compared with."""
+    """Render a small run, and return its arrays. That of the CPU is the reference."""
     out = asked.out / "same" / f"{name}-{run}"
     variant = "llvm_ad_mono" if run == "cpu" else asked.variant
     command(asked, "same", mitsonar(*RENDERS[name], "--overwrite", "-o", out), MITSONAR_VARIANT=variant)
@@ -333,7 +340,7 @@ def made(asked: Asked, name: str, run: str) -> dict[str, np.ndarray]:
 
 
 def differ(one: np.ndarray, other: np.ndarray) -> float:
-    """Rms difference as a part of the rms value."""
+    """Return the rms difference as a part of the rms value."""
     if one.shape != other.shape:
         return float("inf")
     scale = float(np.sqrt(np.nanmean(np.abs(other.astype(np.complex128)) ** 2)))
@@ -341,7 +348,7 @@ def differ(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def tests(asked: Asked) -> Found:
-    """The tests that need CUDA, or those of the variant on a CPU."""
+    """Run the tests that need CUDA, or on a CPU those of the variant."""
     if importlib.util.find_spec("pytest") is None:
         raise Failed("pytest is missing: pack it with `pack.py --all`")
     chosen = ["-m", "gpu", str(ROOT / "tests")] if asked.device == "cuda" else ["-k", "variant", str(ROOT / "tests")]
@@ -351,18 +358,18 @@ def tests(asked: Asked) -> Found:
 
 
 def variant_tests() -> Path:
-    """The file of tests of the variant, wherever it lies."""
+    """Return the file of the tests of the variant."""
     return next((ROOT / "tests").rglob("test_variant.py"))
 
 
 def last_line(asked: Asked, name: str) -> str:
-    """The last line of a log."""
+    """Return the last line of a log."""
     text = (asked.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
     return next(line for line in reversed(text.splitlines()) if line.strip())
 
 
 def render_speed(asked: Asked) -> Found:
-    """How fast frames are rendered; its table is in the log."""
+    """Measure the speed of rendering frames. The table is in the log."""
     few = ["--quick"] if asked.small else ["--without-open3d"]
     script = str(ROOT / "benchmarks" / "bench_render.py")
     command(asked, "render_speed", [script, "--variant", asked.variant, *few])
@@ -370,21 +377,21 @@ def render_speed(asked: Asked) -> Found:
 
 
 def coherent_speed(asked: Asked) -> Found:
-    """How fast impulse responses are made."""
+    """Measure the speed of impulse responses."""
     script = str(ROOT / "benchmarks" / "bench_impulse.py")
     command(asked, "coherent_speed", [script, "--quick"] if asked.small else [script, "speed"])
     return Found(rows_of(asked, "coherent_speed"))
 
 
 def rows_of(asked: Asked, name: str) -> dict[str, str]:
-    """Lines of a log that hold a result."""
+    """Return the lines of a log that hold a result."""
     text = (asked.out / "logs" / f"{name}.log").read_text(encoding="utf-8", errors="replace")
     mine = text.rpartition("\n$ ")[2].splitlines()[1:]
     return {f"line {k}": line for k, line in enumerate(line for line in mine if line.strip() and line[0] not in "{-")}
 
 
 def row(table: str, name: str) -> Callable[[Asked], Found]:
-    """A row of a table: its data, training and evaluation by `mitsonar reproduce`, which goes on where it was stopped."""
+    """Return the step of a row of a table, by `mitsonar reproduce`, which resumes where it was stopped."""
 
     def work(asked: Asked) -> Found:
         out = asked.out / f"table-{table}"
@@ -399,7 +406,7 @@ def row(table: str, name: str) -> Callable[[Asked], Found]:
 
 
 def effort(asked: Asked, table: str) -> list[object]:
-    """What is spent on each row: all epochs; at a small scale some seconds on coarse data."""
+    """Return the effort of a row: all epochs, or at a small scale some seconds on coarse data."""
     bf16 = ["--set", "precision=bf16-mixed"] if asked.device == "cuda" else []
     if not asked.small:
         return ["--scale", asked.scale, "--minutes", 0, *bf16]
@@ -412,10 +419,10 @@ def effort(asked: Asked, table: str) -> list[object]:
 
 
 def weights(asked: Asked) -> Found:
-    """Networks of the rows that are done, in bf16, in files below 16 MiB, in OUT/weights; `together` reads them again."""
+    """Save the networks of finished rows in OUT/weights, in bf16 and files below 16 MiB. `together` reads them."""
     import torch
 
-    said: dict[str, Any] = {}
+    said: Plain = {}
     for path in sorted(asked.out.glob("table-*/runs/*/network.ckpt")):
         folder = asked.out / "weights" / path.parent.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -436,8 +443,8 @@ def weights(asked: Asked) -> Found:
     return Found(said or {"networks": "none yet"}, done=finished and bool(said))
 
 
-def halved(value: Any) -> Any:
-    """Tensors of 32-bit numbers in bf16, wherever they are."""
+def halved(value: Saved) -> Saved:
+    """Convert all tensors of 32-bit numbers to bf16."""
     import torch
 
     if isinstance(value, torch.Tensor):
@@ -447,11 +454,11 @@ def halved(value: Any) -> Any:
     return [halved(one) for one in value] if isinstance(value, list) else value
 
 
-def together(folder: Path) -> dict[str, Any]:
-    """A checkpoint of `weights` as mitsonar saves it: `torch.save(together(FOLDER), "network.ckpt")`."""
+def together(folder: Path) -> Plain:
+    """Read a checkpoint of `weights` as mitsonar saves it: `torch.save(together(FOLDER), "network.ckpt")`."""
     import torch
 
-    def full(value: Any) -> Any:
+    def full(value: Saved) -> Saved:
         if isinstance(value, torch.Tensor):
             return value.to(torch.float32) if value.dtype == torch.bfloat16 else value
         if isinstance(value, dict):

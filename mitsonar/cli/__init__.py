@@ -1,4 +1,4 @@
-"""The command line: one file a group of commands, each loading what it needs when it is called."""
+"""The command line: one file a group of commands. A command imports what it needs when it is called."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["application", "main"]
 
 
 def main() -> None:
-    """``mitsonar`` and ``python -m mitsonar``."""
+    """Run the command line, as ``mitsonar`` or ``python -m mitsonar``."""
     import typer
 
     from mitsonar.cli.help_texts import with_plain_brackets
@@ -20,7 +20,7 @@ def main() -> None:
 
 
 def application() -> typer.Typer:
-    """Collect all commands."""
+    """Create the application with all commands."""
     import typer
 
     from mitsonar.cli import (

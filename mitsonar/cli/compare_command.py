@@ -1,4 +1,4 @@
-"""``mitsonar compare``: estimators side by side on the same pairs of a data set."""
+"""``mitsonar compare``: estimators on the same pairs of a data set."""
 
 from __future__ import annotations
 
@@ -19,37 +19,40 @@ def compare(
     estimators: Annotated[
         str | None,
         typer.Option(
-            help="Names, or checkpoints of networks, with commas between them, each NAME or NAME:key=value:key=value "
+            help="Names of estimators or checkpoints of networks, separated by commas: NAME or NAME:key=value:key=value "
             "(default: all that need no training)."
         ),
     ] = None,
     noise: Annotated[
         str,
         typer.Option(
-            help="Levels with commas between them (or ; where one is m,s,g): none, low, high, chapter2, a YAML file; of "
-            "impulse responses ratios: none,20 dB."
+            help="Levels of noise, separated by commas (by ; if one is m,s,g): none, low, high, chapter2, a YAML file; for "
+            "impulse responses signal-to-noise ratios: none,20 dB."
         ),
     ] = "none",
-    part: Annotated[str | None, typer.Option(help="train, validation, test (default where it is), all.")] = None,
-    pairs: Annotated[int | None, typer.Option(min=2, help="At most so many, each of a sequence of its own.")] = None,
+    part: Annotated[str | None, typer.Option(help="train, validation, test (default if the split has one) or all.")] = None,
+    pairs: Annotated[int | None, typer.Option(min=2, help="Largest number of pairs, one a sequence.")] = None,
     perturb: Annotated[
-        bool, typer.Option("--perturb", help="Rows with wrong height, pitch, roll, sound speed, heave.")
+        bool, typer.Option("--perturb", help="Add rows with wrong height, pitch, roll, sound speed and heave.")
     ] = False,
     jitter: Annotated[
-        bool, typer.Option("--jitter", help="A row with rays that move: is it the sampling's pattern?")
+        bool, typer.Option("--jitter", help="Add a row with jittered rays, which shows errors from the sampling pattern.")
     ] = False,
-    prior: Annotated[bool, typer.Option("--prior", help="Rows that know how large motions are, as networks do.")] = False,
-    limit: Annotated[
-        int, typer.Option(min=0, help="Pairs over which the physical limit is computed; 0: none (of images only).")
-    ] = 10,
-    reference: Annotated[str | None, typer.Option(help="Method that others are compared with (default: the last).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise, choice of pairs and bootstrap.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for answers, table.md and table.json; goes on.")
+    prior: Annotated[
+        bool, typer.Option("--prior", help="Add rows with a prior on the size of motions, as networks have.")
+    ] = False,
+    limit: Annotated[int, typer.Option(min=0, help="Number of pairs for the Cramer-Rao bound (images only); 0: none.")] = 10,
+    reference: Annotated[
+        str | None, typer.Option(help="Estimator that others are compared with (default: the last).")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print for programs.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, choice of pairs and bootstrap.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Folder for estimates, table.md and table.json; a stopped run is resumed."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Errors of all methods on the same pairs; failures count as zero motion; bootstrap by scene, then sequence."""
+    """Compare estimators on the same pairs. Failures count as zero motion. Bootstrap by scene, then sequence."""
     from mitsonar.estimation.benchmark_tables import table_lines
     from mitsonar.estimation.comparison_run import Asked
     from mitsonar.estimation.comparison_run import compare as compared

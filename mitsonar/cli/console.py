@@ -1,4 +1,4 @@
-"""What every command shares: answers to mistakes, warnings, progress."""
+"""Output of all commands: errors, warnings and progress."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from typing import Any, ParamSpec, TypeVar
+from contextlib import AbstractContextManager, contextmanager
+from types import TracebackType
+from typing import ParamSpec, TypeVar
 
 import typer
 
@@ -23,24 +24,24 @@ R = TypeVar("R")
 
 
 def say(text: str) -> None:
-    """A line on standard output, as it is."""
+    """Print a line on standard output."""
     typer.echo(text)
 
 
 def warn(text: str) -> None:
-    """A warning's line on standard error."""
+    """Print a warning on standard error."""
     typer.echo(f"warning: {text}", err=True)
 
 
-AGAIN = "the same command goes on (`render`, `odometry` and `train` with --resume)"
+RESUME_HINT = "the same command goes on (`render`, `odometry` and `train` with --resume)"
 
 
 def say_stopped() -> None:
-    """After Ctrl-C."""
-    typer.echo(f"stopped; what is whole on disk stays, {AGAIN}", err=True)
+    """Print what to do after Ctrl-C."""
+    typer.echo(f"stopped; what is whole on disk stays, {RESUME_HINT}", err=True)
 
 
-STANDS = {"height_m": "--height", "pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"}
+GEOMETRY = {"height_m": "--height", "pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"}
 INSTRUMENT = {"model": "--model", "seed": "--seed"}
 
 OPTIONS: dict[str, dict[str, str]] = {
@@ -48,27 +49,30 @@ OPTIONS: dict[str, dict[str, str]] = {
     "crlb": INSTRUMENT,
     "impulse": {**INSTRUMENT, "velocity": "--velocity"},
     "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},
-    "odometry": {**STANDS, "every": "--every"},
+    "odometry": {**GEOMETRY, "every": "--every"},
     "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},
-    "mosaic": {**STANDS, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
+    "mosaic": {**GEOMETRY, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
     "compare": {"height_m": "NAME:height_m=METRES", "pitch_rad": "NAME:pitch_deg=DEGREES"},
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "reproduce": {"minutes": "--minutes"},
 }
-"""By command: the option that a user types for an argument that a message names (:func:`mitsonar.errors.argument`)."""
+"""By command: the option for an argument that a message names (:func:`mitsonar.errors.argument`)."""
 
 
 def command_line(*words: object) -> str:
-    """A command of mitsonar that can be pasted into a shell: words with spaces are quoted."""
+    """Return a command of mitsonar that can be pasted into a shell. Words with spaces are quoted."""
     return shlex.join(["mitsonar", *map(str, words)])
 
 
 def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) -> Callable[P, R]:
-    """Answer a mistake with one sentence and exit code 2, and a full disk or Ctrl-C likewise; never with a traceback.
+    """Wrap a command so that errors, a full disk and Ctrl-C end it with one sentence instead of a traceback.
 
     Args:
-        command: what is called.
-        options: what a user types for arguments that messages name; default: those of :data:`OPTIONS`.
+        command: the function of the command.
+        options: by argument, the option that messages name; default: those of :data:`OPTIONS`.
+
+    Returns:
+        The command, which exits with code 2 after an error and with code 130 after Ctrl-C.
     """
     typed = OPTIONS.get(command.__name__, {}) if options is None else options
 
@@ -82,12 +86,12 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
             typer.echo(f"error: {' '.join(error.said(typed).split())}", err=True)
         except ModuleNotFoundError as error:
             typer.echo(f"error: {explain_missing(error)}", err=True)
-        except BrokenPipeError:  # the reader of our output has gone: nothing is wrong here
+        except BrokenPipeError:  # the reader of our output has ended, which is no error
             raise typer.Exit(0) from None
         except OSError as error:
             where = f" ({error.filename})" if error.filename else ""
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-            stays = f"; what is whole on disk stays, {AGAIN}" if full else ""
+            stays = f"; what is whole on disk stays, {RESUME_HINT}" if full else ""
             typer.echo(f"error: {error.strerror or error}{where}{stays}", err=True)
         except MemoryError:
             typer.echo("error: out of memory; ask for less: beams, rays or bins of the sonar, objects of a world", err=True)
@@ -103,16 +107,16 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
     return wrapped
 
 
-def _show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+def _show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     if issubclass(category, MitsonarWarning):
         warn(str(message))
 
 
 def numbers(text: str | None, count: int, what: str) -> list[float] | None:
-    """``count`` numbers between commas; None stays None.
+    """Parse ``count`` numbers that are separated by commas; None stays None.
 
     Raises:
-        MitsonarError: others.
+        MitsonarError: the text is not that many numbers.
     """
     if text is None:
         return None
@@ -121,15 +125,19 @@ def numbers(text: str | None, count: int, what: str) -> list[float] | None:
     except ValueError:
         values = []
     if len(values) != count:
-        raise MitsonarError(f"{what} takes {count} numbers with commas between them: got {text!r}")
+        raise MitsonarError(f"{what} takes {count} numbers, separated by commas: got {text!r}")
     return values
 
 
-def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
-    """KEY=VALUE pairs, values as YAML."""
+def changes_of(pairs: list[str], seed: int | None) -> dict[str, object]:
+    """Parse KEY=VALUE pairs, with values in YAML, and add a seed.
+
+    Raises:
+        MitsonarError: a pair has no key or no ``=``, or its value is not YAML.
+    """
     from mitsonar.io.plain_data import parse_yaml
 
-    changes: dict[str, Any] = {}
+    changes: dict[str, object] = {}
     for pair in pairs:
         key, equals, text = pair.partition("=")
         if not (key and equals):
@@ -143,16 +151,19 @@ def changes_of(pairs: list[str], seed: int | None) -> dict[str, Any]:
 
 @contextmanager
 def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """A bar with rate and time left on standard error, or in a log a line every ten seconds; yields what to call."""
+    """Show progress on standard error: a bar with rate and time left, or without a terminal a line every ten seconds.
+
+    Yields the function to call with how many more are done.
+    """
     if not sys.stderr.isatty():
         yield _Log(what, total, unit)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
     from rich.text import Text
 
     class Rate(ProgressColumn):
-        def render(self, task: Any) -> Text:
+        def render(self, task: Task) -> Text:
             rate = task.finished_speed or task.speed
             return Text(f"{rate:.1f} {unit}/s" if rate else f"- {unit}/s")
 
@@ -163,7 +174,7 @@ def progress_bar(what: str, total: int, unit: str) -> Iterator[Callable[[int], N
 
 
 class _Log:
-    """Progress where there is no terminal."""
+    """Progress without a terminal: a line every ten seconds."""
 
     def __init__(self, what: str, total: int, unit: str, every_s: float = 10.0) -> None:
         self.what, self.total, self.unit, self.every_s = what, total, unit, every_s
@@ -172,7 +183,7 @@ class _Log:
 
     def __call__(self, done: int) -> None:
         now = time.monotonic()
-        if self.done == 0 and now - self.begun < 0.5:  # frames that a resumed run had already
+        if self.done == 0 and now - self.begun < 0.5:  # frames that a resumed run already had
             self.had = done
         self.done += done
         if now - self.said >= self.every_s and self.done > self.had:
@@ -184,27 +195,29 @@ class _Log:
 
 
 class LaterBar:
-    """A progress bar that begins when the length is known."""
+    """A progress bar that begins once its length is known."""
 
     def __init__(self, what: str, unit: str) -> None:
         self.what, self.unit = what, unit
-        self.inner: Any = None
+        self.inner: AbstractContextManager[Callable[[int], None]] | None = None
         self.call: Callable[[int], object] = lambda done: None
 
     def begin(self, total: int, done: int) -> None:
-        """Show the bar, with what is done already."""
+        """Show the bar, with the parts that are done already."""
         self.inner = progress_bar(self.what, total, self.unit)
         self.call = self.inner.__enter__()
         if done:
             self.call(done)
 
     def advance(self, more: int) -> None:
-        """Show that more is done."""
+        """Show that more parts are done."""
         self.call(more)
 
     def __enter__(self) -> LaterBar:
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         if self.inner is not None:
-            self.inner.__exit__(*error)
+            self.inner.__exit__(kind, error, traceback)

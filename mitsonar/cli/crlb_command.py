@@ -1,11 +1,11 @@
-"""``mitsonar crlb``: how well a motion can be known at all, of a scene, sonar and noise, or of a data set."""
+"""``mitsonar crlb``: the Cramer-Rao lower bound of motions, for a scene, sonar and noise, or for a data set."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 
@@ -20,41 +20,65 @@ if TYPE_CHECKING:
 __all__ = ["crlb"]
 
 
+class _PosesAsked(TypedDict):
+    """Options that define the poses in a scene."""
+
+    start: str | None
+    end: str | None
+    count: int | None
+    file: Path | None
+    frame: str
+
+
 @answered
 def crlb(
     source: Annotated[
         str, typer.Argument(metavar="SCENE|DATA.zarr", help="Mitsuba XML file, a shipped scene's name, or a data set.")
     ],
-    noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "high",
+    noise: Annotated[
+        str, typer.Option(help="Noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file.")
+    ] = "high",
     start: Annotated[str | None, typer.Option("--from", help=f"Pose: {SIX}.")] = None,
-    end: Annotated[str | None, typer.Option("--to", help="Last pose: --poses are spread from --from to it.")] = None,
-    poses: Annotated[int | None, typer.Option(help="How many poses (default: 1; of a trajectory 20).")] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", help="Last pose. The --poses are evenly spaced from --from to this one.")
+    ] = None,
+    poses: Annotated[int | None, typer.Option(help="Number of poses (default: 1; of a trajectory 20).")] = None,
     trajectory: Annotated[Path | None, typer.Option(help="Poses of a TUM or CSV file, or `shipped`.")] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
-    model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
-    segments: Annotated[str | None, typer.Option(help="Portions of a looking-down sonar's view: q1,q2,q3,q4.")] = None,
-    height: Annotated[float | None, typer.Option(help="Height over the ground [m]; the window follows the floor.")] = None,
-    pairs: Annotated[int, typer.Option(help="Of a data set: how many pairs, each of a sequence of its own.")] = 20,
+    model: Annotated[str | None, typer.Option(help="Model of the echo level: physical or thesis.")] = None,
+    segments: Annotated[
+        str | None, typer.Option(help="Portions of the view of a sonar that looks down: q1,q2,q3,q4.")
+    ] = None,
+    height: Annotated[
+        float | None, typer.Option(help="Height over the ground [m]. The range window follows the floor.")
+    ] = None,
+    pairs: Annotated[int, typer.Option(help="Of a data set: number of pairs, one a sequence.")] = 20,
     part: Annotated[
-        str | None, typer.Option(help="Of a data set: train, validation, test (default where it is), all.")
+        str | None, typer.Option(help="Of a data set: train, validation, test (default if the split has one) or all.")
     ] = None,
     vary: Annotated[
         str | None, typer.Option(help="NAME=V1,V2,...: height_m, pitch_deg, azimuth_fov_deg, beams, window=3.2..5.6 ...")
     ] = None,
     gain: Annotated[float | None, typer.Option(help="Constant gain (default: the data set's, or from the frames).")] = None,
-    pings: Annotated[int | None, typer.Option(help="Of each half of the derivatives (default: as needed).")] = None,
+    pings: Annotated[
+        int | None, typer.Option(help="Pings in each half of the derivatives (default: as many as needed).")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the rays.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="PNG: the bound against the variable, or pose by pose.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    plot: Annotated[
+        Path | None, typer.Option(help="PNG to write: the bound against the variable, or for each pose.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
 ) -> None:
-    """The Cramer-Rao bound of sideways, forward and yaw between two pings, by an exact renderer of the scene.
+    """Compute the Cramer-Rao lower bound of sideways, forward and yaw between two pings, from derivatives of the renderer.
 
-    One frame: against an oracle that knows scene and pose. Two frames: both noisy, relief known. Laws: `pixel`, the exact
-    one of clipped, rounded pixels; `gaussian`, of the same mean and variance; `rays`, with the noise of a ping's own rays.
-    With --vary the gain is set anew for each value, and where height, pitch or a field of view change both ends of the
-    window follow the nearest and farthest range of the floor, with as many bins.
+    One frame: scene and first pose are known. Two frames: both are noisy, and the relief is known. Distributions: `pixel`,
+    the exact one of clipped, rounded pixels; `gaussian`, with the same mean and variance; `rays`, with the noise of the
+    rays of a ping.
+
+    With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
+    window follow the nearest and farthest range of the floor. The number of bins stays.
     """
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.estimation.crlb.crlb_report import bounds_of_subject, report_lines, report_of
@@ -64,17 +88,15 @@ def crlb(
     added, name, values = load_noise(noise), *_variable(vary)
     if height is not None and not height > 0:
         raise MitsonarError(f"--height must be above 0: got {height:g} m")
-    flown = {"start": start, "end": end, "count": poses, "file": trajectory}
+    asked_poses: _PosesAsked = {"start": start, "end": end, "count": poses, "file": trajectory, "frame": frame}
     convention_named(frame)
     if Path(source).suffix == ".zarr" or "://" in source:
-        scene_only = {**flown, "--sonar": sonar, "--model": model, "--segments": segments, "-D": parameter}
-        if any(value is not None for value in scene_only.values()):
-            raise MitsonarError(f"{source} is a data set, which says sonar, poses and segments itself: give none of them")
+        scene_only = (start, end, poses, trajectory, sonar, model, segments, parameter)
+        if any(value is not None for value in scene_only):
+            raise MitsonarError(f"{source} is a data set, which has its own sonar, poses and segments: give none of them")
         subject = subject_of_data(source, pairs, part=part, gain=gain, seed=seed)
     else:
-        subject = _of_scene(
-            source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), {**flown, "frame": frame}
-        )
+        subject = _of_scene(source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), asked_poses)
     if name is not None and gain is None:
         subject = replace(subject, gain=None)
     rows: list[tuple[Value | None, Table]] = []
@@ -96,17 +118,17 @@ def crlb(
         say(line)
     if added.scale == 0:
         warn(
-            "echoes without noise tell the motion without limit (law `pixel`: -); `gaussian` counts rounding to grey values "
-            "as variance 1 / (12 255^2), `rays` also the noise of a ping's own rays"
+            "without noise the echoes determine the motion without limit (`pixel`: -); `gaussian` counts rounding as "
+            "variance 1 / (12 255^2), `rays` adds the noise of the rays of a ping"
         )
     if any(row["not_observable"] for row in report["rows"]):
-        warn("inf: an axis cannot be observed, or so little that noise of the rays hides it: raise --pings to know")
+        warn("inf: an axis is not observable, or the noise of the rays hides it: raise --pings to distinguish the two")
     if plot is not None:
         say(f"picture: {plot}")
 
 
 def _variable(text: str | None) -> tuple[str | None, list[Value]]:
-    """NAME=V1,V2,..."""
+    """Parse ``NAME=V1,V2,...``; of ``window`` the values are intervals."""
     from mitsonar.errors import nearest_names
     from mitsonar.estimation.crlb.image_crlb import VARIABLES
 
@@ -136,14 +158,14 @@ def _of_scene(
     segments: str | None,
     gain: float | None,
     parameters: dict[str, str],
-    flown: dict[str, Any],
+    poses: _PosesAsked,
 ) -> Subject:
-    """The poses in one scene that the options say."""
+    """Load a scene and the poses that the options define."""
     from mitsonar.estimation.crlb.crlb_subject import subject_of_scene
     from mitsonar.simulation.scene import load_scene
 
     loaded = load_scene(source, **parameters)
     instrument, attitude = _instrument(loaded, sonar, model, seed)
-    count = flown["count"] or (20 if flown["file"] else None)
-    path = _path(instrument, attitude, source, count, flown["start"], flown["end"], flown["file"], flown["frame"])
+    count = poses["count"] or (20 if poses["file"] else None)
+    path = _path(instrument, attitude, source, count, poses["start"], poses["end"], poses["file"], poses["frame"])
     return subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [], gain=gain)

@@ -1,4 +1,4 @@
-"""``mitsonar dataset``: make labelled data sets, look at them, check them."""
+"""``mitsonar dataset``: make, show and check labelled data sets."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s
 
 
 def datasets() -> typer.Typer:
-    """The group of commands."""
-    app = typer.Typer(help="Make labelled data sets, look at them, check them.", no_args_is_help=True)
+    """Create the group of commands."""
+    app = typer.Typer(help="Make, show and check labelled data sets.", no_args_is_help=True)
     for command in (make, info, show, check, recipes):
         app.command()(command)
     return app
@@ -30,17 +30,19 @@ def datasets() -> typer.Typer:
 def make(
     recipe: Annotated[str, typer.Argument(help="Name of a shipped recipe (`mitsonar dataset recipes`), or a YAML file.")],
     out: Annotated[
-        str, typer.Option("-o", "--out", help="Folder or URL (s3://...) of the data set; made, or gone on with.")
+        str, typer.Option("-o", "--out", help="Folder or URL (s3://...) of the data set; a stopped one is resumed.")
     ],
-    sequences: Annotated[int | None, typer.Option(help="Only so many sequences.")] = None,
-    scale: Annotated[float | None, typer.Option(help="Only this part of the sequences, 0..1.")] = None,
+    sequences: Annotated[int | None, typer.Option(help="Number of sequences (default: the recipe's).")] = None,
+    scale: Annotated[float | None, typer.Option(help="Part of the recipe's sequences to make, 0..1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of worlds, flights and jitter (default: the recipe's).")] = None,
     workers: Annotated[int | None, typer.Option(help="Processes on this machine (default: its cores).")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler that runs: its workers render.")] = None,
-    change: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the recipe: sonar.range_bins=256.")] = None,
-    verify: Annotated[bool, typer.Option("--verify", help="Read all that is there and make again what is damaged.")] = False,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a running dask scheduler, whose workers render.")] = None,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: sonar.range_bins=256.")
+    ] = None,
+    verify: Annotated[bool, typer.Option("--verify", help="Read all stored shards and make damaged ones anew.")] = False,
 ) -> None:
-    """Make a data set. Killed at any moment, the same command goes on and ends with the same bytes."""
+    """Make a data set. After a stop at any moment the same command resumes and ends with the same bytes."""
     from mitsonar.config.data_recipe import load_recipe
     from mitsonar.datasets.generation import make_dataset
 
@@ -55,9 +57,9 @@ def make(
         raise MitsonarError(f"--workers must be at least 1: got {workers}")
     if workers is not None and scheduler is not None:
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
-    crew = len(os.sched_getaffinity(0)) if workers is None else workers
+    processes = len(os.sched_getaffinity(0)) if workers is None else workers
     bar = LaterBar("rendering", "frames")
-    words = {"sequences": sequences, "workers": crew, "scheduler": scheduler, "verify": verify}
+    words = {"sequences": sequences, "workers": processes, "scheduler": scheduler, "verify": verify}
     try:
         with bar:
             made = make_dataset(described, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
@@ -69,14 +71,14 @@ def make(
         warn(sentence)
     there = made.shards - made.made
     say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
-    say(f"look at it: {command_line('dataset', 'show', made.url)}")
+    say(f"show it: {command_line('dataset', 'show', made.url)}")
 
 
 @answered
 def info(
     data: Data,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
-    recipe: Annotated[bool, typer.Option("--recipe", help="The recipe as YAML.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    recipe: Annotated[bool, typer.Option("--recipe", help="Print the recipe as YAML.")] = False,
 ) -> None:
     """Print what a data set holds: frames, arrays, levels against noise, versions."""
     import yaml
@@ -115,12 +117,12 @@ def info(
 def show(
     data: Data,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Picture to write (default: NAME.png in this folder).")
+        Path | None, typer.Option("-o", "--out", help="PNG to write (default: NAME.png in the current folder).")
     ] = None,
-    samples: Annotated[int, typer.Option(min=1, max=16, help="Samples to draw.")] = 4,
-    view: Annotated[str | None, typer.Option(help="Which view (default: the first).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Which samples.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there.")] = False,
+    samples: Annotated[int, typer.Option(min=1, max=16, help="Number of samples to draw.")] = 4,
+    view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the choice of samples.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
 ) -> None:
     """Draw a sheet of sample pairs with labels, the distribution of the labels, and the mean image."""
     import io
@@ -143,7 +145,7 @@ def show(
 
 @answered
 def check(data: Data) -> None:
-    """Verify checksums, counts, ranges, and that labels follow from poses. Reads everything, changes nothing."""
+    """Verify checksums, counts, ranges, and that labels agree with poses. All data are read and none changed."""
     from mitsonar.datasets.data_check import check as find_faults
     from mitsonar.datasets.store import DataStore
 
@@ -154,17 +156,17 @@ def check(data: Data) -> None:
         say(fault)
     if faults:
         raise MitsonarError(
-            f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it goes on where it stopped, and with "
-            "--verify makes again what is damaged; empty frames stay until the recipe is another"
+            f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it resumes where it stopped, and with "
+            "--verify makes damaged shards anew; empty frames stay until the recipe changes"
         )
     say(f"{len(store):,} frames in {store.shards} shards: all is well")
 
 
 @answered
 def recipes(
-    name: Annotated[str | None, typer.Argument(help="One recipe: print its YAML, to start your own from.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Print the YAML of this recipe, to start your own from.")] = None,
 ) -> None:
-    """Print the recipes that are shipped, or one of them."""
+    """Print the shipped recipes, or one of them."""
     from mitsonar.config.data_recipe import load_recipe, shipped_recipes
 
     if name is not None:

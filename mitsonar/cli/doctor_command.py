@@ -1,4 +1,4 @@
-"""``mitsonar doctor``: is everything here, and does it compute what it should?"""
+"""``mitsonar doctor``: check the installation and its results."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def doctor() -> None:
 
 
 def _check_sphere() -> None:
-    """Inside a sphere of 10 m every range is 10 m and every cosine 1."""
+    """Check that inside a sphere of 10 m every range is 10 m and every cosine 1."""
     import mitsuba as mi
     import numpy as np
 
@@ -49,12 +49,12 @@ def _check_sphere() -> None:
     say(f"inside a 10 m sphere: largest error of range (m) and cosine {error:.1e}")
     if not (echoes.hit.all() and error < 1e-5):
         raise MitsonarError(
-            f"inside a 10 m sphere range or cosine is off by {error:.1e}, allowed 1e-5: do not trust results"
+            f"inside a 10 m sphere range or cosine is off by {error:.1e}, allowed 1e-5: results are wrong on this machine"
         )
 
 
 def _check_floor() -> None:
-    """The energy of a flat floor, C H (1 / R^3) integrated over the fan, and the rate at which it is rendered."""
+    """Check the energy of a flat floor, C H (1 / R^3) integrated over the fan, and measure the rate of rendering."""
     import mitsuba as mi
     import numpy as np
 
@@ -82,7 +82,9 @@ def _check_floor() -> None:
     rate = len(poses) * sonar.rays / (time.perf_counter() - start)
     say(f"rays traced and binned a second: {rate / 1e6:.1f} million ({rate / sonar.rays:.0f} pings of {sonar.rays:,})")
     if error > 1e-4:
-        raise MitsonarError(f"the flat floor's energy is off by {error:.1e}, allowed 1e-4: trust nothing")
+        raise MitsonarError(
+            f"the flat floor's energy is off by {error:.1e}, allowed 1e-4: results are wrong on this machine"
+        )
 
 
 def _version(package: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -26,24 +26,25 @@ def evaluate(
     noise: Annotated[
         str | None,
         typer.Option(
-            help="Levels with commas between them (or ; where one is m,s,g): none, low, high, a YAML file; of impulse "
-            "responses none, 20 dB ... Default: none,low,high; of responses none."
+            help="Levels of noise, separated by commas (by ; if one is m,s,g): none, low, high, a YAML file; for impulse "
+            "responses none, 20 dB ... (default: none,low,high; for impulse responses none)."
         ),
     ] = None,
     part: Annotated[
-        str | None, typer.Option(help="train, validation, test (default where it is), all; dealt out as in training.")
+        str | None, typer.Option(help="train, validation, test (default if the split has one) or all, split as in training.")
     ] = None,
-    pairs: Annotated[int | None, typer.Option(min=1, help="At most so many, each of a sequence of its own.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Also with another sonar than that of training.")] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise, choice of pairs and bootstrap.")] = 0,
+    pairs: Annotated[int | None, typer.Option(min=1, help="Largest number of pairs, one a sequence.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Allow another sonar than that of training.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, choice of pairs and bootstrap.")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Pairs at a time.")] = 16,
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder for table.md and table.json.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace tables that are there.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print for programs.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing tables.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Errors of a trained network beside always answering zero; bootstrap by scene, then sequence.
+    """Evaluate a trained network beside always answering zero. Bootstrap by scene, then sequence.
 
-    `large` is the RMSE of motions beyond half the largest (10..20 mm of 20), `as in the thesis` has yaw in 1/100 deg.
+    `large` is the RMSE of motions beyond half the largest (10..20 mm of 20). `as in the thesis` (Almanza-Medina) has yaw
+    in 1/100 deg.
     """
     checkpoint = checkpoint_from(run)
     from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
@@ -53,13 +54,16 @@ def evaluate(
     if out is not None:
         refuse_tables(out, overwrite=overwrite)
     levels = None if noise is None else list(dict.fromkeys(noise.split(";" if ";" in noise else ",")))
-    words: dict[str, Any] = {"part": part, "pairs": pairs, "force": force, "seed": seed, "batch": batch}
     with ExitStack() as bar:
         report = evaluated(
             checkpoint,
             data,
             noise=levels,
-            **words,
+            part=part,
+            pairs=pairs,
+            force=force,
+            seed=seed,
+            batch=batch,
             begin=lambda count: bar.enter_context(progress_bar("evaluating", count, "pairs")),
         )
     report = {"run": run, **report}
@@ -83,10 +87,10 @@ def evaluate(
 
 
 def checkpoint_from(run: str) -> Checkpoint:
-    """The checkpoint that the command line names.
+    """Load the checkpoint that the command line names.
 
     Raises:
-        MitsonarError: no torch, or no checkpoint there that can be used.
+        MitsonarError: torch is missing, or there is no usable checkpoint.
     """
     from mitsonar.networks.checkpoint import Checkpoint
 

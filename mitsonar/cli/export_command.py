@@ -17,18 +17,18 @@ __all__ = ["export"]
 @answered
 def export(
     run: Run,
-    onnx: Annotated[Path, typer.Option("--onnx", help="File to write, .onnx.")],
+    onnx: Annotated[Path, typer.Option("--onnx", help="The .onnx file to write.")],
     batch: Annotated[str, typer.Option(help="Samples at a time: a number, or `dynamic`.")] = "1",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a network with its weights as ONNX; what its numbers mean stands in the file's metadata."""
+    """Write a network with its weights as ONNX. The metadata of the file define inputs and outputs."""
     from mitsonar.io.run_directory import refuse_to_replace
     from mitsonar.io.whole_files import write_whole
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
         raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}{meant(batch, ['dynamic'])}")
     if onnx.suffix.lower() != ".onnx" or not onnx.parent.is_dir():
-        raise MitsonarError(f"--onnx must name an .onnx file in a folder that is there: got {onnx}")
+        raise MitsonarError(f"--onnx must name an .onnx file in an existing folder: got {onnx}")
     refuse_to_replace(onnx, overwrite=overwrite, option="--onnx")
     checkpoint = checkpoint_from(run)
     from mitsonar.networks.onnx_export import onnx_of

@@ -1,4 +1,4 @@
-"""``mitsonar height``: how high the sonar is over the ground in each frame, from the frames alone."""
+"""``mitsonar height``: estimate the height over the ground of each frame, from the frames alone."""
 
 from __future__ import annotations
 
@@ -23,24 +23,26 @@ if TYPE_CHECKING:
 __all__ = ["height"]
 
 AT_ONCE = 8
-"""Frames that are read at a time."""
+"""Number of frames that are read at a time."""
 
 
 @answered
 def height(
     frames: Frames,
-    by: Annotated[str, typer.Option(help="direct, or a checkpoint that was trained on heights.")] = "direct",
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="CSV file to write, a line a frame.")] = None,
-    pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
-    sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
-    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first; of portions: whole, or all).")] = None,
-    noise: Annotated[str, typer.Option(help="Added: none, low, high, m,s,g or a YAML file.")] = "none",
-    seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there.")] = False,
+    by: Annotated[str, typer.Option(help="Estimator: direct, or a checkpoint that was trained on heights.")] = "direct",
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="CSV file to write, one line a frame.")] = None,
+    pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
+    sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
+    view: Annotated[
+        str | None, typer.Option(help="View of a data set (default: the first; of portions: whole, or all).")
+    ] = None,
+    noise: Annotated[str, typer.Option(help="Noise to add: none, low, high, m,s,g or a YAML file.")] = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Tell the height over the ground from first return and fall-off, or by a network; beside it the true one, where known.
+    """Estimate the height over the ground from first return and fall-off, or by a network, and compare it with the truth.
 
-    `mitsonar odometry --height-by` gives estimators the heights found like this.
+    `mitsonar odometry --height-by` passes such heights to the estimators of motion.
     """
     from mitsonar.estimation.height.named_height_estimators import height_estimator_from
     from mitsonar.mapping.height_tables import heights_csv, heights_lines
@@ -58,32 +60,38 @@ def height(
         raise MitsonarError(f"--view is not for {by}, which reads {', '.join(estimator.views)}: leave it out")
     if portions is not None:
         if pitch_deg is not None:
-            raise MitsonarError("--pitch-deg is for frames without poses: a data set tells them")
+            raise MitsonarError("--pitch-deg is for frames without poses: a data set has poses")
         source = views_for(frames, *portions, reading)
     else:
         source = frames_for(frames, reading)
     if source.note:
         say(source.note)
-    said: list[HeightEstimate] = []
+    estimates: list[HeightEstimate] = []
     with progress_bar("measuring", len(source), "frames") as progress:
         for first in range(0, len(source), AT_ONCE):
             here = np.arange(first, min(first + AT_ONCE, len(source)))
-            said += measured(source.read(here), estimator)[1]
+            estimates += measured(source.read(here), estimator)[1]
             progress(len(here))
     true = None if source.sonar_poses is None else source.sonar_poses[:, 2]
     if out is not None:
-        write_whole(out, heights_csv(source.time_s, said, true).encode())
-    for line in heights_lines(said, true):
+        write_whole(out, heights_csv(source.time_s, estimates, true).encode())
+    for line in heights_lines(estimates, true):
         say(line)
-    lost = sum(not one.valid for one in said)
-    given = estimator.inputs if pitch_deg is None else f"pitch {pitch_deg:g} deg as told, which the frames cannot check"
-    say(f"{len(said):,} frames by {by} ({given}), {lost:,} not believed" + (f", in {out}" if out is not None else ""))
-    if lost == len(said):
-        warn("no height was found: check the pitch, and that the window shows ground; frames need echoes that fall off")
+    lost = sum(not one.valid for one in estimates)
+    given = (
+        estimator.inputs
+        if pitch_deg is None
+        else f"pitch {pitch_deg:g} deg from the command line, which the frames cannot verify"
+    )
+    say(f"{len(estimates):,} frames by {by} ({given}), {lost:,} invalid" + (f", in {out}" if out is not None else ""))
+    if lost == len(estimates):
+        warn(
+            "no height was found: check the pitch, and that the window shows ground; the estimate needs echoes that fall off"
+        )
 
 
 def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | None:
-    """Views and their kind, of a data set that holds vectors alone, or portions of a view; None elsewhere."""
+    """Return views and their kind, of a data set of vectors alone or of portions of a view; else None."""
     from mitsonar.config.data_recipe import array_names
     from mitsonar.datasets.store import DataStore
     from mitsonar.mapping.frame_source import is_data_set

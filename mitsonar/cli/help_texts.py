@@ -1,27 +1,44 @@
-"""Help texts as they are written: rich takes ``[m]`` for markup and would leave it out."""
+"""Help texts with square brackets, such as ``[m]``, which rich would take for markup and omit."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
 
 from rich.markup import escape
 
 __all__ = ["with_plain_brackets"]
 
 
-def with_plain_brackets(command: Any) -> Any:
-    """Escape brackets in the help of a command, of its options, and of the commands in it that are there already.
+class Helpful(Protocol):
+    """What a Click command has, in Click itself and in Typer's copy of it."""
 
-    A group that makes its commands when they are asked for calls this itself.
+    help: str | None
+
+    @property
+    def params(self) -> Sequence[object]:
+        """Return the options and arguments."""
+
+
+AnyCommand = TypeVar("AnyCommand", bound=Helpful)
+
+
+def with_plain_brackets(command: AnyCommand) -> AnyCommand:
+    """Escape brackets in the help of a command, of its options, and of its existing subcommands.
+
+    A group that creates its commands on demand calls this itself.
 
     Args:
-        command: Click's, as :func:`typer.main.get_command` makes it; it is changed and returned.
+        command: a Click command of :func:`typer.main.get_command`. It is changed.
+
+    Returns:
+        The same command.
     """
     command.help = command.help and escape(command.help)
     for parameter in command.params:
         text = getattr(parameter, "help", None)
         if text:
-            parameter.help = escape(text)
+            parameter.help = escape(text)  # type: ignore[attr-defined]  # arguments have help in Typer only
     for inner in getattr(command, "commands", {}).values():
         with_plain_brackets(inner)
     return command

@@ -1,4 +1,4 @@
-"""``mitsonar image``: stored echoes are binned again, without tracing."""
+"""``mitsonar image``: bin stored echoes into new frames, without tracing."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ __all__ = ["image"]
 
 @answered
 def image(
-    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run rendered with --exr.")],
-    bins: Annotated[int | None, typer.Option(help="Range bins (default: as rendered).")] = None,
-    window: Annotated[str | None, typer.Option("--range", help="Window from,to in m (default: as rendered).")] = None,
-    noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
+    run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run that was rendered with --exr.")],
+    bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
+    window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
+    noise: Annotated[
+        str, typer.Option(help="Noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file.")
+    ] = "none",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
-    cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
+    cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame with axes in metres.")] = False,
     frame: Frame = "mitsonar",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
 ) -> None:
-    """Bin the echoes of a run again: other bins, another window, other noise."""
+    """Bin the stored echoes of a run into new frames, with other bins, another window or other noise."""
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.motion.conventions import convention_named
     from mitsonar.simulation.render_run import Outputs, StoredEchoes, run

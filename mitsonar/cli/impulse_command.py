@@ -1,4 +1,4 @@
-"""``mitsonar impulse``: a scene becomes complex channel impulse responses on disk."""
+"""``mitsonar impulse``: simulate complex channel impulse responses of a scene."""
 
 from __future__ import annotations
 
@@ -29,10 +29,13 @@ def impulse(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE-impulse).")] = None,
     velocity: Annotated[
         str | None,
-        typer.Option(help="vx,vy of the vehicle, starboard and forward in m/s; vx,vy,turn with deg/s to starboard."),
+        typer.Option(
+            help="Velocity vx,vy to starboard and forward [m/s], or vx,vy,turn with the turn to starboard [deg/s]."
+        ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Number of pings (default: 1); with --trajectory: at even times over all of it.")
+        int | None,
+        typer.Option(help="Number of pings (default: 1); with --trajectory evenly spaced in time over all of it."),
     ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     trajectory: Annotated[
@@ -40,15 +43,18 @@ def impulse(
     ] = None,
     frame: Frame = "mitsonar",
     model: Annotated[
-        str | None, typer.Option(help="scatterers (of the world) or rays (of the vehicle, the thesis's).")
+        str | None,
+        typer.Option(help="scatterers (fixed in the world) or rays (fixed to the vehicle, as in Almanza-Medina)."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of where scatterers lie.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: carrier_hz=160e3.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the positions of scatterers.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3.")
+    ] = None,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
 ) -> None:
-    """Measure channels: responses.npz, responses.zarr, response.png and waterfall.png in the folder OUT."""
+    """Simulate channels, and write responses.npz, responses.zarr, response.png and waterfall.png into the folder OUT."""
     from mitsonar.io.provenance import file_digest
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.impulse_run import iteration_error, run_impulse
@@ -76,8 +82,8 @@ def impulse(
     )
     still, twice = iteration_error(flown, speeds, sonar)
     say(
-        f"motion while sound travels turns the carrier by up to {still:.3g} turns at {sonar.range_max:g} m, which is "
-        f"counted exactly (the thesis's two rounds would leave {twice:.2g})"
+        f"motion during the travel of sound changes the phase by up to {still:.3g} turns at {sonar.range_max:g} m, which is "
+        f"counted exactly (two iterations, as in Almanza-Medina, would leave {twice:.2g})"
     )
     say(f"figures: {folder / 'response.png'}, {folder / 'waterfall.png'}")
 
@@ -85,7 +91,7 @@ def impulse(
 def _instrument(
     found: tuple[ChannelSonar, Pose] | None, model: str | None, seed: int | None, changes: list[str]
 ) -> tuple[ChannelSonar, Pose | None]:
-    """The instrument to use and the pose that the scene gives it; without one in the scene, the thesis's."""
+    """Return the instrument with its changes, and its pose in the scene; by default the instrument of Almanza-Medina."""
     from mitsonar.instruments.channel_sonar import ChannelSonar
 
     sonar, attitude = found if found is not None else (ChannelSonar(name="thesis"), None)
@@ -96,14 +102,14 @@ def _instrument(
             raise MitsonarError(f"--set takes KEY=VALUE: got {pair!r}")
         if key == "transmitter":
             raise MitsonarError(f"fields of view are set in the scene, or in Python, not by --set: got {pair!r}")
-        fields[key] = _listening(sonar, value) if key == "receivers" else value
+        fields[key] = _receivers(sonar, value) if key == "receivers" else value
     fields |= {} if model is None else {"model": model}
     fields |= {} if seed is None else {"seed": seed}
     return sonar.replace(**fields), attitude
 
 
-def _listening(sonar: ChannelSonar, names: str) -> list[dict[str, Any]]:
-    """Some of an instrument's receivers."""
+def _receivers(sonar: ChannelSonar, names: str) -> list[dict[str, object]]:
+    """Return the named receivers of an instrument."""
     known = {one.name: one for one in sonar.receivers}
     wanted = [name.strip() for name in names.split(",")]
     for name in wanted:
@@ -124,7 +130,7 @@ def _path(
     path: str | None,
     frame: str,
 ) -> tuple[Trajectory, NDArray[np.float64]]:
-    """Poses and velocities that the options say."""
+    """Return the poses and velocities that the options define."""
     import numpy as np
 
     from mitsonar.motion.composition import steady
@@ -146,7 +152,7 @@ def _path(
         named = path in COURSES or not Path(path).suffix
         flown = course(path, begin or Pose(0.0, 0.0, 10.0)) if named else Trajectory.load(path, frame, looks_ahead=False)
         speeds = velocities(flown)
-        if frames is not None:  # fewer pings do not make the vehicle cut corners
+        if frames is not None:  # velocities are of the full trajectory
             few = flown.resample(frames)
             speeds = np.stack([np.interp(few.time_s, flown.time_s, column) for column in speeds.T], axis=1)
             flown = few
@@ -160,5 +166,5 @@ def _path(
     count = 2 if velocity is None else velocity.count(",") + 1
     speed = [*(numbers(velocity, count, "--velocity (m/s, m/s, deg/s)") or [0.0, 0.0]), 0.0][:3]
     if velocity is None and (frames or 1) > 1:
-        warn("the vehicle stands still, so that all pings are alike: give --velocity vx,vy in m/s, or --trajectory")
+        warn("the vehicle stands still, and all pings are alike: give --velocity vx,vy in m/s, or --trajectory")
     return steady(begin, (speed[0], speed[1], math.radians(speed[2])), frames or 1, sonar.frame_rate_hz)

@@ -1,4 +1,4 @@
-"""``mitsonar mosaic``: frames and a path become a map of the ground."""
+"""``mitsonar mosaic``: a map of the ground from frames and a path."""
 
 from __future__ import annotations
 
@@ -31,24 +31,32 @@ __all__ = ["mosaic"]
 def mosaic(
     frames: Frames,
     trajectory: Annotated[
-        str, typer.Argument(help="TUM or CSV file, the folder of an odometry, or `true`: where the frames say they were.")
+        str,
+        typer.Argument(help="Path: a TUM or CSV file, the folder of an odometry, or `true` for the poses in the frames."),
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="OUT.png, a figure, and OUT.quality.png; or OUT.tif, a GeoTIFF.")],
-    cell_mm: Annotated[float, typer.Option(help="Edge of a cell of the map.")] = 10.0,
-    blend: Annotated[str, typer.Option(help="weighted: all beams; centre: the plain mean of the middle ones.")] = "weighted",
-    centre_beams: Annotated[int, typer.Option(help="How many, for centre.")] = 24,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", help="OUT.png for figures of the map and its quality (OUT.quality.png), or OUT.tif for a GeoTIFF."
+        ),
+    ],
+    cell_mm: Annotated[float, typer.Option(help="Cell size of the map [mm].")] = 10.0,
+    blend: Annotated[
+        str, typer.Option(help="weighted: all beams; centre: the plain mean of the middle beams.")
+    ] = "weighted",
+    centre_beams: Annotated[int, typer.Option(help="Number of middle beams for `centre`.")] = 24,
     flatten: Annotated[
-        bool, typer.Option("--flatten/--no-flatten", help="Take out how the sonar lights the ground.")
+        bool, typer.Option("--flatten/--no-flatten", help="Compensate the illumination of the ground.")
     ] = True,
-    true: Annotated[Path | None, typer.Option(help="TUM or CSV file of the true path, to be drawn too.")] = None,
+    true: Annotated[Path | None, typer.Option(help="TUM or CSV file of the true path, which is drawn too.")] = None,
     frame: Frame = "mitsonar",
-    height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
-    pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
-    sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
-    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first).")] = None,
-    noise: Annotated[str, typer.Option(help="Added to the frames: none, low, high, m,s,g or a YAML file.")] = "none",
-    seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")] = False,
+    height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
+    pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
+    sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
+    view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
+    noise: Annotated[str, typer.Option(help="Noise to add: none, low, high, m,s,g or a YAML file.")] = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
     from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
@@ -56,19 +64,19 @@ def mosaic(
 
     quality = _checked_out(out, true, overwrite)
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
-    paths, told_height = _paths(trajectory, true, frame)
+    paths, path_height = _paths(trajectory, true, frame)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
     source = frames_for(frames, Reading(sequence, view, noise, seed, height, pitch))
     if source.note:
         say(source.note)
-    if source.height_m is None and told_height is not None:
-        source = source.with_geometry(told_height)
+    if source.height_m is None and path_height is not None:
+        source = source.with_geometry(path_height)
     if source.height_m is None:
-        raise MitsonarError(f"{source.name} does not tell how high the sonar is over the ground: give --height")
+        raise MitsonarError(f"{source.name} holds no height over the ground: give --height")
     if trajectory == "true":
         if source.true is None:
             raise MitsonarError(
-                f"{source.name} does not tell where the sonar was: give a TUM or CSV file, or an odometry's folder"
+                f"{source.name} does not state where the sonar was: give a TUM or CSV file, or an odometry's folder"
             )
         paths = {"true": source.true}
     laid_along = next(iter(paths))
@@ -106,7 +114,7 @@ def mosaic(
 
 
 def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
-    """Where the quality goes, if it has a file of its own; nothing that is there is in the way."""
+    """Check the file to write, and return the file of the quality, if there is one."""
     kind = out.suffix.lower()
     if kind not in (".png", ".tif", ".tiff"):
         raise MitsonarError(f"-o must name a .png, .tif or .tiff file: got {out}")
@@ -120,7 +128,7 @@ def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
 
 
 def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Trajectory], float | None]:
-    """Paths by name, the one to lay frames along first, and the height that an odometry was told."""
+    """Load the paths by name, first the one of the map, and the height that an odometry was given."""
     from mitsonar.mapping.odometry_run import OdometryFolder
     from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.trajectory import Trajectory
@@ -149,7 +157,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
 
 
 def _spread(count: int) -> NDArray[np.intp]:
-    """Which frames tell the illumination."""
+    """Choose the frames that the illumination is estimated from."""
     from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES
 
     return np.unique(np.linspace(0, count - 1, min(ILLUMINATION_FRAMES, count)).astype(np.intp))

@@ -1,11 +1,11 @@
-"""``mitsonar odometry``: frames become the path that the sonar took."""
+"""``mitsonar odometry``: estimate the path of the sonar from its frames or impulse responses."""
 
 from __future__ import annotations
 
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -19,7 +19,7 @@ Frames = Annotated[
     str, typer.Argument(metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, or a data set.")
 ]
 PAIRS_A_WORKER = 50
-"""Fewer do not pay for starting a process."""
+"""Smallest number of pairs that is worth a process."""
 
 
 @answered
@@ -34,39 +34,43 @@ def odometry(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, corrnet, or a network's checkpoint; NAME:key=value:key=value; several "
-            "checkpoints with commas: the one trained nearest to the height; of impulse responses: zero, correlation, "
-            "likelihood."
+            help="zero, ecc, flow, phase, direct, corrnet, or a checkpoint; NAME:key=value:key=value. Of several "
+            "checkpoints, separated by commas, the one trained nearest to the height is used. For impulse responses: "
+            "zero, correlation, likelihood."
         ),
     ] = None,
-    smooth: Annotated[
-        str, typer.Option(help="none, spline or kalman; motions that are not believed are bridged anyway.")
-    ] = "none",
-    scale: Annotated[str | None, typer.Option(help="Factors for sideways,forward,yaw, or `fit` to the true path.")] = None,
-    every: Annotated[int, typer.Option(help="Use every so many frames only.")] = 1,
+    smooth: Annotated[str, typer.Option(help="none, spline or kalman. Invalid motions are bridged in any case.")] = "none",
+    scale: Annotated[str | None, typer.Option(help="Factors of sideways,forward,yaw, or `fit` to the true path.")] = None,
+    every: Annotated[int, typer.Option(help="Step between the frames that are used.")] = 1,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX} (default: the true one, or 0).")] = None,
     frame: Frame = "mitsonar",
-    height: Annotated[float | None, typer.Option(help="Over the ground [m], for frames that lack it.")] = None,
+    height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
     height_by: Annotated[
-        str | None, typer.Option(help="Measure it in each frame: direct, or a checkpoint that was trained on heights.")
+        str | None,
+        typer.Option(help="Estimator of the height of each frame: direct, or a checkpoint that was trained on heights."),
     ] = None,
-    pitch_deg: Annotated[float | None, typer.Option(help="Pitch, > 0 looks down, for frames without poses.")] = None,
-    sequence: Annotated[int | None, typer.Option(help="Of a data set (default: the longest).")] = None,
-    view: Annotated[str | None, typer.Option(help="Of a data set (default: the first).")] = None,
+    pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
+    sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
+    view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
     noise: Annotated[
-        str, typer.Option(help="Added: none, low, high, m,s,g or a YAML file; to impulse responses a ratio such as '20 dB'.")
+        str,
+        typer.Option(
+            help="Noise to add: none, low, high, m,s,g or a YAML file; for impulse responses a ratio such as '20 dB'."
+        ),
     ] = "none",
-    seed: Annotated[int, typer.Option(min=0, help="Of that noise.")] = 0,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes (default: as many as pay, up to the cores).")] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an odometry that is there.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of processes (default: by the number of pairs and cores).")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing odometry.")] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with one that was broken off; path options may change.")
+        bool, typer.Option("--resume", help="Resume a stopped odometry; options of the path may change.")
     ] = False,
 ) -> None:
-    """Estimate the motion between all consecutive frames and drive the path that they tell.
+    """Estimate the motion between consecutive frames, and integrate the path.
 
-    Writes into OUT: estimated.tum, true.tum where poses are known, motions.csv, covariances.npz, table.md, table.json,
-    path.png, run.json, and estimates.jsonl, from which --resume goes on.
+    OUT holds estimated.tum, true.tum if poses are known, motions.csv, covariances.npz, table.md, table.json, path.png,
+    run.json, and estimates.jsonl, from which --resume continues.
     """
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
@@ -84,28 +88,25 @@ def odometry(
         method = estimator_from(estimator)
     except MitsonarError:
         if images:
-            frames_for(frames, reading)  # what is wrong with them is said first
+            frames_for(frames, reading)  # faults of the frames are reported first
         raise
     source = open_source(frames, method, reading)
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
-    crew = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
-    words: dict[str, Any] = {
-        "smooth": smooth,
-        "scale": factors,
-        "start": None if first is None else Pose.from_degrees(first),
-    }
+    processes = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
     with progress_bar("estimating", pairs, "pairs") as progress:
         found = run_odometry(
             source,
             estimator,
             method,
             out,
-            **words,
+            smooth=smooth,  # type: ignore[arg-type]  # other words are refused there
+            scale=factors,
+            start=None if first is None else Pose.from_degrees(first),
             frame=frame,
             every=every,
-            workers=crew,
+            workers=processes,
             overwrite=overwrite,
             resume=resume,
             progress=progress,
@@ -115,5 +116,5 @@ def odometry(
     for sentence in found.warnings():
         warn(sentence)
     count, lost = len(found.estimates), int((~found.believed).sum())
-    say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} not believed and bridged, in {out}")
+    say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")

@@ -1,4 +1,4 @@
-"""``mitsonar reproduce``: tables of the thesis again."""
+"""``mitsonar reproduce``: reproduce the tables of Almanza-Medina."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,25 +23,28 @@ __all__ = ["reproduce"]
 
 @answered
 def reproduce(
-    table: Annotated[str | None, typer.Argument(help="Number of a table, such as 3.2; without one they are listed.")] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder of data, trainings and tables; goes on.")] = None,
-    rows: Annotated[str | None, typer.Option(help="Only these, names with commas between them (default: all).")] = None,
-    scale: Annotated[float, typer.Option(help="Part of the thesis's data that is made, above 0 to 1.")] = 0.02,
-    minutes: Annotated[float, typer.Option(help="Of training at most, each row; 0: all epochs of the recipe.")] = 30.0,
+    table: Annotated[str | None, typer.Argument(help="Number of a table, such as 3.2 (default: list all tables).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder of data, trainings and tables; a stopped run is resumed.")
+    ] = None,
+    rows: Annotated[str | None, typer.Option(help="Names of rows, separated by commas (default: all).")] = None,
+    scale: Annotated[float, typer.Option(help="Part of the data of Almanza-Medina to make, above 0 and at most 1.")] = 0.02,
+    minutes: Annotated[float, typer.Option(help="Longest training of a row [min]; 0: all epochs of the recipe.")] = 30.0,
     batch: Annotated[
-        int | None, typer.Option(help="Pairs of a step (default: the recipe's); the rate grows with the square root.")
+        int | None,
+        typer.Option(help="Pairs of a step (default: the recipe's); the learning rate is scaled by the square root."),
     ] = None,
     change: Annotated[
         list[str] | None,
-        typer.Option("--set", help="KEY=VALUE of all recipes whose row has no value of its own: precision=bf16-mixed."),
+        typer.Option("--set", help="Change a key of all recipes, KEY=VALUE, unless a row sets it: precision=bf16-mixed."),
     ] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes that render (default: this machine's cores).")] = None,
-    accelerator: Annotated[str, typer.Option(help="Lightning's: auto, cpu, gpu ...")] = "auto",
-    devices: Annotated[str, typer.Option(help="Lightning's: auto, how many, or which (0,1).")] = "auto",
+    workers: Annotated[int | None, typer.Option(help="Number of processes that render (default: number of cores).")] = None,
+    accelerator: Annotated[str, typer.Option(help="Lightning's accelerator: auto, cpu, gpu ...")] = "auto",
+    devices: Annotated[str, typer.Option(help="Lightning's devices: auto, a number, or a list (0,1).")] = "auto",
 ) -> None:
-    """Make the data of a table, train and evaluate its rows, and print it beside the thesis's numbers.
+    """Make the data of a table, train and evaluate its rows, and print them beside the numbers of Almanza-Medina.
 
-    Killed at any moment, the same command goes on. Several tables may share a folder: what they share is trained once.
+    After a stop at any moment the same command resumes. Several tables may share a folder: common rows are trained once.
     """
     if table is None:
         _list()
@@ -58,11 +61,13 @@ def reproduce(
     from mitsonar.training.reproduce import reproduce as reproduced
 
     effort = Effort(scale, minutes or None, batch, changes_of(change or [], None))
-    crew = len(os.sched_getaffinity(0)) if workers is None else workers
-    words: dict[str, Any] = {"rows": wanted, "workers": crew, "accelerator": accelerator, "devices": devices}
+    processes = len(os.sched_getaffinity(0)) if workers is None else workers
     try:
         with ExitStack() as stack:
-            reproduced(table, out, effort, watch=stack.enter_context(_Console()), **words)
+            watch = stack.enter_context(_Console())
+            reproduced(
+                table, out, effort, rows=wanted, workers=processes, accelerator=accelerator, devices=devices, watch=watch
+            )
     except KeyboardInterrupt:
         say_stopped()
         sys.stdout.flush()
@@ -72,10 +77,10 @@ def reproduce(
 
 
 def _list() -> None:
-    """All tables with their rows."""
+    """List all tables with their rows."""
     from mitsonar.training.document_tables import NOISES, load_tables
 
-    say(f"RMSE in the thesis, sideways mm / forward mm / yaw deg: {', '.join(NOISES.values())}")
+    say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(NOISES.values())}")
     for table in load_tables().values():
         say(f"\n{table.name}  {table.title}")
         for row in table.rows:
@@ -84,7 +89,7 @@ def _list() -> None:
 
 
 class _Console:
-    """Bars on standard error, one at a time."""
+    """Progress bars on standard error, one at a time."""
 
     def __init__(self) -> None:
         self.bar = ExitStack()
@@ -92,17 +97,17 @@ class _Console:
     def __enter__(self) -> _Console:
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: object) -> None:
         self.bar.close()
 
     def begin(self, what: str, total: int, unit: str) -> Callable[[int], None]:
-        """The next bar."""
+        """Close the last bar and show the next one."""
         self.bar.close()
         return self.bar.enter_context(progress_bar(what, total, unit))
 
     @contextmanager
     def training(self, what: str) -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[], bool]]]:
-        """The bar of a training, which Ctrl-C ends after its step."""
+        """Show the bar of a training. Ctrl-C stops the training after its step."""
         self.bar.close()
         typer.echo(f"training {what}", err=True)
         with asked_to_stop() as stop, TrainingBar() as bar:

@@ -1,4 +1,4 @@
-"""``mitsonar train``: train a network as a recipe says."""
+"""``mitsonar train``: train a network by a recipe."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitsonar.cli.console import answered, changes_of, say
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from mitsonar.training.training_run import TrainingReport
 
 __all__ = ["TrainingBar", "asked_to_stop", "train"]
@@ -27,33 +30,43 @@ def train(
         str, typer.Argument(metavar="RECIPE.yaml", help="A training recipe: a YAML file, or the name of a shipped one.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run: network, log, learning curve, state.")],
-    data: Annotated[str | None, typer.Option(help="Path or URL of a data set; with --render only for validation.")] = None,
-    render: Annotated[bool, typer.Option("--render", help="Render training samples while the network learns.")] = False,
-    minutes: Annotated[float | None, typer.Option(help="Stop after so many, all resumed runs together.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped or killed.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew where a run is.")] = False,
-    scale: Annotated[float | None, typer.Option(help="Only this part of the data, 0..1.")] = None,
-    pairs: Annotated[int | None, typer.Option(help="Train on so many samples in all, whatever epochs say.")] = None,
-    change: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the recipe: optimiser.rate=1e-3.")] = None,
-    accelerator: Annotated[str, typer.Option(help="Lightning's: auto, cpu, gpu ...")] = "auto",
-    devices: Annotated[str, typer.Option(help="Lightning's: auto, how many, or which (0,1).")] = "auto",
-    strategy: Annotated[str, typer.Option(help="Lightning's: auto, ddp ...")] = "auto",
-    precision: Annotated[
-        str | None, typer.Option(help="Lightning's: 32-true, bf16-mixed ... (default: the recipe's).")
+    data: Annotated[str | None, typer.Option(help="Path or URL of a data set; with --render for validation only.")] = None,
+    render: Annotated[bool, typer.Option("--render", help="Render training samples during training.")] = False,
+    minutes: Annotated[
+        float | None, typer.Option(help="Duration after which training stops [min], of all resumed runs together.")
     ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of the CPU (default: torch's choice).")] = None,
-    workers: Annotated[int | None, typer.Option(help="Processes that read or render (default: by the machine).")] = None,
-    state_minutes: Annotated[float, typer.Option(help="Minutes between states: what a kill may cost.")] = 5.0,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a run that was stopped or killed.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
+    scale: Annotated[float | None, typer.Option(help="Part of the data to use, 0..1.")] = None,
+    pairs: Annotated[
+        int | None, typer.Option(help="Length of the training in samples, in place of the recipe's epochs.")
+    ] = None,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: optimiser.rate=1e-3.")
+    ] = None,
+    accelerator: Annotated[str, typer.Option(help="Lightning's accelerator: auto, cpu, gpu ...")] = "auto",
+    devices: Annotated[str, typer.Option(help="Lightning's devices: auto, a number, or a list (0,1).")] = "auto",
+    strategy: Annotated[str, typer.Option(help="Lightning's strategy: auto, ddp ...")] = "auto",
+    precision: Annotated[
+        str | None, typer.Option(help="Lightning's precision: 32-true, bf16-mixed ... (default: the recipe's).")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Number of CPU threads (default: torch's choice).")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Number of processes that read or render (default: by the machine).")
+    ] = None,
+    state_minutes: Annotated[
+        float, typer.Option(help="Time between two saved states [min]. A kill loses at most this.")
+    ] = 5.0,
 ) -> None:
-    """Train a network. Killed at any moment, the same command with --resume goes on, on a CPU to the same bits."""
+    """Train a network. After a stop at any moment --resume continues; on a CPU the result has the same bits."""
     from mitsonar.config.training_recipe import load_training_recipe
     from mitsonar.training.training_run import leads
     from mitsonar.training.training_run import train as train_network
 
-    told = load_training_recipe(recipe, changes_of(change or [], None))
+    wanted = load_training_recipe(recipe, changes_of(change or [], None))
     with asked_to_stop() as stop, TrainingBar() as bar:
         made = train_network(
-            told,
+            wanted,
             data,
             out,
             render=render,
@@ -80,11 +93,14 @@ def train(
 
 
 @contextmanager
-def asked_to_stop() -> Iterator[Any]:
-    """Ctrl-C ends training after its step, with its state kept; a second one at once."""
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C stop training after its step, with its state saved, and a second Ctrl-C at once.
+
+    Yields the function that returns whether to stop.
+    """
     asked = threading.Event()
 
-    def first(number: int, frame: Any) -> None:
+    def first(number: int, frame: FrameType | None) -> None:
         asked.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -99,21 +115,25 @@ def asked_to_stop() -> Iterator[Any]:
 
 
 class TrainingBar:
-    """One line that changes, where there is a terminal, and a line that stays for each validation; else only lines: one a
-    validation, and one every half minute."""
+    """Progress of a training on standard error.
+
+    A terminal shows a bar, and a line for each validation. Otherwise a line is printed for each validation and every half
+    minute.
+    """
 
     def __init__(self, every_s: float = 30.0) -> None:
         self.every_s, self.said = every_s, time.monotonic()
-        self.inner: Any = None
+        self.inner: Progress | None = None
 
     def __enter__(self) -> TrainingBar:
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: object) -> None:
         if self.inner is not None:
             self.inner.stop()
 
     def __call__(self, report: TrainingReport) -> None:
+        """Show a report."""
         if sys.stderr.isatty():
             self._draw(report)
         elif report.validated or time.monotonic() - self.said >= self.every_s:
@@ -135,7 +155,7 @@ class TrainingBar:
 
 
 def progress_line(report: TrainingReport) -> str:
-    """How far a training is: ``epoch 1.26 at 18/s, 0.5 min, loss 15.3, RMSE 10.9/11.9 mm 0.232 deg``."""
+    """Format the progress of a training: ``epoch 1.26 at 18/s, 0.5 min, loss 15.3, RMSE 10.9/11.9 mm 0.232 deg``."""
     return (
         f"epoch {report.epoch:.2f} at {report.per_second:.3g}/s, {report.minutes:.1f} min, loss {report.loss:.3g}, "
         f"RMSE {_rmse(report.rmse, report)}"
@@ -143,12 +163,12 @@ def progress_line(report: TrainingReport) -> str:
 
 
 def validation_text(report: TrainingReport) -> str:
-    """What the last validation found: ``; noise none 2.84/1.00 mm 0.052 deg``."""
+    """Format the last validation: ``; noise none 2.84/1.00 mm 0.052 deg``."""
     return "".join(f"; noise {level} {_rmse(values, report)}" for level, values in report.validation.items())
 
 
 def _rmse(values: list[float], report: TrainingReport) -> str:
-    """Numbers with the same unit share it."""
+    """Format an RMSE. Numbers with the same unit share it."""
     texts: dict[str, list[str]] = {}
     for value, axis in zip(values, report.axes, strict=True):
         texts.setdefault(axis.unit, []).append(f"{value:.3g}")

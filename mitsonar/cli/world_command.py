@@ -1,4 +1,4 @@
-"""``mitsonar world``: a seed, or a user's own model, becomes a scene and its meshes."""
+"""``mitsonar world``: make a scene and its meshes from a seed or from a user's model."""
 
 from __future__ import annotations
 
@@ -22,19 +22,26 @@ if TYPE_CHECKING:
 
 __all__ = ["worlds"]
 
-Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make: scene.xml, meshes/, textures/.")]
+Click = Any
+"""A command or context of Click, or of Typer's copy of it."""
+
+FieldValue = int | float | str
+"""Value of an option, before the numbers of a tuple are parsed."""
+
+Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make, with scene.xml, meshes/ and textures/.")]
 
 
 def worlds() -> typer.Typer:
-    """The group of commands: one for each family, with an option for each of its numbers."""
+    """Create the group of commands: one for each family, with an option for each of its fields."""
     return typer.Typer(help="Make a world: a Mitsuba scene and its meshes.", no_args_is_help=True, cls=_Families)
 
 
 class _Families(TyperGroup):
-    """Asks the families what they are only when one of these commands is meant: `mitsonar --help` does not wait for them."""
+    """Imports the families only when one of these commands is called, which keeps `mitsonar --help` fast."""
 
     @functools.cached_property
-    def known(self) -> Any:
+    def known(self) -> Click:
+        """Create the commands of all families."""
         from mitsonar.worlds.families import FAMILIES
 
         app = typer.Typer()
@@ -43,21 +50,21 @@ class _Families(TyperGroup):
         app.command("mesh")(mesh)
         return with_plain_brackets(typer.main.get_command(app))
 
-    def list_commands(self, ctx: Any) -> list[str]:
+    def list_commands(self, ctx: Click) -> list[str]:
         return list(self.known.list_commands(ctx))
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        self.commands = self.known.commands  # of which a wrong name's neighbours are told
+    def resolve_command(self, ctx: Click, args: list[str]) -> Click:
+        self.commands = self.known.commands  # for the suggestions after a wrong name
         return super().resolve_command(ctx, args)
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+    def get_command(self, ctx: Click, cmd_name: str) -> Click:
         return self.known.get_command(ctx, cmd_name)
 
 
 def _command(name: str, family: type[Family]) -> Callable[..., None]:
-    """A command whose options are the fields of a family."""
+    """Create a command whose options are the fields of a family."""
 
-    def command(seed: int, out: Path, **fields: Any) -> None:
+    def command(seed: int, out: Path, **fields: FieldValue | None) -> None:
         from mitsonar.worlds.families import create_family
 
         if seed < 0:
@@ -67,7 +74,12 @@ def _command(name: str, family: type[Family]) -> Callable[..., None]:
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     parameters = [
-        inspect.Parameter("seed", keyword, default=0, annotation=Annotated[int, typer.Option(help="Seed: same bytes.")]),
+        inspect.Parameter(
+            "seed",
+            keyword,
+            default=0,
+            annotation=Annotated[int, typer.Option(help="Seed of the world; the same seed gives the same bytes.")],
+        ),
         inspect.Parameter("out", keyword, annotation=Out),
     ]
     parameters += [_option(key, field) for key, field in family.model_fields.items()]
@@ -77,31 +89,32 @@ def _command(name: str, family: type[Family]) -> Callable[..., None]:
 
 
 def _option(key: str, field: FieldInfo) -> inspect.Parameter:
-    """The option of one field; intervals and triples are numbers with commas between them."""
+    """Create the option of one field. Intervals and triples are numbers separated by commas."""
     default = "drawn" if field.default is None else _shown(field.default)
     text = f"{field.description} [default: {default}]"
     kind = next((kind for kind in (int, float) if field.annotation in (kind, kind | None)), str)
-    places = ",".join("N" * len(get_args(field.annotation))) if get_origin(field.annotation) is tuple else None
-    option = typer.Option(f"--{key.replace('_', '-')}", help=text, show_default=False, metavar=places)
+    shape = ",".join("N" * len(get_args(field.annotation))) if get_origin(field.annotation) is tuple else None
+    option = typer.Option(f"--{key.replace('_', '-')}", help=text, show_default=False, metavar=shape)
     return inspect.Parameter(
         key,
         inspect.Parameter.KEYWORD_ONLY,
         default=None,
-        annotation=Annotated[kind | None, option],  # type: ignore[valid-type]
+        annotation=Annotated[kind | None, option],
     )
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return ",".join(f"{part:g}" for part in value) if isinstance(value, tuple) else str(value)
 
 
-def _pair(value: Any, field: FieldInfo, key: str) -> Any:
-    """The numbers of an option whose field is a tuple; other values as they are."""
+def _pair(value: FieldValue, field: FieldInfo, key: str) -> FieldValue | tuple[float, ...]:
+    """Parse the numbers of an option whose field is a tuple. Other values stay as they are."""
     if get_origin(field.annotation) is not tuple:
         return value
     from mitsonar.cli.console import numbers
 
     kinds = get_args(field.annotation)
+    assert isinstance(value, str)
     given = numbers(value, len(kinds), f"--{key.replace('_', '-')}")
     assert given is not None
     return tuple(
@@ -113,24 +126,26 @@ def _pair(value: Any, field: FieldInfo, key: str) -> Any:
 def mesh(
     file: Annotated[Path, typer.Argument(help="Model: glb, gltf, obj, stl, dae or ply.")],
     out: Out,
-    scale: Annotated[float, typer.Option(help="Metres a unit of the file (0.001 for millimetres).")] = 1.0,
+    scale: Annotated[float, typer.Option(help="Length of a unit of the file [m]: 0.001 for millimetres.")] = 1.0,
     up: Annotated[str | None, typer.Option(help="Axis that points up: x, y or z (default: y for glTF, else z).")] = None,
-    reflectivity: Annotated[str, typer.Option(help="red, luminance, or a number 0..1.")] = "luminance",
-    floor: Annotated[bool, typer.Option(help="A seabed of random cells below the model.")] = True,
+    reflectivity: Annotated[
+        str, typer.Option(help="Reflectivity from the texture: red or luminance; or a number 0..1.")
+    ] = "luminance",
+    floor: Annotated[bool, typer.Option(help="Add a seabed of random cells below the model.")] = True,
     floor_m: Annotated[
-        float | None, typer.Option(help="Edge of that seabed in m (default: 3 x the model's diagonal).")
+        float | None, typer.Option(help="Edge of that seabed [m] (default: 3 times the diagonal of the model).")
     ] = None,
 ) -> None:
-    """Turn a model of your own, textured or not, into a scene: on a seabed, with a sonar that looks at it."""
+    """Make a scene from your own model, with or without textures: on a seabed, with a sonar that looks at it."""
     from mitsonar.worlds.user_mesh import mesh_world
 
     world = mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m)
     if not 0.05 <= world.size_m <= 500:
-        warn(f"the model is {world.size_m:.3g} m large: --scale is metres a unit of the file, 0.001 for millimetres")
+        warn(f"the model is {world.size_m:.3g} m large: --scale is the unit of the file in metres, 0.001 for millimetres")
     _write(world, out)
 
 
 def _write(world: World, out: Path) -> None:
     scene = world.write(out)
     say(world.about)
-    say(f"{world.faces:,} triangles in {scene}; see it with: {command_line('render', scene, '--cartesian')}")
+    say(f"{world.faces:,} triangles in {scene}; render it with: {command_line('render', scene, '--cartesian')}")

@@ -1,1 +1,1 @@
-"""Training of networks, their evaluation, and the thesis's tables again."""
+"""Training of networks, their evaluation, and the reproduction of the tables of Almanza-Medina."""

@@ -1,11 +1,11 @@
-"""How well a trained network does on a data set: the thesis's columns, and those that keep them honest."""
+"""Evaluation of a trained network on a data set, with baselines and confidence intervals."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -31,18 +31,18 @@ from mitsonar.estimation.learned.trained_network import (
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.motion.motion_errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.training.training_types import Array, JsonObject
 
 __all__ = ["NOISES", "evaluate", "predictions"]
 
-Array = NDArray[np.float64]
-
 NOISES = ("none", "low", "high")
+"""Levels of noise, by default."""
 
 SAME_INSTRUMENT = ("name", "model", "seed", "rays", "points_per_m2")
-"""Keys of a channel sonar in which two may differ and yet be one instrument."""
+"""Keys of a channel sonar that do not make it another instrument."""
 
 TIMED = 20
-"""Pairs over which the time of one is taken."""
+"""Pairs over which the time of one estimate is measured."""
 
 
 def predictions(
@@ -54,31 +54,31 @@ def predictions(
     device: torch.device | str | None = None,
     progress: Callable[[int], object] = lambda pairs: None,
 ) -> tuple[Array, Array | None]:
-    """What a network says of samples.
+    """Estimate the targets of samples by a network.
 
     Args:
         checkpoint: of the network.
-        pairs: arranged as it was trained; see :func:`samples_for`.
+        pairs: samples, arranged as in training; see :func:`samples_for`.
         batch: samples at a time.
-        numbers: of the samples; default: all.
-        device: where it computes; default: a GPU where there is one.
-        progress: called with how many were done.
+        numbers: numbers of the samples; default: all samples.
+        device: of the computation; default: a GPU, if there is one.
+        progress: called with the number of samples that were done.
 
     Returns:
         Targets ``(n, 3)`` [m, m, rad], ``(n, 2)`` [m] without yaw, or ``(n, 1)`` [m] of heights; covariances
-        ``(n, 3, 3)``, if the network says them.
+        ``(n, 3, 3)``, if the network estimates them.
     """
-    place = _device(device)
-    network = checkpoint.build().to(place)
+    torch_device = _device(device)
+    network = checkpoint.build().to(torch_device)
     wanted = range(len(pairs)) if numbers is None else numbers
     found = []
     with torch.inference_mode():
         for start in range(0, len(wanted), batch):
             raw = default_collate([pairs.raw(number) for number in wanted[start : start + batch]])
-            found.append(checkpoint.decode(answer_of(network, pairs.finished(raw, place)[0])))
+            found.append(checkpoint.decode(answer_of(network, pairs.finished(raw, torch_device)[0])))
             progress(len(found[-1][0]))
-    targets = np.concatenate([answer for answer, _ in found])
-    covariances = [law for _, law in found if law is not None]
+    targets = np.concatenate([targets for targets, _ in found])
+    covariances = [covariance for _, covariance in found if covariance is not None]
     return targets, np.concatenate(covariances) if covariances else None
 
 
@@ -88,58 +88,92 @@ def evaluate(
     *,
     noise: Sequence[str] | None = None,
     part: str | None = None,
-    split: str | Split | dict[str, Any] | None = None,
+    split: str | Split | JsonObject | None = None,
     pairs: int | None = None,
     force: bool = False,
     seed: int = 0,
     batch: int = 16,
     device: torch.device | str | None = None,
     begin: Callable[[int], Callable[[int], object]] = lambda total: lambda done: None,
-) -> dict[str, Any]:
-    """Errors of a network on one sample of each sequence of a part of a data set, beside always answering nothing.
+) -> JsonObject:
+    """Evaluate a network on one sample of each sequence of a data set, beside always answering zero: see :func:`_report`.
 
     Args:
         checkpoint: of the network.
         data: path or URL of the data set.
         noise: levels, each a table; default: :data:`NOISES`, or none for impulse responses.
-        part: ``train``, ``validation``, ``test`` or ``all``; default: ``test`` where the split has one, else ``validation``.
+        part: ``train``, ``validation``, ``test`` or ``all``; default: ``test`` if the split has one, else ``validation``.
         split: default: that of the training, else of the data set.
-        pairs: at most so many, drawn at random.
-        force: go on with another sonar than that of training.
+        pairs: largest number of pairs, which are drawn at random.
+        force: allow another sonar than that of training.
         seed: of noise, choice of samples, and bootstrap.
         batch: samples at a time.
-        device: where it computes; default: a GPU where there is one. Times are of one CPU core anyway.
-        begin: called with how many answers will be made; gives what is called with how many more were made.
-
-    Returns:
-        Numbers and texts: what was asked for; ``notes``, sentences that the reader of the tables needs; ``tables``, one a
-        level, each with ``rows``: for the network and ``zero`` what :class:`~mitsonar.estimation.benchmark.BenchmarkRow`
-        holds, in
-        mm, mm, deg (heights: mm), with ``thesis``, the RMSE in mm, mm, 1/100 deg; and ``beyond``: shares of true motions and
-        of answers beyond those of training.
+        device: of the computation; default: a GPU, if there is one. Times are always of one CPU core.
+        begin: called with the number of all estimates; returns what is called with how many more are done.
 
     Raises:
-        MitsonarError: another sonar than that of training, views or arrays that the data set lacks, no samples.
+        MitsonarError: another sonar than that of training, missing views or arrays, or no samples.
     """
-    recipe = DataStore.open(data).recipe
-    others = _other_sonars(checkpoint, recipe)
+    others = _other_sonars(checkpoint, DataStore.open(data).recipe)
     if others and not force:
         raise MitsonarError(f"{'; '.join(others)}: evaluate on that sonar, or force it with --force")
     split = checkpoint.recipe.get("split") if split is None else split
     usual = NOISES[:1] if checkpoint.channel is not None else NOISES
     levels = list(dict.fromkeys(usual if noise is None else noise))
     samples = {level: samples_for(checkpoint, data, part=part, split=split, noise=level, seed=seed) for level in levels}
-    first = samples[levels[0]]
-    numbers = chosen(len(first), pairs, seed)
-    truth = np.array([first.target(number) for number in numbers])
-    scenes = first.scene[first.first[numbers]]
-    resamples = cluster_resamples(scenes, seed=seed)
-    quiet = samples_for(checkpoint, data, part=part, split=split, seed=seed)
-    ms = _milliseconds(checkpoint, quiet, numbers[:TIMED])
-    progress, tables = begin(len(levels) * len(numbers)), []
+    subject = _Subject.of(samples[levels[0]], pairs, seed)
+    ms = _milliseconds(checkpoint, samples_for(checkpoint, data, part=part, split=split, seed=seed), subject.numbers[:TIMED])
+    progress, tables = begin(len(levels) * len(subject.numbers)), []
     for level in levels:
-        said = predictions(checkpoint, samples[level], batch, numbers=numbers, device=device, progress=progress)
-        tables.append({"noise": level, "variation": "as told", **_table(checkpoint, truth, resamples, ms, *said)})
+        found = predictions(checkpoint, samples[level], batch, numbers=subject.numbers, device=device, progress=progress)
+        tables.append({"noise": level, "variation": "as told", **_table(checkpoint, subject, ms, *found)})
+    return _report(checkpoint, data, part, samples[levels[0]], subject, others, tables)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """The samples of an evaluation.
+
+    Attributes:
+        numbers: of the samples, n of them.
+        truth: true targets ``(n, outputs)`` [m, rad].
+        scenes: number of distinct scenes.
+        resamples: samples of each bootstrap resample ``(resamples, n)``.
+        seed: of the choice and the bootstrap.
+    """
+
+    numbers: list[int]
+    truth: Array
+    scenes: int
+    resamples: NDArray[np.int64]
+    seed: int
+
+    @classmethod
+    def of(cls, samples: SonarPairs | ImpulsePairs, pairs: int | None, seed: int) -> _Subject:
+        """Choose samples and draw the resamples."""
+        numbers = chosen(len(samples), pairs, seed)
+        truth = np.array([samples.target(number) for number in numbers])
+        scenes = samples.scene[samples.first[numbers]]
+        return cls(numbers, truth, len(np.unique(scenes)), cluster_resamples(scenes, seed=seed), seed)
+
+
+def _report(
+    checkpoint: Checkpoint,
+    data: str | Path,
+    part: str | None,
+    samples: SonarPairs | ImpulsePairs,
+    subject: _Subject,
+    others: list[str],
+    tables: list[JsonObject],
+) -> JsonObject:
+    """Return the report of an evaluation.
+
+    ``notes`` are sentences that a reader of the tables needs. ``tables`` has one table for each level of noise. The rows of
+    a table are of the network and of ``zero``, and hold the fields of
+    :class:`~mitsonar.estimation.benchmark.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE in mm, mm,
+    1/100 deg. ``beyond`` holds the shares of true motions and of estimates outside the range of training.
+    """
+    recipe = DataStore.open(data).recipe
     return {
         "network": checkpoint.network,
         "digest": checkpoint.digest,
@@ -147,12 +181,12 @@ def evaluate(
         "data": str(data),
         "recipe": recipe.name,
         "model": modality_of(recipe).sonar.model,
-        "part": part or first.split.unseen,
-        "split": first.split.by,
-        "pairs": len(numbers),
-        "scenes": len(np.unique(scenes)),
+        "part": part or samples.split.unseen,
+        "split": samples.split.by,
+        "pairs": len(subject.numbers),
+        "scenes": subject.scenes,
         "names": list(checkpoint.labels["names"]),
-        "seed": seed,
+        "seed": subject.seed,
         "notes": [*others, *_notes(checkpoint, recipe, part)],
         "tables": tables,
     }
@@ -163,14 +197,14 @@ def samples_for(
     data: str | Path,
     *,
     part: str | None = None,
-    split: str | Split | dict[str, Any] | None = None,
+    split: str | Split | JsonObject | None = None,
     noise: str = "none",
     seed: int = 0,
 ) -> SonarPairs | ImpulsePairs:
-    """One sample of each sequence of a data set, arranged for a network.
+    """Return one sample of each sequence of a data set, arranged for a network.
 
     Raises:
-        MitsonarError: a data set that lacks what the network is given, or without samples in that part.
+        MitsonarError: the data set lacks an input of the network, or has no samples in that part.
     """
     words = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": True}
     if part is None:
@@ -185,7 +219,7 @@ def _device(device: torch.device | str | None) -> torch.device:
 
 
 def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numbers: Sequence[int]) -> float:
-    """Median processor time of one sample on one core, from frames (and their geometry) to the answer."""
+    """Measure the median processor time of one sample on one core [ms], from frames (and their geometry) to the estimate."""
     network = checkpoint.build()
     spent = []
     with torch.inference_mode(), one_thread():
@@ -194,29 +228,29 @@ def _milliseconds(checkpoint: Checkpoint, pairs: SonarPairs | ImpulsePairs, numb
             begun = time.process_time()
             answer_of(network, pairs.finished(raw)[0])
             spent.append(1e3 * (time.process_time() - begun))
-    return float(np.median(spent[1:]))  # the first one prepares
+    return float(np.median(spent[1:]))  # the first sample warms up
 
 
 # ---------------------------------------------------------------- tables
 
 
-def _table(
-    checkpoint: Checkpoint, truth: Array, resamples: NDArray[np.int64], ms: float, said: Array, law: Array | None
-) -> dict[str, Any]:
-    """Rows of the network and of always answering nothing."""
-    inputs, beyond = {checkpoint.network: inputs_of(checkpoint), "zero": "nothing"}, _beyond(checkpoint, truth, said)
+def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Array, covariances: Array | None) -> JsonObject:
+    """Return the rows of the network and of always answering zero."""
+    truth, resamples = subject.truth, subject.resamples
+    inputs, beyond = {checkpoint.network: inputs_of(checkpoint), "zero": "nothing"}, _beyond(checkpoint, truth, estimates)
     if truth.shape[1] >= 2:
-        truth, said, axes = _with_yaw(truth), _with_yaw(said), truth.shape[1]
-        nan, sure = np.full((len(truth), 3, 3), np.nan), np.ones(len(truth), dtype=bool)
+        truth, estimates, axes = _with_yaw(truth), _with_yaw(estimates), truth.shape[1]
+        nan, valid = np.full((len(truth), 3, 3), np.nan), np.ones(len(truth), dtype=bool)
+        covariances = nan if covariances is None else covariances
         answers = {
-            checkpoint.network: Answers(said, sure, nan if law is None else law, np.full(len(truth), ms)),
-            "zero": Answers(np.zeros_like(truth), sure, nan, np.zeros(len(truth))),
+            checkpoint.network: Answers(estimates, valid, covariances, np.full(len(truth), ms)),
+            "zero": Answers(np.zeros_like(truth), valid, nan, np.zeros(len(truth))),
         }
         rows = [_of_axes(row.plain(), axes) for row in rows_of(answers, inputs, truth, resamples, reference="zero")]
         scale = np.array([1, 1, 100])[:axes]
     else:
         middle = np.full_like(truth, checkpoint.coder.low.mean() / 2 + checkpoint.coder.high.mean() / 2)
-        found = {checkpoint.network: said, "zero": middle}
+        found = {checkpoint.network: estimates, "zero": middle}
         times = {checkpoint.network: ms, "zero": 0.0}
         rows = [
             {"method": name, "inputs": inputs[name], "ms": times[name], **_height_errors(values, truth, middle, resamples)}
@@ -229,19 +263,21 @@ def _table(
 
 
 def _with_yaw(motion: Array) -> Array:
-    """Motions ``(n, 3)`` of those with or without yaw, which is then 0."""
+    """Return motions ``(n, 3)``; a missing yaw is 0."""
     return np.hstack([motion, np.zeros((len(motion), len(AXES) - motion.shape[1]))])
 
 
-def _of_axes(row: dict[str, Any], axes: int) -> dict[str, Any]:
-    """A row with the numbers of its first axes."""
+def _of_axes(row: JsonObject, axes: int) -> JsonObject:
+    """Return a row with the numbers of its first axes."""
     return {name: value[:axes] if isinstance(value, list) else value for name, value in row.items()}
 
 
-def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArray[np.int64]) -> dict[str, Any]:
-    """What :class:`~mitsonar.motion.motion_errors.MotionErrors` says of motions, of heights ``(n, 1)`` [m], in mm; zero
-    stands for always
-    answering the middle of the heights of training, and slopes are over the differences from it."""
+def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArray[np.int64]) -> JsonObject:
+    """Return the errors of heights ``(n, 1)`` [m], with the fields of :class:`~mitsonar.motion.motion_errors.MotionErrors`.
+
+    Errors are in mm. ``zero`` is the RMSE of always answering the middle of the training heights. Slopes are over the
+    differences from this middle.
+    """
     error, side = 1e3 * (heights - truth), 1e3 * (truth - middle)
     rmse, zero = (float(np.sqrt((values**2).mean())) for values in (error, side))
     low, high = np.percentile(np.sqrt((error[resamples, 0] ** 2).mean(axis=1)), [2.5, 97.5])
@@ -265,20 +301,20 @@ def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArr
     }
 
 
-def _beyond(checkpoint: Checkpoint, truth: Array, said: Array) -> dict[str, float]:
-    """Shares of samples whose truth, and whose answer, lies beyond the targets of training on any axis."""
+def _beyond(checkpoint: Checkpoint, truth: Array, estimates: Array) -> dict[str, float]:
+    """Return the shares of true and of estimated targets that are outside the range of training on any axis."""
     low, high = checkpoint.coder.low - 1e-9, checkpoint.coder.high + 1e-9
     return {
         name: float(((values < low) | (values > high)).any(axis=1).mean())
-        for name, values in (("true", truth), ("answers", said))
+        for name, values in (("true", truth), ("answers", estimates))
     }
 
 
-# ---------------------------------------------------------------- what is other than in training
+# ---------------------------------------------------------------- differences from training
 
 
 def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
-    """Sentences on the sonars of a data set that are not those of training."""
+    """Describe the sonars of a data set that differ from those of training."""
     if checkpoint.channel is not None:
         return _other_channel(checkpoint.channel, recipe.channel_sonar, recipe.name)
     found = []
@@ -296,14 +332,14 @@ def _other_sonars(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
 
 
 def _other_channel(trained: ChannelSonar, other: ChannelSonar, name: str) -> list[str]:
-    """A sentence on keys that differ and change responses."""
+    """Describe the keys that differ and change responses."""
     mine, its = trained.model_dump(mode="json"), other.model_dump(mode="json")
     changed = [key for key in mine if mine[key] != its[key] and key not in SAME_INSTRUMENT]
     return [f"trained with another channel sonar than that of {name}: {', '.join(changed)} differ"] if changed else []
 
 
 def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str]:
-    """Sentences on what else differs, and on pairs that training has seen."""
+    """Describe other differences from training, and pairs that training has seen."""
     found = []
     same = checkpoint.data_recipe == recipe.model_dump(mode="json")
     if same and part in ("train", "all"):
@@ -318,7 +354,7 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str
         angles = [abs(getattr(recipe.mount, key) - trained[key]) > ANGLE_OFF_DEG for key in ("pitch_deg", "roll_deg")]
         if heights or any(angles):
             found.append(
-                f"{checkpoint.fixed} are fixed by training; here the sonar stands at {low:g}..{high:g} m, pitch "
+                f"{checkpoint.fixed} are fixed by training; here the sonar is at {low:g}..{high:g} m, pitch "
                 f"{recipe.mount.pitch_deg:g} deg, roll {recipe.mount.roll_deg:g} deg"
             )
     return found

@@ -1,14 +1,14 @@
-"""The tables of an evaluation: as Markdown, and in a folder."""
+"""Tables of an evaluation: as Markdown, and as files in a folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark_tables import markdown
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.training.training_types import JsonObject
 
 __all__ = ["refuse_tables", "report_lines", "save_tables"]
 
@@ -18,8 +18,8 @@ COLUMNS = (
 )
 
 
-def report_lines(report: dict[str, Any]) -> list[str]:
-    """The tables of :func:`mitsonar.training.evaluation.evaluate` as Markdown."""
+def report_lines(report: JsonObject) -> list[str]:
+    """Format the tables of :func:`mitsonar.training.evaluation.evaluate` as Markdown."""
     units = "height mm" if len(report["names"]) == 1 else "sideways mm / forward mm / yaw deg"
     units = units.removesuffix(" / yaw deg") if len(report["names"]) == 2 else units
     lines = [
@@ -36,18 +36,18 @@ def report_lines(report: dict[str, Any]) -> list[str]:
 
 
 def refuse_tables(out: Path, *, overwrite: bool) -> None:
-    """Keep tables that are in a folder, unless they may be replaced.
+    """Refuse to replace the tables in a folder without ``overwrite``.
 
     Raises:
-        MitsonarError: some are, or it is no folder.
+        MitsonarError: the folder holds tables, or the path is a file.
     """
     if out.exists() and not out.is_dir():
         raise MitsonarError(f"-o is a folder: got the file {out}")
     refuse_to_replace(out / "table.md", out / "table.json", overwrite=overwrite)
 
 
-def save_tables(out: Path, report: dict[str, Any]) -> None:
-    """Write ``table.md`` and ``table.json``; the folder is made."""
+def save_tables(out: Path, report: JsonObject) -> None:
+    """Write ``table.md`` and ``table.json``. The folder is created."""
     out.mkdir(parents=True, exist_ok=True)
     write_whole(out / "table.md", ("\n".join(report_lines(report)) + "\n").encode())
     write_json(out / "table.json", report)

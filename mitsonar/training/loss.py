@@ -1,16 +1,19 @@
-"""What training makes small (Almanza-Medina, 3.4): eq. 3.1, eq. 3.2-3.3 with the penalty, and the likelihood of a law."""
+"""Losses of training: eq. 3.1, eq. 3.2-3.3 with the penalty (Almanza-Medina, 3.4), and the Gaussian likelihood."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mitsonar.config.training_recipe import Loss
 from mitsonar.datasets.arrangement import Labels
-from mitsonar.networks.gaussian_head import likelihood
+from mitsonar.networks.gaussian_head import GaussianHead, likelihood
+
+if TYPE_CHECKING:
+    from mitsonar.training.training_types import NetworkOutput
 
 __all__ = ["create_loss", "squared_error"]
 
@@ -18,13 +21,14 @@ __all__ = ["create_loss", "squared_error"]
 def squared_error(
     estimates: Tensor, labels: Tensor, *, penalty: float = 0.0, low: Tensor | float = -10.0, high: Tensor | float = 10.0
 ) -> Tensor:
-    """Eq. 3.1, or with a penalty eq. 3.3: squared errors and penalties, summed, over 2 S W.
+    """Return the loss of eq. 3.1, or with a penalty that of eq. 3.3: the sum of squared errors and penalties over 2 S W.
 
     Args:
         estimates: ``(S, W)`` in label units.
-        labels: ``(S, W)``.
+        labels: ``(S, W)`` in label units.
         penalty: eta of eq. 3.2.
-        low, high: u_1 and u_2 of eq. 3.2, for each of the W or for all.
+        low: u_1 of eq. 3.2, one value or one for each of the W labels.
+        high: u_2 of eq. 3.2, one value or one for each of the W labels.
     """
     square = (estimates - labels).square()
     if penalty:
@@ -33,16 +37,22 @@ def squared_error(
     return square.sum() / (2 * square.numel())
 
 
-def create_loss(loss: Loss, labels: Labels) -> Callable[[Any, Tensor], Tensor]:
-    """The loss of what a network says, against labels, as a recipe tells it."""
+def create_loss(loss: Loss, labels: Labels) -> Callable[[NetworkOutput, Tensor], Tensor]:
+    """Return the loss of a network's output ``(batch, outputs)`` against labels, as a recipe defines it."""
     if loss.kind == "likelihood":
-        return likelihood
+        return _likelihood
     low, high = (torch.from_numpy(labels.encode(end)) for end in (labels.low, labels.high))
     if loss.bounds is not None:
         low, high = (torch.full_like(low, bound) for bound in loss.bounds)
 
-    def regression(estimates: Tensor, target: Tensor) -> Tensor:
+    def regression(estimates: NetworkOutput, target: Tensor) -> Tensor:
+        assert isinstance(estimates, Tensor)
         ends = {"low": low.to(estimates), "high": high.to(estimates)} if loss.penalty else {}
         return squared_error(estimates, target, penalty=loss.penalty, **ends)
 
     return regression
+
+
+def _likelihood(estimates: NetworkOutput, target: Tensor) -> Tensor:
+    assert isinstance(estimates, GaussianHead)
+    return likelihood(estimates, target)

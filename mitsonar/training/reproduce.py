@@ -1,4 +1,4 @@
-"""A table of the thesis again: data made at a scale, its rows trained and evaluated one after the other, all on disk."""
+"""Reproduction of a table of Almanza-Medina: make its data at a scale, train and evaluate its rows, keep all on disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from pydantic import ValidationError
 
@@ -25,21 +25,14 @@ from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.storage import Storage
 from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.training.document_tables import (
-    Found,
-    Reached,
-    RowScore,
-    load_tables,
-    plain_table,
-    rows_named,
-    table_figure,
-    table_lines,
-    table_named,
-    tables_with,
-)
+from mitsonar.training.document_tables import load_tables, rows_named, table_named, tables_with
 from mitsonar.training.evaluation import evaluate
+from mitsonar.training.reproduced_tables import plain_table, table_figure, table_lines
+from mitsonar.training.row_results import Found, Reached, RowScore
 from mitsonar.training.training_folder import TRAINING
-from mitsonar.training.training_run import TrainingReport, train
+from mitsonar.training.training_journal import TrainingReport
+from mitsonar.training.training_run import train
+from mitsonar.training.training_types import JsonObject
 
 __all__ = ["Effort", "Watch", "reproduce", "unseen_recipe"]
 
@@ -52,44 +45,46 @@ TABLES = RunKind(
 )
 
 UNSEEN_SEED = 7919
-"""Added to a data set's seed: worlds that training never saw."""
+"""Added to the seed of a data set, so that its worlds are not those of training."""
 
 UNSEEN_SEQUENCES = (100, 1000)
-"""Fewest (ten scenes, if the recipe has as many) and most sequences of unseen scenes; between, a twentieth of training's."""
+"""Fewest (ten scenes) and most sequences of unseen scenes; between, a twentieth of the training sequences."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """What is spent on each row; a folder has one and keeps it.
+    """What is spent on each row. All rows in one folder have the same effort.
 
     Attributes:
         scale: part of the recipe's sequences that are made, 0..1.
-        minutes: of training at most; None: until the recipe's epochs are done.
-        batch: samples of a step instead of the recipe's; Adam's rate grows with its square root. None: the recipe's.
-        changes: keys of the training recipes to change, dots between the levels; those that a table or row sets itself stay.
+        minutes: of training at most [min]; None: until the epochs of the recipe are done.
+        batch: samples of a step in place of the recipe's; the learning rate is scaled by the square root. None: the
+            recipe's.
+        changes: keys of the training recipes to change, with dots between the levels. Keys that a table or a row sets are
+            not changed.
 
     Raises:
-        MitsonarError: values outside these limits.
+        MitsonarError: a value is outside these limits.
     """
 
     scale: float = 0.02
     minutes: float | None = 30.0
     batch: int | None = None
-    changes: dict[str, Any] = field(default_factory=dict)
+    changes: JsonObject = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not 0 < self.scale <= 1:
-            raise MitsonarError(f"scale is a part of the thesis's data, above 0 and at most 1: got {self.scale:g}")
+            raise MitsonarError(f"scale is a part of the data of Almanza-Medina, above 0 and at most 1: got {self.scale:g}")
         if self.minutes is not None and not (self.minutes > 0 and math.isfinite(self.minutes)):
             raise MitsonarError(f"{argument('minutes')} of training of a row must be above 0: got {self.minutes:g}")
         if self.batch is not None and self.batch < 1:
             raise MitsonarError(f"a batch has 1 sample or more: got {self.batch}")
 
-    def recipe(self, name: str, own: dict[str, Any] | None = None) -> TrainingRecipe:
-        """The training recipe of that name, changed as this says, and then as a table and its row do.
+    def recipe(self, name: str, own: JsonObject | None = None) -> TrainingRecipe:
+        """Load the training recipe of that name, with the changes of this effort and then those of a table and its row.
 
         Raises:
-            MitsonarError: keys that it has not, values outside their limits.
+            MitsonarError: an unknown key, or a value outside its limits.
         """
         recipe = load_training_recipe(name, {**self.changes, **(own or {})})
         if self.batch is None or self.batch == recipe.batch:
@@ -98,41 +93,44 @@ class Effort:
         return recipe.replace(batch=self.batch, optimiser=recipe.optimiser.model_dump() | {"rate": rate})
 
     def sentence(self) -> str:
-        """For people."""
-        said = [f"scale {self.scale:g} of the recipes' data"]
-        said.append("all epochs" if self.minutes is None else f"at most {self.minutes:g} minutes of training a row")
+        """Describe the effort for people."""
+        parts = [f"scale {self.scale:g} of the recipes' data"]
+        parts.append("all epochs" if self.minutes is None else f"at most {self.minutes:g} minutes of training a row")
         if self.batch is not None:
-            said.append(f"batches of {self.batch}, the rate scaled by the square root")
+            parts.append(f"batches of {self.batch}, the rate scaled by the square root")
         if self.changes:
             keys = ", ".join(f"{key} {json.dumps(value)}" for key, value in self.changes.items())
-            said.append(f"recipes changed, where a row has no value of its own: {keys}")
-        return "; ".join(said)
+            parts.append(f"recipes changed, where a row has no value of its own: {keys}")
+        return "; ".join(parts)
 
 
-Told = Callable[[int], None]
-"""Called with how many more are done."""
+Advance = Callable[[int], None]
+"""Reports progress: is called with how many more parts are done."""
+
+TrainingCallbacks = tuple[Callable[[TrainingReport], None], Callable[[], bool]]
+"""What is called after each step of a training: the progress report, and the question whether to stop."""
 
 
 class Watch(Protocol):
-    """Who is told how far things are."""
+    """Shows the progress of a reproduction."""
 
-    def begin(self, what: str, total: int, unit: str) -> Told:
-        """Something begins that has so many parts."""
+    def begin(self, what: str, total: int, unit: str) -> Advance:
+        """Show that work of ``total`` parts begins, and return what reports its progress."""
 
-    def training(self, what: str) -> AbstractContextManager[tuple[Callable[[TrainingReport], None], Callable[[], bool]]]:
-        """While a network is trained; yields what is called after each step, and what is asked then: whether to stop."""
+    def training(self, what: str) -> AbstractContextManager[TrainingCallbacks]:
+        """Return the context of the training of one network."""
 
 
 class SilentWatch:
-    """A watch that nobody keeps."""
+    """A watch that shows nothing."""
 
-    def begin(self, what: str, total: int, unit: str) -> Told:
-        """Nothing is told."""
+    def begin(self, what: str, total: int, unit: str) -> Advance:
+        """Return a report that does nothing."""
         return lambda done: None
 
     @contextmanager
-    def training(self, what: str) -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[], bool]]]:
-        """Nothing is told, and training goes on."""
+    def training(self, what: str) -> Iterator[TrainingCallbacks]:
+        """Yield a report that does nothing, and a question that never stops training."""
         yield lambda report: None, lambda: False
 
 
@@ -146,28 +144,28 @@ def reproduce(
     accelerator: str = "auto",
     devices: str | int = "auto",
     watch: Watch | None = None,
-) -> dict[str, Any]:
-    """Make the data of a table's rows, train each, evaluate it, and write the table; or go on with one that was broken off.
+) -> JsonObject:
+    """Make the data of the rows of a table, train and evaluate each row, and write the table; or resume this.
 
-    ``out`` holds ``table.md``, ``table.json`` and ``table-NUMBER.png``, written anew after each row; ``data/``, one data set
-    for all rows that learn from the same, and one of unseen scenes; ``runs/``, one training a row; ``rows/``, what each
-    row reached. Other tables may be asked for in the same folder: a row that is in both is trained once.
+    ``out`` holds ``table.md``, ``table.json`` and ``table-NUMBER.png``, which are replaced after each row. ``data/`` holds
+    one training data set for all rows with the same data, and one of unseen scenes. ``runs/`` holds one training a row.
+    ``rows/`` holds the result of each row. Several tables may share a folder: a row of both is trained once.
 
     Args:
-        table: its number.
-        out: the folder.
+        table: number of the table.
+        out: folder of the results.
         effort: what is spent on each row.
-        rows: their names; default: all of the table.
-        workers: processes that render.
-        accelerator: Lightning's word.
-        devices: Lightning's word.
-        watch: who is told how far things are.
+        rows: names of rows; default: all rows of the table.
+        workers: number of processes that render.
+        accelerator: as in Lightning's trainer.
+        devices: as in Lightning's trainer.
+        watch: shows the progress; default: nothing is shown.
 
     Returns:
-        What ``table.json`` holds.
+        The content of ``table.json``.
 
     Raises:
-        MitsonarError: unknown names; a folder that holds other things, or was begun with other numbers or recipes.
+        MitsonarError: an unknown name; or the folder holds other things, or was begun with another effort or recipe.
     """
     known = table_named(table)
     recipes = {row.name: effort.recipe(row.recipe, {**known.set, **row.set}) for row in rows_named(known, rows)}
@@ -186,7 +184,7 @@ def reproduce(
 
 @dataclass(frozen=True)
 class Crew:
-    """Who does the work, which changes nothing in the folder: see :func:`reproduce`."""
+    """How the work is done, which has no effect on the results: see :func:`reproduce`."""
 
     workers: int
     accelerator: str
@@ -196,11 +194,11 @@ class Crew:
 
 @dataclass(frozen=True)
 class TableBuilder:
-    """The folder.
+    """The folder of a reproduction.
 
     Attributes:
-        run: which tables are wanted, and the recipes of their rows.
-        effort: what it was begun with.
+        run: the tables asked for, and the recipes of their rows.
+        effort: what is spent on each row.
     """
 
     run: RunDirectory
@@ -208,21 +206,21 @@ class TableBuilder:
 
     @property
     def folder(self) -> Path:
-        """Where it is."""
+        """Return the path of the folder."""
         return self.run.path
 
     @property
     def tables(self) -> list[str]:
-        """Names of the tables that are wanted."""
+        """Return the numbers of the tables asked for."""
         return self.run.notes.get("tables") or []
 
     @property
-    def recipes(self) -> dict[str, Any]:
-        """Recipes of the rows that were begun."""
+    def recipes(self) -> JsonObject:
+        """Return the recipes of the rows asked for, by the names of the rows."""
         return self.run.notes.get("recipes") or {}
 
     def ask(self, table: str, recipes: dict[str, TrainingRecipe]) -> None:
-        """Keep which tables are wanted, and the recipes of their rows.
+        """Store a table and the recipes of its rows.
 
         Raises:
             MitsonarError: a row was begun with another recipe.
@@ -235,20 +233,20 @@ class TableBuilder:
         self.run.note(tables=tables, recipes=had | asked)
 
     def work(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
-        """Data, training and evaluation of one row; each stays on disk when it is done, and is not done again."""
+        """Make the data of one row, train and evaluate it. What is on disk already is not repeated."""
         sequences = max(1, round(self.effort.scale * data.sequences))
         table = table_named(tables_with(name)[0])
         other, fresh = unseen_recipe(data, sequences, table.unseen, recipe.input.frames)
         if table.unseen is not None:
             fresh = max(min(fresh, UNSEEN_SEQUENCES[0]), round(self.effort.scale * fresh))
         seen = self._made(data, sequences, crew)
-        gain = DataStore.open(seen).about.get("gain")  # one sonar, whatever it looks at
+        gain = DataStore.open(seen).about.get("gain")  # both data sets are of one sonar
         unseen = self._made(other if gain is None else other.model_copy(update={"gain": gain}), fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
         noises = list(table.noises)
         scores = [
-            _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_teller(crew.watch, f"{name}, {said}")))
-            for url, part, said in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
+            _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_progress(crew.watch, f"{name}, {samples}")))
+            for url, part, samples in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
         ]
         reached = _reached(checkpoint, recipe, self._run(name))
         found = Found(recipe=name, validation=scores[0], unseen=scores[1], reached=reached)
@@ -256,16 +254,16 @@ class TableBuilder:
         write_json(self.folder / "rows" / f"{name}.json", found.model_dump(mode="json"))
 
     def _made(self, data: Recipe, sequences: int, crew: Crew) -> Path:
-        """A data set; all rows of the same recipe read the same one."""
+        """Make a data set, or complete it. Rows with the same data recipe share it."""
         path = self.folder / "data" / f"{data.name}-{data.digest()[:8]}.zarr"
-        told: list[Told] = []
+        advance: list[Advance] = []
 
         def begun(frames: int, done: int) -> None:
-            told.append(crew.watch.begin(f"rendering {path.stem}", frames, "frames"))
-            told[0](done)
+            advance.append(crew.watch.begin(f"rendering {path.stem}", frames, "frames"))
+            advance[0](done)
 
         make_dataset(
-            data, str(path), sequences=sequences, workers=crew.workers, begun=begun, progress=lambda more: told[0](more)
+            data, str(path), sequences=sequences, workers=crew.workers, begun=begun, progress=lambda more: advance[0](more)
         )
         return path
 
@@ -273,29 +271,38 @@ class TableBuilder:
         return self.folder / "runs" / name
 
     def _trained(self, name: str, recipe: TrainingRecipe, data: Path, crew: Crew) -> Checkpoint:
-        """The network of a row."""
+        """Train the network of a row, or resume its training."""
         run = self._run(name)
-        words: dict[str, Any] = {"minutes": self.effort.minutes, "accelerator": crew.accelerator, "devices": crew.devices}
         with crew.watch.training(name) as (progress, stop):
-            return train(recipe, data, run, resume=run.exists(), progress=progress, stop=stop, **words)
+            return train(
+                recipe,
+                data,
+                run,
+                minutes=self.effort.minutes,
+                resume=run.exists(),
+                accelerator=crew.accelerator,
+                devices=crew.devices,
+                progress=progress,
+                stop=stop,
+            )
 
     def found(self) -> dict[str, Found]:
-        """Rows that are done.
+        """Load the results of the rows that are done.
 
         Raises:
-            MitsonarError: a file that is damaged.
+            MitsonarError: a file is damaged.
         """
         rows = {}
         for path in sorted((self.folder / "rows").glob("*.json")):
             try:
                 rows[path.stem] = Found(**read_json(path))
             except (ValidationError, TypeError) as error:
-                said = complaint(error, Found, "row") if isinstance(error, ValidationError) else str(error)
-                raise MitsonarError(f"{path} is damaged ({said}): remove it, and the row is evaluated again") from None
+                reason = complaint(error, Found, "row") if isinstance(error, ValidationError) else str(error)
+                raise MitsonarError(f"{path} is damaged ({reason}): remove it, and the row is evaluated again") from None
         return rows
 
-    def report(self) -> dict[str, Any]:
-        """Write the tables and figures of what there is."""
+    def report(self) -> JsonObject:
+        """Write the tables and figures of the rows that are done, and return the content of ``table.json``."""
         found, version = self.found(), versions(("mitsonar",))["mitsonar"]
         tables = [table_named(name) for name in self.tables]
         lines = [f"`mitsonar reproduce`, mitsonar {version}: {self.effort.sentence()}."]
@@ -313,13 +320,13 @@ class TableBuilder:
 
 
 def unseen_recipe(data: Recipe, learnt: int, wanted: int | None, frames: int) -> tuple[Recipe, int]:
-    """The recipe of unseen scenes, and how many of its sequences are made.
+    """Return the recipe of unseen scenes, and how many of its sequences are made.
 
     Args:
-        data: that training learns from.
-        learnt: sequences of it.
-        wanted: sequences, of no more frames than a sample has; None: part of the training's.
-        frames: of a sample.
+        data: recipe of the training data.
+        learnt: number of training sequences.
+        wanted: number of sequences, each with the frames of one sample; None: a part of ``learnt``.
+        frames: frames of a sample.
     """
     fields = data.model_dump(mode="json") | {"name": f"{data.name}-unseen", "seed": (data.seed + UNSEEN_SEED) % 2**31}
     if wanted is None:
@@ -331,13 +338,13 @@ def unseen_recipe(data: Recipe, learnt: int, wanted: int | None, frames: int) ->
     return recipe_from(fields), wanted
 
 
-def _teller(watch: Watch, what: str) -> Callable[[int], Told]:
-    """For :func:`~mitsonar.training.evaluation.evaluate`."""
+def _progress(watch: Watch, what: str) -> Callable[[int], Advance]:
+    """Return the argument ``begin`` of :func:`~mitsonar.training.evaluation.evaluate`."""
     return lambda total: watch.begin(f"evaluating {what}", total, "pairs")
 
 
-def _scores(report: dict[str, Any]) -> dict[str, RowScore]:
-    """What an evaluation found, by noise."""
+def _scores(report: JsonObject) -> dict[str, RowScore]:
+    """Return the errors of an evaluation, by noise."""
     scores = {}
     for table in report["tables"]:
         row = next(row for row in table["rows"] if row["method"] == report["network"])
@@ -352,18 +359,18 @@ def _scores(report: dict[str, Any]) -> dict[str, RowScore]:
 
 
 def _reached(checkpoint: Checkpoint, recipe: TrainingRecipe, folder: Path) -> Reached:
-    """The scale of a training that has ended, from what it wrote.
+    """Return the scale of a finished training, as its folder states it.
 
     Raises:
-        MitsonarError: that file is damaged.
+        MitsonarError: the folder is damaged.
     """
     try:
-        return _as_told(checkpoint, recipe, RunDirectory.open(folder, TRAINING).notes)
+        return _scale(checkpoint, recipe, RunDirectory.open(folder, TRAINING).notes)
     except (KeyError, TypeError, ZeroDivisionError, ValidationError) as error:
         raise MitsonarError(f"{folder} is damaged ({error}): remove it, and the row is trained again") from None
 
 
-def _as_told(checkpoint: Checkpoint, recipe: TrainingRecipe, run: dict[str, Any]) -> Reached:
+def _scale(checkpoint: Checkpoint, recipe: TrainingRecipe, run: JsonObject) -> Reached:
     seen = run["steps_done"] * recipe.batch
     machine = run["machine"]
     return Reached(
@@ -385,7 +392,7 @@ def _as_told(checkpoint: Checkpoint, recipe: TrainingRecipe, run: dict[str, Any]
 
 
 def _processor() -> str:
-    """The name of this machine's processor."""
+    """Return the name of the processor of this machine."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

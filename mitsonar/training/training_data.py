@@ -1,11 +1,11 @@
-"""What a training reads: batches whose order is a function of (seed, epoch, index), and samples to validate on."""
+"""Samples of a training: batches whose order is a function of (seed, epoch, index), and validation samples."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,6 +21,12 @@ from mitsonar.datasets.scene_rendering import calibrate
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.simulation.variant import ensure_variant
+from mitsonar.training.training_types import Array, Batch, JsonObject, RawSample
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.arrangement import Arrangement
+    from mitsonar.datasets.response_packing import Packing
+    from mitsonar.training.training_types import NetworkInput
 
 __all__ = ["STEP", "Material", "Validation", "batches", "finished", "material_of", "seed_of"]
 
@@ -32,12 +38,12 @@ VALIDATION_WORLDS = 5
 
 
 def seed_of(*numbers: int) -> int:
-    """A seed of 63 bits, a hash of whole numbers."""
+    """Return a seed of 63 bits, a hash of whole numbers."""
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
 
 
 Kind = SonarPairs | RenderedPairs | ImpulsePairs
-"""Of samples."""
+"""Samples that a network can learn from."""
 
 
 @dataclass(frozen=True)
@@ -45,43 +51,42 @@ class Material:
     """What a network learns from.
 
     Attributes:
-        samples: stored or rendered.
-        numbers: of the stored samples that are for training; None: they are rendered.
+        samples: stored or rendered samples.
+        numbers: numbers of the stored samples for training; None: samples are rendered.
         epoch: samples of an epoch.
-        validation: what is validated on.
-        about: what a resumed run must find again: name and digest of the data.
+        validation: validation samples.
+        about: name, digest and gain of the data, which a resumed run must repeat.
     """
 
     samples: Kind
     numbers: NDArray[np.int64] | None
     epoch: int
     validation: Validation
-    about: dict[str, Any]
+    about: JsonObject
 
 
 class Validation:
-    """Samples that a network never learns from, with each level of noise; always the same ones, with the same noise.
+    """Samples that training does not use, with each level of noise. Samples and noise are always the same.
 
     Args:
-        samples: with raw labels.
-        rows: the raw samples, or the numbers of stored ones.
-        levels: names of noise levels.
+        samples: with labels of kind ``raw``.
+        rows: raw samples, or numbers of stored samples.
+        levels: names of levels of noise.
     """
 
-    def __init__(self, samples: Kind, rows: list[dict[str, Any]] | list[int], levels: list[str]) -> None:
+    def __init__(self, samples: Kind, rows: list[RawSample] | list[int], levels: list[str]) -> None:
         self.samples, self.rows = samples, rows
-        self.arrangements: dict[str, Any] = {level: samples.at_noise(level) for level in dict.fromkeys(levels)}
+        self.arrangements: dict[str, Arrangement | Packing] = {
+            level: samples.at_noise(level) for level in dict.fromkeys(levels)
+        }
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def batches(self, size: int, device: torch.device | str | None = None) -> Iterator[tuple[str, Any, NDArray[np.float64]]]:
-        """Noise level, inputs on a device, and true motions [m, rad] (or heights [m]), batch after batch."""
+    def batches(self, size: int, device: torch.device | str | None = None) -> Iterator[tuple[str, NetworkInput, Array]]:
+        """Yield level of noise, inputs on a device, and true motions [m, rad] (or heights [m]) of each batch."""
         for begin in range(0, len(self), size):
-            rows = [
-                self.samples.raw(row) if isinstance(row, int) else row  # type: ignore[call-arg, arg-type]
-                for row in self.rows[begin : begin + size]
-            ]
+            rows = [self.samples.raw(row) if isinstance(row, int) else row for row in self.rows[begin : begin + size]]
             raw = default_collate(rows)
             for level, arrangement in self.arrangements.items():
                 self.samples.arrange = arrangement
@@ -90,16 +95,16 @@ class Validation:
 
 
 def material_of(recipe: TrainingRecipe, data: str | Path | None, *, render: bool, gain: float | None = None) -> Material:
-    """What a recipe's network learns from: a data set's parts, or frames that are rendered as it learns.
+    """Open the data of a recipe: parts of a data set, or frames that are rendered during training.
 
     Args:
         recipe: of the training.
-        data: path or URL of a data set; with ``render`` validation is on it.
-        render: training samples are rendered, of the recipe of ``data`` or the one that the training's recipe names.
-        gain: of rendered pixels, where it is known.
+        data: path or URL of a data set. With ``render`` it is used for validation only.
+        render: render training samples, by the recipe of ``data`` or the one that the recipe names.
+        gain: of rendered pixels, if it is known.
 
     Raises:
-        MitsonarError: neither, no such data set, views or kinds it has not, too few samples.
+        MitsonarError: neither ``data`` nor ``render``, no such data set, missing views or kinds, or too few samples.
     """
     if data is None and not render:
         raise MitsonarError("a training needs samples: give --data DATA.zarr, or --render to have them rendered")
@@ -136,18 +141,18 @@ def _stored(recipe: TrainingRecipe, data: str | Path) -> Material:
     return Material(pairs, numbers, len(numbers), validation, about)
 
 
-def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: Any) -> SonarPairs | ImpulsePairs:
+def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: str) -> SonarPairs | ImpulsePairs:
     kind = ImpulsePairs if recipe.input.kind == "response" else SonarPairs
     return kind(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **words})
 
 
 def _within(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> NDArray[np.bool_]:
-    """Which samples lie in the part of the data that is used."""
+    """Return which samples are in the part of the data that is used ``(samples,)``."""
     return np.asarray(pairs.first + pairs.frames <= recipe.part_of_data * len(pairs.store))
 
 
 def _validation(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> Validation:
-    """Stored samples, those of other sequences first."""
+    """Choose stored samples, from as many sequences as possible."""
     wanted = recipe.validation
     numbers = np.flatnonzero(_within(recipe, pairs))
     if not len(numbers):
@@ -156,7 +161,7 @@ def _validation(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> Val
             "part_of_data, or make more"
         )
     numbers = np.random.default_rng([recipe.seed, CHOICE]).permutation(numbers)
-    # how many of its sequence come before it: the first of each sequence, then the second ...
+    # rank within the sequence: the first sample of each sequence is taken, then the second ...
     sequence = pairs.sequence[pairs.first[numbers]]
     order = np.argsort(sequence, kind="stable")
     starts = np.flatnonzero(np.diff(sequence[order], prepend=-1))
@@ -167,7 +172,7 @@ def _validation(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> Val
 
 
 def _rendered_validation(recipe: TrainingRecipe, world: Recipe, gain: float) -> Validation:
-    """Samples of a few worlds of their own, rendered once."""
+    """Render samples of a few worlds that training does not use."""
     wanted = recipe.validation
     count = wanted.pairs or 500
     words = {**recipe.arrangement(), "labels": "raw", "seed": seed_of(recipe.seed, WORLDS) >> 33}
@@ -189,26 +194,26 @@ def batches(
     device: torch.device,
     workers: int = 0,
     share: tuple[int, int] = (0, 1),
-) -> DataLoader[Any]:
-    """Batches ``start`` to ``stop`` of a training, whatever was read before; none that is skipped is read.
+) -> DataLoader[Batch]:
+    """Load the batches ``start`` to ``stop`` of a training. They do not depend on ``start``; skipped batches are not read.
 
-    On a CPU they are finished where they are read, else on the device: :func:`finished`.
+    On a CPU, the processes that read also finish the samples. Otherwise :func:`finished` does this on the device.
 
     Args:
-        material: what is learnt from.
+        material: data of the training.
         recipe: of the training.
         start: first step.
         stop: step after the last.
-        device: that the network is on.
-        workers: processes that read or render.
-        share: number of this device and how many there are.
+        device: of the network.
+        workers: number of processes that read or render.
+        share: number of this device, and number of devices.
     """
     together = _Together(material.samples, finish=device.type == "cpu")
-    words: dict[str, Any] = {
+    words: JsonObject = {
         "num_workers": workers,
         "collate_fn": together,
         "pin_memory": device.type == "cuda",
-        "multiprocessing_context": "spawn" if workers else None,  # a fork after the ray tracer has started is unsafe
+        "multiprocessing_context": "spawn" if workers else None,  # a fork is unsafe once the ray tracer runs
     }
     size = recipe.batch // share[1]
     if isinstance(material.samples, RenderedPairs):
@@ -219,9 +224,9 @@ def batches(
 
 
 class Order(Sampler[list[tuple[int, int]]]):
-    """(epoch, sample) of each batch from step ``start`` on: each epoch deals out the samples anew, by (seed, epoch).
+    """(epoch, sample) of each batch from step ``start`` on. Each epoch permutes the samples by (seed, epoch).
 
-    What does not fill a batch at the end of an epoch is left to other epochs.
+    Samples that do not fill a batch at the end of an epoch are left out of that epoch.
     """
 
     def __init__(
@@ -231,33 +236,33 @@ class Order(Sampler[list[tuple[int, int]]]):
 
     def __iter__(self) -> Iterator[list[tuple[int, int]]]:
         one, of = self.share
-        known, dealt = -1, self.numbers
+        known, order = -1, self.numbers
         for step in range(self.start, self.stop):
-            epoch, place = divmod(step, len(self.numbers) // self.batch)
+            epoch, position = divmod(step, len(self.numbers) // self.batch)
             if epoch != known:
-                known, dealt = epoch, np.random.default_rng([self.seed, ORDER, epoch]).permutation(self.numbers)
-            yield [(epoch, int(number)) for number in dealt[place * self.batch : (place + 1) * self.batch][one::of]]
+                known, order = epoch, np.random.default_rng([self.seed, ORDER, epoch]).permutation(self.numbers)
+            yield [(epoch, int(number)) for number in order[position * self.batch : (position + 1) * self.batch][one::of]]
 
 
 @dataclass(frozen=True)
-class _Stored(Dataset[Any]):
+class _Stored(Dataset[RawSample]):
     """Raw samples with their epoch, for workers that only read."""
 
     pairs: SonarPairs | ImpulsePairs
 
-    def __getitem__(self, key: tuple[int, int]) -> dict[str, Any]:
+    def __getitem__(self, key: tuple[int, int]) -> RawSample:
         epoch, number = key
         return {"epoch": epoch, **self.pairs.raw(number)}
 
 
 @dataclass(frozen=True)
 class _Together:
-    """Raw samples become a batch: ``epoch``, ``frames``, and ``raw``, or finished ``inputs`` and ``label``."""
+    """Collates raw samples into a batch: ``epoch``, ``frames``, and ``raw``, or finished ``inputs`` and ``label``."""
 
     samples: Kind
     finish: bool
 
-    def __call__(self, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    def __call__(self, rows: list[RawSample]) -> Batch:
         epoch = rows[0].get("epoch", 0)
         raw = default_collate([{name: values for name, values in row.items() if name != "epoch"} for row in rows])
         batch = {"epoch": epoch, "frames": raw["frames"][:, 0].clone()}
@@ -268,8 +273,8 @@ class _Together:
         return {**batch, "inputs": inputs, "label": label}
 
 
-def finished(batch: dict[str, Any], samples: Kind, device: torch.device) -> tuple[Any, Tensor]:
-    """Inputs and labels of a batch on a device."""
+def finished(batch: Batch, samples: Kind, device: torch.device) -> tuple[NetworkInput, Tensor]:
+    """Return inputs and labels of a batch on a device."""
     if "inputs" in batch:
         return batch["inputs"], batch["label"]
     samples.set_epoch(batch["epoch"])

@@ -6,6 +6,7 @@ import csv
 import io
 import os
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from mitsonar.io.plain_data import whole_number
 from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.motion_errors import Axis
+from mitsonar.training.training_types import JsonObject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,23 +40,25 @@ TRAINING = RunKind(
 )
 
 WIDE = 30
-"""Ratio of samples seen from which they are drawn on a log axis."""
+"""Ratio of last to first samples seen from which their axis is logarithmic."""
 
 
 class StateFile(TorchCheckpointIO):
-    """Lightning's state, written whole and read without executing anything in it."""
+    """The file of Lightning's state. It is written whole or not at all, and nothing in it is executed."""
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        """Write it."""
+    def save_checkpoint(self, checkpoint: JsonObject, path: str | Path, storage_options: object | None = None) -> None:
+        """Write a state, whole or not at all."""
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
         write_whole(path, buffer.getvalue())
 
-    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = True) -> dict[str, Any]:
-        """Read it.
+    def load_checkpoint(
+        self, path: str | Path, map_location: Callable[..., Any] | None = None, weights_only: bool | None = True
+    ) -> JsonObject:
+        """Read a state, without executing anything in it.
 
         Raises:
-            MitsonarError: damaged, or something else.
+            MitsonarError: the file is damaged, or holds something else.
         """
         try:
             state = torch.load(path, map_location=map_location or "cpu", weights_only=True)
@@ -71,12 +75,12 @@ class StateFile(TorchCheckpointIO):
 
 @dataclass
 class RunFolder:
-    """Where a training lies.
+    """The folder of a training.
 
     Attributes:
         path: of the folder.
-        writes: whether this process is the one that writes.
-        run: what was asked for, and how far it is; None before :meth:`begin`, and where another process writes.
+        writes: whether this process writes.
+        run: arguments and progress; None before :meth:`begin`, and if another process writes.
     """
 
     path: Path
@@ -85,16 +89,16 @@ class RunFolder:
 
     @property
     def state(self) -> Path:
-        """What --resume goes on from."""
+        """Return the path of the state, from which --resume continues."""
         return self.path / "last.ckpt"
 
     @property
     def network(self) -> Path:
-        """The best network."""
+        """Return the path of the best network."""
         return self.path / "network.ckpt"
 
     def known(self) -> RunDirectory | None:
-        """An earlier run, which may be another one.
+        """Return the earlier run in the folder, if there is one. Its arguments may differ.
 
         Raises:
             MitsonarError: its file is damaged.
@@ -102,19 +106,19 @@ class RunFolder:
         return RunDirectory.open(self.path, TRAINING) if (self.path / RUN_FILE).is_file() else None
 
     def begin(
-        self, recipe: TrainingRecipe, asked: dict[str, Any], notes: dict[str, Any], *, resume: bool, overwrite: bool
+        self, recipe: TrainingRecipe, asked: JsonObject, notes: JsonObject, *, resume: bool, overwrite: bool
     ) -> RunDirectory | None:
-        """Make the folder, or find an earlier run in it; that run.
+        """Create the folder, or resume the run in it, and return the resumed run.
 
         Args:
             recipe: of the training.
-            asked: what a resumed run must have as before, beside the recipe, to reach the same weights.
-            notes: what else is worth knowing of the run.
-            resume: go on with a run that is there.
-            overwrite: begin anew where a run is.
+            asked: arguments beside the recipe that a resumed run must repeat to reach the same weights.
+            notes: other facts on the run.
+            resume: resume a run in the folder.
+            overwrite: replace a run in the folder.
 
         Raises:
-            MitsonarError: it exists and neither is allowed, holds other things, or an earlier run differs.
+            MitsonarError: the folder holds a run and neither is allowed, the arguments differ, or it holds other things.
         """
         if not self.writes:
             return None
@@ -126,14 +130,14 @@ class RunFolder:
             write_whole(self.path / "recipe.yaml", text.encode())
         return self.run if self.run.resumed else None
 
-    def end(self, *, finished: bool, **notes: Any) -> None:
-        """Keep how far the training is."""
+    def end(self, *, finished: bool, **notes: float) -> None:
+        """Store the progress of the training."""
         if self.run is not None:
             self.run.finished = finished
             self.run.note(**notes)
 
-    def log(self, rows: list[dict[str, Any]], zero: list[float], axes: tuple[Axis, ...]) -> None:
-        """Write log.csv and curve.png anew."""
+    def log(self, rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...]) -> None:
+        """Write ``log.csv`` and ``curve.png``."""
         if not rows:
             return
         text = io.StringIO()
@@ -148,24 +152,24 @@ class RunFolder:
         write_whole(self.path / "curve.png", buffer.getvalue())
 
 
-def machine() -> dict[str, Any]:
-    """Where a run is made."""
+def machine() -> JsonObject:
+    """Describe this machine."""
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     return {"system": platform.platform(), "cores": len(os.sched_getaffinity(0)), "gpu": device}
 
 
 def column(level: str, axis: Axis) -> str:
-    """Name of a column of the log: validation RMSE at a level of noise."""
+    """Return the name of a column of the log: the validation RMSE of one axis at a level of noise."""
     return f"{level} {axis.name} ({axis.unit})"
 
 
-def curve_figure(rows: list[dict[str, Any]], zero: list[float], axes: tuple[Axis, ...]) -> Figure:
-    """The loss, and the validation RMSE of each number, against training samples seen.
+def curve_figure(rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...]) -> Figure:
+    """Draw the loss, and the validation RMSE of each axis, against the training samples seen.
 
     Args:
         rows: of the log.
-        zero: RMSE of answering no motion, in the units of ``axes``.
-        axes: what is estimated.
+        zero: RMSE of always answering no motion, in the units of ``axes``.
+        axes: names and units of the estimates.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter, FormatStrFormatter, LogLocator, NullFormatter

@@ -1,76 +1,37 @@
-"""A training from recipe to checkpoint, which may be killed at any moment and goes on to the same bits."""
+"""A training from recipe to checkpoint. It may be killed at any moment, and a resumed run ends with the same bits.
+
+Sample order, noise and dropout are functions of (seed, epoch, index) and (seed, step). The bits are the same on a CPU with
+the same number of threads.
+"""
 
 from __future__ import annotations
 
 import logging
-import math
 import os
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import lightning
-import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback
-from numpy.typing import NDArray
 
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.provenance import other_versions
 from mitsonar.io.run_directory import RunDirectory
-from mitsonar.motion.motion_errors import Axis
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_data import Material, material_of
-from mitsonar.training.training_folder import RunFolder, StateFile, column
-from mitsonar.training.training_step import NetworkTraining, axes_of, network_for, rmse_by_level
+from mitsonar.training.training_folder import RunFolder, StateFile
+from mitsonar.training.training_journal import STATE_MINUTES, Journal, Pace, TrainingReport
+from mitsonar.training.training_step import NetworkTraining, network_for
+from mitsonar.training.training_types import JsonObject
 
 __all__ = ["TrainingReport", "leads", "train"]
 
-STATE_MINUTES = 5.0
-"""Between two states on disk: what a kill may cost."""
-
 MOST_AT_ONCE = 1024
-"""Threads, and processes, that a run may have had."""
-
-SMOOTH = 0.98
-"""Weight of the past in the running numbers of a report."""
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class TrainingReport:
-    """How far a training is; after each step.
-
-    Attributes:
-        step, steps: done, and planned.
-        epoch: of the step, from 0, with its fraction.
-        pairs: samples seen.
-        minutes: trained, all resumed runs together.
-        per_second: samples a second in this process.
-        loss: running mean.
-        rmse: running, of training samples, in the units of ``axes``.
-        validation: the last validation's RMSE by level of noise, in the units of ``axes``.
-        validated: whether it is of this step.
-        axes: names and units.
-    """
-
-    step: int
-    steps: int
-    epoch: float
-    pairs: int
-    minutes: float
-    per_second: float
-    loss: float
-    rmse: list[float]
-    validation: dict[str, list[float]]
-    validated: bool
-    axes: tuple[Axis, ...]
+"""Largest number of threads, and of processes, that a run may have had."""
 
 
 def train(
@@ -94,54 +55,88 @@ def train(
     progress: Callable[[TrainingReport], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Checkpoint:
-    """Train a network; the best one by validation at the noise of training.
-
-    Sample order, noise and dropout are functions of (seed, epoch, index) and (seed, step). On a CPU, with the same number of
-    threads, a run that was killed and resumed ends with the same bits as an unbroken one.
+    """Train a network, and return the best one by validation at the noise of training.
 
     Args:
-        recipe: of the training, its name, or a YAML file.
+        recipe: of the training; its name, or a YAML file.
         data: path or URL of a data set.
         out: folder of the run.
-        render: training samples are rendered meanwhile, of the recipe of ``data``, else of the one that the recipe names.
-        minutes: of training after which it stops, all resumed runs together, validation included.
-        resume: go on with the run in ``out``; one that is not there begins.
-        overwrite: begin anew where a run is.
-        scale: only this part of the data, times the recipe's ``part_of_data``.
+        render: render training samples meanwhile, by the recipe of ``data``, else by the one that the recipe names.
+        minutes: duration after which training stops [min], of all resumed runs together, with validation.
+        resume: resume the run in ``out``, or begin if there is none.
+        overwrite: replace a run in ``out``.
+        scale: part of the data to use, times ``part_of_data`` of the recipe.
         pairs: length of the training in samples, in place of the recipe's.
-        accelerator, devices, strategy: Lightning's.
-        precision: Lightning's, in place of the recipe's.
-        threads: of the CPU.
-        workers: processes that read or render; default: by the machine.
-        state_minutes: between two states on disk.
+        accelerator: as in Lightning's trainer.
+        devices: as in Lightning's trainer.
+        strategy: as in Lightning's trainer.
+        precision: as in Lightning's trainer, in place of the recipe's.
+        threads: number of CPU threads.
+        workers: number of processes that read or render; default: by the machine.
+        state_minutes: time between two states on disk [min].
         progress: called after each step.
-        stop: asked after each step; when it says so the state is kept and training stops.
+        stop: called after each step; if it returns true, the state is saved and training stops.
 
     Raises:
-        MitsonarError: what does not go together, before training begins; a loss that is not finite.
+        MitsonarError: contradictory arguments, before training begins; or a loss that is not finite.
     """
-    recipe = recipe if isinstance(recipe, TrainingRecipe) else load_training_recipe(recipe)
-    recipe = _changed(recipe, scale, pairs, precision)
-    if minutes is not None and not minutes > 0:
-        raise MitsonarError(f"--minutes must be above 0: got {minutes:g}")
-    if threads is not None and threads < 1:
-        raise MitsonarError(f"--threads must be at least 1: got {threads}")
-    folder = RunFolder(Path(out), writes=leads())
-    known = folder.known() if resume else None
-    gain = None if known is None else known.amount("gain")
-    threads = threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
-    material = material_of(recipe, data, render=render, gain=gain)
-    network = network_for(recipe, material)
-    with _quiet(), _settings(threads), torch.random.fork_rng(devices=[]):
-        module = NetworkTraining(network, recipe, material)
-        journal = Journal(folder, module, material, minutes, state_minutes, progress, stop)
-        trainer = _trainer(module, folder, journal, accelerator, devices, strategy)
-        workers = _workers(workers, known, render, trainer)
+    recipe, folder = _changed(recipe, scale, pairs, precision), RunFolder(Path(out), writes=leads())
+    hardware = _Hardware(accelerator, devices, strategy, threads, workers)
+    run = _Run(recipe, data, folder, render, resume, overwrite)
+    return run.train(hardware, Pace(minutes, state_minutes, progress, stop))
+
+
+@dataclass(frozen=True)
+class _Hardware:
+    """Where a training is computed: see :func:`train`."""
+
+    accelerator: str
+    devices: str | int
+    strategy: str
+    threads: int | None
+    workers: int | None
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What is trained and where it is kept: see :func:`train`."""
+
+    recipe: TrainingRecipe
+    data: str | Path | None
+    folder: RunFolder
+    render: bool
+    resume: bool
+    overwrite: bool
+
+    def train(self, hardware: _Hardware, pace: Pace) -> Checkpoint:
+        """Train, or resume training, and return the best network."""
+        if pace.minutes is not None and not pace.minutes > 0:
+            raise MitsonarError(f"--minutes must be above 0: got {pace.minutes:g}")
+        if hardware.threads is not None and hardware.threads < 1:
+            raise MitsonarError(f"--threads must be at least 1: got {hardware.threads}")
+        known = self.folder.known() if self.resume else None
+        gain = None if known is None else known.amount("gain")
+        threads = hardware.threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
+        material = material_of(self.recipe, self.data, render=self.render, gain=gain)
+        network = network_for(self.recipe, material)
+        with _quiet(), _settings(threads), torch.random.fork_rng(devices=[]):
+            module = NetworkTraining(network, self.recipe, material)
+            journal = Journal(self.folder, module, material, pace)
+            trainer = _trainer(module, self.folder, journal, hardware)
+            workers = _workers(hardware.workers, known, self.render, trainer)
+            self._begin(material, module, trainer, workers)
+            self._fit(module, journal, trainer, workers)
+        if journal.stopped:
+            raise KeyboardInterrupt
+        return Checkpoint.load(self.folder.path)
+
+    def _begin(self, material: Material, module: NetworkTraining, trainer: lightning.Trainer, workers: int) -> None:
+        """Create the folder of the run, or check that it holds this run."""
         asked = {
             "data": material.about["name"],
             "digest": material.about["digest"],
-            "render": render,
-            "workers": workers if render else None,
+            "render": self.render,
+            "workers": workers if self.render else None,
             "world_size": trainer.world_size,
         }
         notes = {
@@ -151,209 +146,47 @@ def train(
             "epoch_samples": material.epoch,
             "steps": module.steps,
         }
-        _warn_of_other_bits(folder.begin(recipe, asked, notes, resume=resume, overwrite=overwrite), notes)
-        state = folder.state if resume and folder.state.is_file() else None
-        begun = StateFile().load_checkpoint(state) if state else None
-        done = begun["global_step"] if begun else 0
-        used = float(begun["callbacks"][journal.state_key]["minutes"]) if begun else 0.0
-        del begun
-        if done < module.steps and minutes is not None and used >= minutes and not folder.network.is_file():
+        earlier = self.folder.begin(self.recipe, asked, notes, resume=self.resume, overwrite=self.overwrite)
+        _warn_of_other_bits(earlier, notes)
+
+    def _fit(self, module: NetworkTraining, journal: Journal, trainer: lightning.Trainer, workers: int) -> None:
+        """Train from the last state on, if steps and minutes are left.
+
+        Raises:
+            MitsonarError: no minutes are left, and there is no network yet.
+        """
+        minutes = journal.pace.minutes
+        state = self.folder.state if self.resume and self.folder.state.is_file() else None
+        done, used = _position(state, journal)
+        if done < module.steps and minutes is not None and used >= minutes and not self.folder.network.is_file():
             raise MitsonarError(
-                f"the run in {folder.path} was stopped before it validated once, and has had its {minutes:g} minutes "
+                f"the run in {self.folder.path} was stopped before it validated once, and has used its {minutes:g} minutes "
                 f"({used:.1f}): resume it with more"
             )
         if done < module.steps and (minutes is None or used < minutes):
             module.workers = workers
             trainer.fit(module, ckpt_path=state, weights_only=True)
-    if journal.stopped:
-        raise KeyboardInterrupt
-    return Checkpoint.load(folder.path)
+
+
+def _position(state: Path | None, journal: Journal) -> tuple[int, float]:
+    """Return the steps and minutes that a state has done; without a state none."""
+    if state is None:
+        return 0, 0.0
+    begun = StateFile().load_checkpoint(state)
+    return begun["global_step"], float(begun["callbacks"][journal.state_key]["minutes"])
 
 
 def leads() -> bool:
-    """Whether this process writes and speaks, where Lightning has started several."""
+    """Return whether this process writes and prints, of the several that Lightning may have started."""
     return all(os.environ.get(name, "0") == "0" for name in ("LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"))
 
 
-class Journal(Callback):
-    """What happens between steps: reports, validation, states, the best network, and the end.
-
-    Nothing here changes what the next step computes.
-    """
-
-    def __init__(
-        self,
-        folder: RunFolder,
-        module: NetworkTraining,
-        material: Material,
-        minutes: float | None,
-        state_minutes: float,
-        progress: Callable[[TrainingReport], None] | None,
-        stop: Callable[[], bool] | None,
-    ) -> None:
-        self.folder, self.module, self.material = folder, module, material
-        self.minutes, self.state_minutes, self.progress, self.stop = minutes, state_minutes, progress, stop
-        self.recipe, self.axes = module.recipe, axes_of(material.samples.labels)
-        self.scales = np.array([axis.scale for axis in self.axes])
-        self.kept = _Kept()
-        self.had_minutes = 0.0
-        self.stopped = False
-        self.running = _Running()
-        self.validation: dict[str, list[float]] = {}
-
-    def state_dict(self) -> dict[str, Any]:
-        """For last.ckpt."""
-        return {**vars(self.kept), "minutes": self.spent}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """From last.ckpt."""
-        self.had_minutes = float(state_dict["minutes"])
-        self.kept = _Kept(**{name: value for name, value in state_dict.items() if name != "minutes"})
-
-    @property
-    def spent(self) -> float:
-        """Minutes of training, all resumed runs together."""
-        return self.had_minutes + (time.monotonic() - self.begun) / 60
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """The clock starts."""
-        self.begun = self.saved = self.validated = time.monotonic()
-        self.first = trainer.global_step
-
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """After each step."""
-        step = trainer.global_step
-        loss = float(outputs["loss"].detach())
-        self.kept.loss_sum, self.kept.loss_count = self.kept.loss_sum + loss, self.kept.loss_count + 1
-        self.running.add(loss, self.module.squares)
-        end, validate, save = self._due(trainer, step)
-        if validate and trainer.is_global_zero:
-            self._validate(trainer, step)
-        if self.progress is not None and trainer.is_global_zero:
-            self.progress(self._report(step, validate))
-        if save and self._finite():  # every process takes part in writing
-            trainer.save_checkpoint(self.folder.state)
-            self.saved = time.monotonic()
-        if end:
-            if trainer.is_global_zero:
-                finished = step >= self.module.steps
-                self.folder.end(finished=finished, steps_done=step, minutes=round(self.spent, 3))
-            trainer.strategy.barrier()
-            trainer.should_stop = True
-
-    def _due(self, trainer: lightning.Trainer, step: int) -> tuple[bool, bool, bool]:
-        """Whether training ends, is validated, and its state kept: as the first process says."""
-        now, told = time.monotonic(), self.recipe.validation
-        self.stopped = self.stopped or (self.stop is not None and self.stop())
-        over = self.minutes is not None and self.spent >= self.minutes
-        end = step >= self.module.steps or over or self.stopped
-        if told.every_steps is not None:
-            validate = step % told.every_steps == 0
-        else:
-            validate = now - self.validated >= told.every_minutes * 60
-        validate = validate or (end and not self.stopped)
-        due = end, validate, end or validate or now - self.saved >= self.state_minutes * 60
-        return due if trainer.world_size == 1 else trainer.strategy.broadcast(due)
-
-    def _validate(self, trainer: lightning.Trainer, step: int) -> None:
-        """A row of the log; the network is kept if it is the best so far."""
-        context = trainer.precision_plugin.forward_context()
-        size = max(self.recipe.batch, 8)
-        labels, device = self.material.samples.labels, self.module.device
-        rmse, zero = rmse_by_level(
-            self.module.network, self.material.validation, labels, size, device=device, context=context
-        )
-        self.validation = {level: (values * self.scales).tolist() for level, values in rmse.items()}
-        row: dict[str, Any] = {
-            "step": step,
-            "epoch": step / self.module.epoch_steps,
-            "pairs": step * self.recipe.batch,
-            "minutes": self.spent,
-            "learning_rate": self.recipe.optimiser.rate_at(step - 1, self.module.epoch_steps, self.module.steps),
-            "loss": self.kept.loss_sum / self.kept.loss_count,
-        }
-        for level, values in self.validation.items():
-            row |= {column(level, axis): value for axis, value in zip(self.axes, values, strict=True)}
-        self.kept.rows.append(row)
-        self.kept.loss_sum, self.kept.loss_count = 0.0, 0
-        score = _score([rmse[level] for level in self.recipe.noises], zero)
-        if self._finite() and not score >= self.kept.best:
-            self.kept.best = score
-            self._checkpoint(row).save(self.folder.network)
-        self.folder.log(self.kept.rows, (zero * self.scales).tolist(), self.axes)
-        self.validated = time.monotonic()
-
-    def _checkpoint(self, row: dict[str, Any]) -> Checkpoint:
-        """The network as it is now."""
-        count = len(self.material.validation)
-        metrics = {level: {"rmse": values, "pairs": count} for level, values in self.validation.items()}
-        trained = {"pairs": row["pairs"], "minutes": round(row["minutes"], 2), "epochs": round(row["epoch"], 3)}
-        return Checkpoint.of(
-            self.module.network,
-            self.material.samples,
-            noise=self.recipe.noise_said,
-            recipe=self.recipe.plain(),
-            metrics=metrics,
-            trained={**trained, "steps": row["step"], "seed": self.recipe.seed},
-        )
-
-    def _finite(self) -> bool:
-        """Whether the network is worth keeping."""
-        return all(bool(torch.isfinite(values).all()) for values in self.module.network.state_dict().values())
-
-    def _report(self, step: int, validated: bool) -> TrainingReport:
-        seconds = time.monotonic() - self.begun
-        return TrainingReport(
-            step=step,
-            steps=self.module.steps,
-            epoch=step / self.module.epoch_steps,
-            pairs=step * self.recipe.batch,
-            minutes=self.spent,
-            per_second=(step - self.first) * self.recipe.batch / max(seconds, 1e-6),
-            loss=self.running.loss,
-            rmse=(np.sqrt(self.running.squares) * self.scales).tolist(),
-            validation=self.validation,
-            validated=validated,
-            axes=self.axes,
-        )
-
-
-@dataclass
-class _Kept:
-    """What a resumed run needs of the journal."""
-
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    loss_sum: float = 0.0
-    loss_count: int = 0
-    best: float = math.inf
-
-
-class _Running:
-    """Running means, for a report."""
-
-    def __init__(self) -> None:
-        self.weight, self.loss, self.squares = 0.0, 0.0, np.zeros(1)
-
-    def add(self, loss: float, squares: np.ndarray[Any, Any]) -> None:
-        """Of one step."""
-        self.weight = SMOOTH * self.weight + 1
-        self.loss = self.loss + (loss - self.loss) / self.weight
-        self.squares = self.squares + (squares - self.squares) / self.weight
-
-
-def _score(rmse: list[Array], zero: Array) -> float:
-    """What the kept network has least of: RMSE over that of answering nothing, as a geometric mean over axes and levels of
-    noise. One axis that no network tells does not outweigh all others, and ten per cent are ten per cent on each."""
-    moves = zero > 0
-    parts = np.array([level[moves] / zero[moves] for level in rmse])
-    return float(np.exp(np.log(np.maximum(parts, 1e-9)).mean())) if moves.any() else float(np.mean(rmse))
-
-
-def _changed(recipe: TrainingRecipe, scale: float | None, pairs: int | None, precision: str | None) -> TrainingRecipe:
-    """The recipe that is run, which the run's folder keeps."""
-    changes: dict[str, Any] = {}
+def _changed(
+    recipe: TrainingRecipe | str | Path, scale: float | None, pairs: int | None, precision: str | None
+) -> TrainingRecipe:
+    """Load a recipe and change it by the arguments. The folder of the run keeps the result."""
+    recipe = recipe if isinstance(recipe, TrainingRecipe) else load_training_recipe(recipe)
+    changes: JsonObject = {}
     if scale is not None:
         if not 0 < scale <= 1:
             raise MitsonarError(f"--scale must lie in 0..1: got {scale:g}")
@@ -367,19 +200,17 @@ def _changed(recipe: TrainingRecipe, scale: float | None, pairs: int | None, pre
     return recipe.replace(**changes) if changes else recipe
 
 
-def _trainer(
-    module: NetworkTraining, folder: RunFolder, journal: Journal, accelerator: str, devices: str | int, strategy: str
-) -> lightning.Trainer:
-    """Lightning's trainer.
+def _trainer(module: NetworkTraining, folder: RunFolder, journal: Journal, hardware: _Hardware) -> lightning.Trainer:
+    """Create Lightning's trainer.
 
     Raises:
-        MitsonarError: what Lightning does not take, or a batch that the devices cannot share.
+        MitsonarError: Lightning refuses an argument, or the devices cannot share a batch equally.
     """
     try:
         trainer = lightning.Trainer(
-            accelerator=accelerator,
-            devices=devices,
-            strategy=strategy,
+            accelerator=hardware.accelerator,
+            devices=hardware.devices,
+            strategy=hardware.strategy,
             precision=module.recipe.precision,
             max_steps=module.steps,
             max_epochs=-1,
@@ -393,10 +224,10 @@ def _trainer(
             use_distributed_sampler=False,
             default_root_dir=folder.path,
         )
-    except Exception as error:  # Lightning has exceptions of many kinds for what is not there
+    except Exception as error:  # Lightning raises exceptions of many kinds for missing hardware
         raise MitsonarError(
-            f"accelerator {accelerator}, devices {devices}, strategy {strategy}, precision {module.recipe.precision} do not "
-            f"work here: {str(error).splitlines()[0]}"
+            f"accelerator {hardware.accelerator}, devices {hardware.devices}, strategy {hardware.strategy}, precision "
+            f"{module.recipe.precision} do not work here: {str(error).splitlines()[0]}"
         ) from None
     if module.recipe.batch % trainer.world_size:
         raise MitsonarError(
@@ -409,7 +240,7 @@ def _trainer(
 
 
 def _workers(workers: int | None, known: RunDirectory | None, render: bool, trainer: lightning.Trainer) -> int:
-    """Processes that read or render: those of an earlier run, or by the machine."""
+    """Return the number of processes that read or render: as in the earlier run, or by the machine."""
     if workers is not None:
         if workers < 0:
             raise MitsonarError(f"--workers must be at least 0: got {workers}")
@@ -423,8 +254,8 @@ def _workers(workers: int | None, known: RunDirectory | None, render: bool, trai
     return (1 if cores > 2 else 0) if on_cpu else max(1, min(8, cores - 1))
 
 
-def _warn_of_other_bits(had: RunDirectory | None, notes: dict[str, Any]) -> None:
-    """What makes a resumed run end with other last bits than an unbroken one."""
+def _warn_of_other_bits(had: RunDirectory | None, notes: JsonObject) -> None:
+    """Warn of differences after which a resumed run ends with other bits than an uninterrupted one."""
     if had is None:
         return
     other = [
@@ -434,13 +265,13 @@ def _warn_of_other_bits(had: RunDirectory | None, notes: dict[str, Any]) -> None
     ]
     for change in other + other_versions(had.versions, ("mitsonar", "torch")):
         warnings.warn(
-            f"the run was begun with {change}: it goes on, but not to the same bits", MitsonarWarning, stacklevel=3
+            f"the run was begun with {change}: it goes on, but not to the same bits", MitsonarWarning, stacklevel=5
         )
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Lightning says nothing: what matters is an error or in a report."""
+    """Silence Lightning. Everything important is an error or in a report."""
     logs = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric", "lightning_utilities")]
     levels = [log.level for log in logs]
     with warnings.catch_warnings():
@@ -457,7 +288,7 @@ def _quiet() -> Iterator[None]:
 
 @contextmanager
 def _settings(threads: int | None) -> Iterator[None]:
-    """Threads and algorithms of torch as this training needs them, and afterwards as they were."""
+    """Set the threads and algorithms of torch for this training, and restore them afterwards."""
     had, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
     if threads:

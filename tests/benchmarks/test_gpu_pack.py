@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import sys
+import time
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -208,7 +209,7 @@ def test_a_folder_that_was_begun_otherwise_is_refused(calls: Calls, tmp_path: Pa
 
 def asked_of(tmp_path: Path, seconds: float) -> run.Asked:
     """A step that has so long."""
-    return run.Asked(tmp_path, 1.0, "cpu", run.time.monotonic() + seconds)
+    return run.Asked(tmp_path, 1.0, "cpu", time.monotonic() + seconds)
 
 
 def test_a_command_is_stopped_in_time_and_says_why(tmp_path: Path) -> None:
@@ -225,9 +226,9 @@ def test_a_command_is_stopped_in_time_and_says_why(tmp_path: Path) -> None:
 def test_a_command_that_heeds_no_request_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "GRACE_S", 1.0)
     deaf = ["-c", "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); time.sleep(60)"]
-    begun = run.time.monotonic()
+    begun = time.monotonic()
     assert not run.command(asked_of(tmp_path, 3), "deaf", deaf, goes_on=True)
-    assert run.time.monotonic() - begun < 30
+    assert time.monotonic() - begun < 30
 
 
 def test_weights_come_back_in_small_files_of_half_the_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -235,7 +236,7 @@ def test_weights_come_back_in_small_files_of_half_the_bytes(tmp_path: Path, monk
     monkeypatch.setattr(pack, "MIB", 2**10)
     folder = tmp_path / "table-3.2" / "runs" / "posenet-normx10"
     folder.mkdir(parents=True)
-    held = {"weights": {"a": torch.randn(9000), "steps": torch.tensor(7)}, "about": ["x", 1.5]}
+    held: dict[str, Any] = {"weights": {"a": torch.randn(9000), "steps": torch.tensor(7)}, "about": ["x", 1.5]}
     torch.save(held, folder / "network.ckpt")
     assert not run.weights(asked_of(tmp_path, 60)).done  # its row is not evaluated yet
     out = tmp_path / "weights" / "posenet-normx10"

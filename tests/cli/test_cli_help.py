@@ -62,7 +62,7 @@ def test_a_group_that_is_made_at_once_is_escaped_as_a_whole() -> None:
     inner.command("again")(measure)
     app.add_typer(inner, name="group")
     app.command("one")(measure)
-    made = with_plain_brackets(typer.main.get_command(app))
+    made: Any = with_plain_brackets(typer.main.get_command(app))
     group = made.commands["group"]
     assert group.help == r"A group \[s]."
     for command in (made.commands["one"], group.commands["measure"]):

@@ -6,6 +6,7 @@ import pickle
 import shlex
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from drawn_frames import over_ground, sway
@@ -129,7 +130,7 @@ def test_the_table_names_options_that_there_are() -> None:
 
     from mitsonar.cli import application
 
-    tree = typer.main.get_command(application())
+    tree: Any = typer.main.get_command(application())
     for name, options in OPTIONS.items():
         command = tree.commands["world"].get_command(None, "mesh") if name == "mesh" else tree.commands[name]
         there = {option for parameter in command.params for option in parameter.opts}
@@ -150,7 +151,7 @@ def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> No
     folder = tmp_path / "my world's $5"
     done = mitsonar("world", "flat-objects", "--size-m", 4, "-o", folder)
     assert done.returncode == 0, done.stderr
-    printed = done.stdout.partition("see it with: ")[2].strip()
+    printed = done.stdout.partition("render it with: ")[2].strip()
     words = subprocess.run(
         ["sh", "-c", f'for word in {printed}; do echo "$word"; done'], capture_output=True, text=True, check=True
     )
@@ -163,7 +164,7 @@ def test_a_data_sets_command_is_quoted(mitsonar: Command, tmp_path: Path) -> Non
     told += ["--set", "world={family: flat-objects, size_m: 20}", "--set", "flight.jump_m=null"]
     done = mitsonar("dataset", "make", "rocky-field", "-o", tmp_path / "a b.zarr", *told)
     assert done.returncode == 0, done.stderr
-    assert shlex.split(done.stdout.partition("look at it: ")[2]) == [
+    assert shlex.split(done.stdout.partition("show it: ")[2]) == [
         "mitsonar",
         "dataset",
         "show",

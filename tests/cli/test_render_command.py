@@ -66,6 +66,7 @@ def test_render_writes_all_that_it_promises(mitsonar: Command, scene: Path, tmp_
     assert frames.image.dtype == np.float32
     assert frames.shape_id is not None
     assert set(np.unique(frames.shape_id)) <= {-1, 0}
+    assert frames.height_m is not None
     np.testing.assert_allclose(frames.height_m, 2.5, atol=1e-5)
     for index in range(3):
         picture = np.array(Image.open(out / "images" / f"{index:06d}.png"))
@@ -73,6 +74,7 @@ def test_render_writes_all_that_it_promises(mitsonar: Command, scene: Path, tmp_
         assert (out / "cartesian" / f"{index:06d}.png").stat().st_size > 5000
         assert (out / "echoes" / f"{index:06d}.exr").is_file()
     path = Trajectory.load_tum(out / "poses.tum")
+    assert frames.poses is not None
     np.testing.assert_allclose(path.poses, frames.poses, atol=1e-7)
     np.testing.assert_allclose(path.poses[-1], [0.2, 0.1, 2.5, np.radians(35), 0, np.radians(5)], atol=1e-7)
     about = json.loads((out / "run.json").read_text())
@@ -90,7 +92,8 @@ def test_without_options_one_frame_from_the_pose_in_the_scene(mitsonar: Command,
     found = sonar_in(load_scene(scene))
     assert found is not None
     assert len(frames) == 1
-    np.testing.assert_allclose(frames.poses[0], found[1])
+    assert frames.poses is not None
+    np.testing.assert_allclose(frames.poses[0], np.array(found[1]))
     same = Simulator(load_scene(scene)).render([found[1]])
     np.testing.assert_array_equal(frames.image, same.image)
     assert frames.level_scale == same.level_scale
@@ -109,8 +112,9 @@ def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(
     fewer = SonarFrames.load(tmp_path / "other")
     assert fewer.image.shape == (2, 32, 16)
     np.testing.assert_allclose(fewer.range_m[[0, -1]], [4 + 1.5 / 64, 5.5 - 1.5 / 64])
-    again = Simulator(load_scene(scene), fewer.sonar)
-    levels = np.concatenate([pings.levels for pings in again.pings(fewer.poses)])
+    assert fewer.poses is not None
+    traced = Simulator(load_scene(scene), fewer.sonar)
+    levels = np.concatenate([pings.levels for pings in traced.pings(fewer.poses)])
     np.testing.assert_allclose(np.minimum(levels, fewer.level_scale), fewer.image * fewer.level_scale, rtol=1e-6)
 
 

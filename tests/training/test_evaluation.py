@@ -37,6 +37,7 @@ from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.networks.onnx_export import onnx_of  # noqa: E402
 from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
+from mitsonar.training.training_types import JsonObject  # noqa: E402
 
 SAYS = np.array([0.004, -0.006, np.radians(0.1)])
 """What the networks here answer, whatever they see."""
@@ -65,7 +66,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def checkpoint(made: Path) -> Checkpoint:
-    about = {"metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}, "trained": {"pairs": 100}}
+    about: JsonObject = {"metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}, "trained": {"pairs": 100}}
     return constant(SonarPairs(made, part="all", labels="normx10"), **about)
 
 
@@ -98,10 +99,11 @@ def test_it_answers_what_the_network_says(checkpoint: Checkpoint, pairs: SonarPa
 
 def test_it_sees_what_training_saw(pairs: SonarPairs, made: Path) -> None:
     """Frames reach the network as the data set's own arrangement gives them, fans too."""
-    for name, words in {
+    arrangements: dict[str, JsonObject] = {
         "posenet": {"layout": "stack"},
         "posenet_dual": {"coordinates": "both", "cartesian_rows": 64},
-    }.items():
+    }
+    for name, words in arrangements.items():
         own = SonarPairs(made, part="all", one_a_sequence=True, labels="quantised", **words)
         inputs, label = own[0]
         batch = tuple(part[None] for part in inputs) if isinstance(inputs, tuple) else inputs[None]
@@ -171,14 +173,14 @@ def test_what_it_does_not_doubt(checkpoint: Checkpoint, pairs: SonarPairs) -> No
         assert ImageNetwork(checkpoint).estimate(fine).valid
 
 
-def test_answers_beyond_the_box_are_not_believed(made: Path, pairs: SonarPairs) -> None:
+def test_answers_beyond_the_box_are_invalid(made: Path, pairs: SonarPairs) -> None:
     own = SonarPairs(made, part="all")
-    for size, believed in ((0.0235, True), (0.0245, False), (np.nan, False)):
+    for size, valid in ((0.0235, True), (0.0245, False), (np.nan, False)):
         trained = constant(own, [0.0, -size, 0.0])
         if np.isnan(size):
             trained = replace(constant(own), weights={k: v * float("inf") for k, v in constant(own).weights.items()})
         found = ImageNetwork(trained).estimate(pairs.sonar_frames(2))
-        assert found.valid == believed, found
+        assert found.valid == valid, found
     assert "not finite" in found.reason
     assert "forward -24.5 mm is beyond the motions of training, -20..20 mm" in (
         ImageNetwork(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
@@ -262,7 +264,7 @@ def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: Son
     assert (checkpoint.network, checkpoint.recipe["data"]) == ("corrnet", "rocky-field")
     assert checkpoint.trained["pairs"] > 10_000
     estimator = create_estimator("corrnet")
-    assert estimator_from("corrnet:force=0").digest == checkpoint.digest  # type: ignore[attr-defined]
+    assert estimator_from("corrnet:force=0").digest == checkpoint.digest
     frames = pairs.sonar_frames(2)
     there = pickle.loads(pickle.dumps(estimator)).estimate(frames)
     assert there.motion == estimator.estimate(frames).motion
@@ -343,10 +345,10 @@ def test_odometry_and_compare_take_checkpoints(
     assert done.returncode == 0, done.stderr
     _, row = json.loads(done.stdout)["tables"][0]["rows"]
     truth = SonarPairs(made, part="all", one_a_sequence=True)
-    believed = [ImageNetwork(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
-    answers = np.where(np.array(believed)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
+    valid = [ImageNetwork(checkpoint).estimate(truth.sonar_frames(k)).valid for k in range(len(truth))]
+    answers = np.where(np.array(valid)[:, None], SAYS, 0)  # frames of so few cells may hold too little to match
     errors = in_units(answers - np.array([motions(truth.pose[truth.frame_numbers(k)])[0] for k in range(len(truth))]))
-    assert row["failures"] == believed.count(False) <= 2
+    assert row["failures"] == valid.count(False) <= 2
     assert np.allclose(row["rmse"], np.sqrt((errors**2).mean(axis=0)), rtol=1e-5)
     again = mitsonar(*table, "-o", tmp_path / "table", "--json")
     assert json.loads(again.stdout)["tables"][0]["rows"][1] == row

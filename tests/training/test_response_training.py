@@ -42,7 +42,7 @@ FIELDS: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
     """Two small scenes of ten sequences of three pings, without turns."""
-    url = tmp_path_factory.mktemp("made") / "heard.zarr"
+    url = tmp_path_factory.mktemp("made") / "responses.zarr"
     make_dataset(impulse_recipe(scenes=[{"count": 2, "sequences": 10}], flight={"yaw_deg": 0.0}), str(url))
     return url
 
@@ -62,7 +62,7 @@ ROWS = ((400, 32), (200, 64), (100, 128), (50, 256), (25, 512), (13, 512), (7, 5
 
 
 def test_the_layers_are_those_of_the_table() -> None:
-    network = create_network("impulse_posenet", layers=9).eval()
+    network: Any = create_network("impulse_posenet", layers=9).eval()
     shapes: list[tuple[str, tuple[int, ...]]] = []
     for layer in network.nets[2]:
         layer.register_forward_hook(lambda one, _, out: shapes.append((type(one).__name__, tuple(out.shape[1:]))))
@@ -89,14 +89,14 @@ def test_the_layers_are_those_of_the_table() -> None:
 @pytest.mark.parametrize(("layers", "size", "receivers"), [(6, (800, 80), 4), (7, (800, 8), 2), (8, (1600, 16), 4)])
 def test_every_row_of_table_5_2_has_its_network(layers: int, size: tuple[int, int], receivers: int) -> None:
     words = {"layers": layers, "size": list(size), "receivers": receivers}
-    network = create_network("impulse_posenet", width=0.05, outputs=3, **words)
+    network: Any = create_network("impulse_posenet", width=0.05, outputs=3, **words)
     assert network(torch.randn(2, 1, *size)).shape == (2, 3)
     assert create_network("impulse_posenet", **network.options).options == network.options
 
 
 def test_each_receiver_has_a_net_of_its_own() -> None:
     """What changes in one receiver's columns reaches the answer through its net alone."""
-    network = create_network("impulse_posenet", width=0.05).eval()
+    network: Any = create_network("impulse_posenet", width=0.05).eval()
     matrix = torch.randn(1, 1, 800, 16, requires_grad=True)
     seen: list[Any] = []
     network.nets[1].register_forward_hook(lambda one, given, out: seen.append(given[0]))

@@ -45,8 +45,9 @@ from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
 from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
-from mitsonar.training.training_data import Order, _Together, finished, material_of  # noqa: E402
-from mitsonar.training.training_run import TrainingReport, _score, train  # noqa: E402
+from mitsonar.training.training_data import Order, Validation, _Together, finished, material_of  # noqa: E402
+from mitsonar.training.training_journal import TrainingReport, _score  # noqa: E402
+from mitsonar.training.training_run import train  # noqa: E402
 
 FIELDS: dict[str, Any] = {
     "network": {"name": "posenet", "width": 0.03},
@@ -148,7 +149,7 @@ def test_rates_by_hand() -> None:
 
 
 def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
-    """The thesis's training, from three lines; keys changed with dots; and back from what a run keeps."""
+    """The training of Almanza-Medina, from three lines; keys changed with dots; and back from what a run keeps."""
     path = tmp_path / "mine.yaml"
     path.write_text("network: posenet\ndata: mine-data.yaml\nnoise: low\n")
     told = load_training_recipe(path, {"network.width": 0.5, "validate.pairs": 7})
@@ -279,6 +280,13 @@ def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest
     assert [sample["frames"][0] for sample in batches] == [sample["frames"][0] for sample in tail]
 
 
+def numbers_of(validation: Validation) -> list[int]:
+    """The numbers of stored samples."""
+    numbers = [row for row in validation.rows if isinstance(row, int)]
+    assert len(numbers) == len(validation)
+    return numbers
+
+
 def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
     half = material_of(recipe(part_of_data=0.5, split={"train": 0.5, "validation": 0.5}), made, render=False)
     whole = material_of(recipe(split={"train": 0.5, "validation": 0.5}), made, render=False)
@@ -288,9 +296,11 @@ def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
     assert 0 < half.epoch < whole.epoch == 40
     sequences = half.samples.sequence
     validation = half.validation
-    assert max(validation.samples.first[validation.rows]) + 2 <= 50
+    assert isinstance(validation.samples, SonarPairs)
+    assert max(validation.samples.first[numbers_of(validation)]) + 2 <= 50
     chosen = whole.validation
-    assert len({sequences[chosen.samples.first[row]] for row in chosen.rows}) == len(chosen.rows) == 5  # one a sequence
+    assert isinstance(chosen.samples, SonarPairs)
+    assert len({sequences[chosen.samples.first[row]] for row in numbers_of(chosen)}) == len(chosen) == 5  # one a sequence
 
 
 # ---------------------------------------------------------------- runs
@@ -428,7 +438,7 @@ def test_a_run_that_was_stopped_before_it_validated_asks_for_more_minutes(made: 
     with pytest.raises(KeyboardInterrupt):
         train(told, made, tmp_path / "run", threads=1, stop=lambda: True)
     with pytest.raises(
-        MitsonarError, match=r"stopped before it validated once, and has had its 1e-09 minutes .* resume it with more"
+        MitsonarError, match=r"stopped before it validated once, and has used its 1e-09 minutes .* resume it with more"
     ):
         train(told, made, tmp_path / "run", resume=True, minutes=1e-9)
     assert train(told, made, tmp_path / "run", resume=True, minutes=5).trained["steps"] == 3
@@ -455,9 +465,9 @@ def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
         train(told, made, out, resume=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("all of it")
-    for words in ({}, {"resume": True}, {"overwrite": True}):
+    for resume, overwrite in ((False, False), (True, False), (False, True)):
         with pytest.raises(MitsonarError, match=r"holds other things \(thesis\.txt\) and is kept"):
-            train(told, made, tmp_path / "mine", **words)
+            train(told, made, tmp_path / "mine", resume=resume, overwrite=overwrite)
 
 
 def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
@@ -470,7 +480,8 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     assert isinstance(learnt.samples, SonarPairs)
     first = int(learnt.samples.first[learnt.numbers[20]])  # begins one sample and ends none, where a sequence begins
     frame = first - first % 5
-    zarr.open_group(str(url), mode="r+")["image"][frame, 17, 5] = np.nan
+    stored: Any = zarr.open_group(str(url), mode="r+")["image"]
+    stored[frame, 17, 5] = np.nan
     order = list(Order(learnt.numbers, 8, 0, 0, 9, (0, 1)))
     step = next(k for k, batch in enumerate(order) if frame in learnt.samples.first[[number for _, number in batch]])
     with pytest.raises(MitsonarError) as caught:

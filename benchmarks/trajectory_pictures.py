@@ -1,0 +1,136 @@
+"""Pictures of ``bench_trajectories.py``: mosaics along true and estimated paths, and the errors of the paths."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
+
+from mitsonar.io.whole_files import write_whole
+from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.plotting.fan_figure import GAMMA
+from mitsonar.records.sonar_frames import SonarFrames
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def draw(out: Path, pictures: Path, frames: int) -> None:
+    """Draw mosaics along true and estimated paths, and the errors of the paths."""
+    pictures.mkdir(parents=True, exist_ok=True)
+    for model in RECIPES:
+        save_small(pictures / f"pattern_mosaics_{model}.png", pattern_figure(out, model, frames))
+    save_small(pictures / "rocky_mosaics.png", rocky_figure(out, frames))
+    save_small(pictures / "trajectory_errors.png", drift_figure(out, frames))
+
+
+def save_small(path: Path, figure: Figure) -> None:
+    """Save a PNG of 160 colours. Noise does not compress, and true colour would be three times the size."""
+    from PIL import Image
+
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=75)
+    Image.open(drawn).convert("RGB").quantize(160, method=Image.Quantize.MAXCOVERAGE).save(
+        small, format="png", optimize=True
+    )
+    write_whole(path, small.getvalue())
+
+
+def paths_of(out: Path, job: Job, name: str) -> tuple[SonarFrames, dict[str, Trajectory]]:
+    """Load frames, true and estimated path of a run."""
+    frames = SonarFrames.load(out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz")
+    assert frames.poses is not None
+    path = Trajectory.load_tum(out / f"{job.name}-{name}.tum")
+    return frames, {"true": Trajectory(frames.poses, frames.time_s), "estimated": path}
+
+
+def mosaic_along(frames: SonarFrames, path: Trajectory) -> Mosaic:
+    """Build the mosaic of all frames along a path, with the illumination compensated."""
+    some = frames.select(np.unique(np.linspace(0, len(frames) - 1, ILLUMINATION_FRAMES).astype(int)))
+    return build_mosaic(frames, path.poses, frames.height_m, cell_m=0.015, illumination=illumination(some))
+
+
+def pattern_figure(out: Path, model: str, frames: int) -> Figure:
+    """Draw mosaics of both runs over the pattern: true poses left, estimated poses right."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.5, 12.0), layout="constrained")
+    for row, run in enumerate(("diagonal", "legs")):
+        maps = {}
+        made, paths = paths_of(out, trajectory_job(run, model, frames), "Kalman")
+        maps["true poses"] = made, {"true": paths["true"]}, paths["true"]
+        maps["direct, Kalman"] = made, paths, paths["estimated"]
+        for column, (name, (made, paths, path)) in enumerate(maps.items()):
+            axes = figure.add_subplot(2, 2, 2 * row + column + 1)
+            show(axes, mosaic_along(made, path), paths)
+            axes.set(xlim=(-4.0, 4.5), ylim=(-5.2, 2.8), title=f"{run}: {name}")
+    figure.suptitle(f"{model} model, Gaussian seabed, noise of chapter 2")
+    return figure
+
+
+def rocky_figure(out: Path, frames: int) -> Figure:
+    """Draw mosaics of the runs over the rocky field: sideways along true and estimated poses, the others along estimated."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(17.0, 10.5), layout="constrained")
+    grid = figure.add_gridspec(2, 3, width_ratios=(12.8, 4, 4))
+    panels = [("sideways", "true", grid[0, 0]), ("sideways", "estimated", grid[1, 0])]
+    panels += [("forward", "estimated", grid[:, 1]), ("braking", "estimated", grid[:, 2])]
+    for run, name, cell in panels:
+        made, paths = paths_of(out, trajectory_job(run, "thesis", frames), "raw")
+        axes = figure.add_subplot(cell)
+        show(axes, mosaic_along(made, paths[name]), paths)
+        axes.set_title(f"{run}, {name} poses")
+    figure.suptitle("rocky field, model `thesis`, no noise; direct, frame by frame")
+    return figure
+
+
+COLOURS = {"true": "limegreen", "estimated": "red"}
+
+
+def show(axes: Axes, mosaic: Mosaic, paths: dict[str, Trajectory]) -> None:
+    """Draw a mosaic with paths over it."""
+    from matplotlib.colors import PowerNorm
+
+    level = mosaic.mean
+    norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.7)))
+    axes.set_facecolor("0.9")
+    axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
+    for name, path in paths.items():
+        width = 3.0 if name == "true" else 1.2
+        axes.plot(path.poses[:, 0], path.poses[:, 1], color=COLOURS[name], linewidth=width, label=name)
+    axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
+    axes.legend(loc="best", fontsize="small")
+
+
+def drift_figure(out: Path, frames: int) -> Figure:
+    """Draw the errors along and across the path and of the heading, over the distance."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
+    runs = [run for run in NOISE_OF if run != "legs"]
+    axes = figure.subplots(3, len(runs), sharex="col", squeeze=False)
+    for column, run in enumerate(runs):
+        for model, colour in (("thesis", "tab:blue"), ("physical", "tab:orange")):
+            _, paths = paths_of(out, trajectory_job(run, model, frames), "raw")
+            true, off = paths["true"].poses, paths["estimated"].poses - paths["true"].poses
+            step = np.diff(true[:, :2], axis=0)
+            way = np.concatenate([[0], np.cumsum(np.linalg.norm(step, axis=1))])
+            ahead = step[0] / np.linalg.norm(step[0])
+            values = (1e3 * off[:, :2] @ ahead, 1e3 * off[:, :2] @ [ahead[1], -ahead[0]], np.degrees(off[:, 5]))
+            for row, value in enumerate(values):
+                axes[row, column].plot(way, value, color=colour, label=f"direct, {model}")
+        axes[0, column].set_title(f"{run}, noise: {NOISE_OF[run]}")
+        axes[2, column].set_xlabel("driven (m)")
+    for row, name in enumerate(("along the way (mm)", "to starboard of it (mm)", "heading (deg)")):
+        axes[row, 0].set_ylabel(name)
+    for one in axes.flat:
+        one.grid(alpha=0.3)
+    for one in (axes[0, 0], axes[0, -1]):
+        one.legend(fontsize="small")
+    return figure
