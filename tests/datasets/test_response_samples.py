@@ -119,7 +119,7 @@ def test_receivers_that_hear_nothing_and_echoes_from_too_far_are_told(tmp_path: 
         split={"by": "sequence"},
     )
     said = " ".join(make_dataset(recipe, str(tmp_path / "data.zarr")).warnings)
-    assert "receiver up hears nothing in 3 of 3 pings" in said
+    assert "receiver up records no echo in 3 of 3 pings" in said
     assert re.search(r"came from beyond range_max 4\.5 m", said)
 
 
