@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from mitsonar.acoustics.noise import NoiseModel
     from mitsonar.config.data_recipe import Recipe
     from mitsonar.datasets.plan import Scene
-    from mitsonar.datasets.response_samples import ImpulseSamples
-    from mitsonar.datasets.torch_pairs import SonarPairs
     from mitsonar.instruments.imaging_sonar import Instrument
 
 __all__ = [
@@ -44,6 +42,9 @@ Values: TypeAlias = NDArray[Any]
 
 Fields: TypeAlias = dict[str, Any]
 """Attributes or keys by name, as JSON holds them."""
+
+OpenedSamples: TypeAlias = Any
+"""An object of the class that :attr:`Modality.samples_class` names, which is loaded only when it is used."""
 
 Read = Callable[..., Values]
 """Reads values of an array of a store by its name, all or those of a slice of frames."""
@@ -183,14 +184,13 @@ def renderer_of(modality: Modality) -> type[Renderer]:
     return found
 
 
-def samples_of(modality: Modality, url: str | Path, **options: Any) -> SonarPairs | ImpulseSamples:
+def samples_of(modality: Modality, url: str | Path, **options: Any) -> OpenedSamples:
     """Open the samples of a store, as estimators are compared on them.
 
     Raises:
         MitsonarError: options that do not fit, no samples in that part.
     """
-    opened: SonarPairs | ImpulseSamples = resolve_name(modality.samples_class)(url, frames=modality.sample_frames, **options)
-    return opened
+    return resolve_name(modality.samples_class)(url, frames=modality.sample_frames, **options)
 
 
 def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:

@@ -108,8 +108,8 @@ class ResponseModality:
             if silent:
                 sentences.append(
                     f"receiver {receiver.name} records no echo in {silent:,} of {len(echoes):,} pings: check where it "
-                    f"points (heading {receiver.field.heading_deg:g} deg, tilt {receiver.field.tilt_deg:g} deg), height_m and "
-                    "range_max"
+                    f"points (heading {receiver.field.heading_deg:g} deg, tilt {receiver.field.tilt_deg:g} deg), height_m "
+                    "and range_max"
                 )
         if dropped.any():
             share = 100 * dropped.sum() / max(1, dropped.sum() + echoes.sum())
