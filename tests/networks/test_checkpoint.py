@@ -198,13 +198,13 @@ def test_a_later_format_is_named(checkpoint: Checkpoint) -> None:
     ("change", "words"),
     [
         ({"trained_at": None}, "trained_at is not a table"),
-        ({"trained_at": {"height_m": [1.0], "pitch_deg": 0, "roll_deg": 0}}, "stands must hold height_m"),
+        ({"trained_at": {"height_m": [1.0], "pitch_deg": 0, "roll_deg": 0}}, "trained_at must hold height_m"),
         ({"network": 3}, "network is not a text"),
         ({"more": 1}, "'more' is unknown"),
         ({"weights": {"a": [1, 2]}}, "weights a are not numbers"),
         ({"weights": {"a": torch.tensor([1.0, float("nan")])}}, "nan or inf"),
         ({"options": {1: 2}}, "options is not a table"),
-        ({"arrangement": {"frames": 2}}, "arrangement views is not said"),
+        ({"arrangement": {"frames": 2}}, "arrangement views is missing or of another type"),
         ({"labels": {"kind": "octal"}}, "'octal', not one of raw, quantised, normx10"),
         ({"labels": {"kind": "raw", "low": [0], "high": [1], "names": []}}, "no names"),
         ({"labels": {"kind": "raw", "low": [0], "high": [float("inf")], "names": ["a"]}}, "limits of the labels"),
@@ -239,5 +239,5 @@ def test_files_of_before_vectors_had_words_are_read(checkpoint: Checkpoint) -> N
     older = Checkpoint.from_bytes(dataclasses.replace(checkpoint, arrangement=words).to_bytes())
     assert older.arrangement == words
     wrong = dataclasses.replace(checkpoint, arrangement={**words, "halves": 3})
-    with pytest.raises(MitsonarError, match="arrangement halves is not said"):
+    with pytest.raises(MitsonarError, match="arrangement halves is missing or of another type"):
         Checkpoint.from_bytes(wrong.to_bytes())
