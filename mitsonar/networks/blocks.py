@@ -131,8 +131,8 @@ def _padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
 class SameAverage(nn.Module):
     """Mean over 4 x 4 cells, stride 1, as many cells out as in (Table 4.1): one cell before, itself, two after.
 
-    Cells outside the image do not count (ours): a map of one cell does not change. By MATLAB's default zeros count. They would
-    divide the one cell that 512 x 192 leaves by 16, and slow down the last layer's learning by as much.
+    Cells outside the image do not count (ours): a map of one cell does not change. By MATLAB's default zeros count:
+    they would divide the one cell that 512 x 192 leaves by 16, and slow down the last layer's learning by as much.
     """
 
     def forward(self, image: Tensor) -> Tensor:
@@ -252,8 +252,9 @@ class ConvolutionNetwork(Network):
 class Quadrants(nn.Module):
     """Cuts two images side by side into four pairs of quadrants.
 
-    The input is ``(batch, channels, rows, columns)``. Each pair is ``(batch, channels, rows / 2, columns / 2)``, the quadrant of the left image beside that of the right: upper
-    left, upper right, lower left, lower right (Almanza-Medina, 3.3.3).
+    The input is ``(batch, channels, rows, columns)``. Each pair is ``(batch, channels, rows / 2, columns / 2)``, the
+    quadrant of the left image beside that of the right. Their order is upper left, upper right, lower left, lower right
+    (Almanza-Medina, 3.3.3).
     """
 
     def forward(self, pair: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

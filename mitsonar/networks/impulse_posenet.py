@@ -29,8 +29,8 @@ class ImpulsePoseNet(Network):
     """A PoseNet for each receiver's block of columns, all joined in one fully connected layer to the estimates.
 
     Convolutions have stride 2 along the delay and 1 across. All but the last have batch normalisation and ReLU. A mean over
-    4 x 4 cells follows. Dropout lies after the first ReLU and after the mean. The number of columns of a block, 2 Q, does not
-    change: "4 x 8" of Conv8 in Table 5.1 is a slip.
+    4 x 4 cells follows. Dropout lies after the first ReLU and after the mean. A block keeps its 2 Q columns: "4 x 8" of
+    Conv8 in Table 5.1 is a slip.
 
     Args:
         outputs: estimates.

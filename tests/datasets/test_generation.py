@@ -383,12 +383,14 @@ def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
 def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(made: Path, tmp_path: Path) -> None:
     """A scheduler by its address; one of its workers is killed while it renders, and nothing is lost."""
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "spawn"}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment, "cwd": tmp_path}
+
+    def started(command: list[str]) -> subprocess.Popen[bytes]:
+        quiet = subprocess.DEVNULL
+        return subprocess.Popen(command, stdout=quiet, stderr=quiet, env=environment, cwd=tmp_path)
+
     dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     place = tmp_path / "scheduler.json"
-    scheduler = subprocess.Popen(
-        [*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)], **quiet
-    )
+    scheduler = started([*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)])
     workers: list[subprocess.Popen[bytes]] = []
     try:
         address = _written(place, 90)["address"]
@@ -402,7 +404,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
             "--no-dashboard",
             "--no-nanny",
         ]
-        workers = [subprocess.Popen(worker, **quiet) for _ in range(2)]
+        workers = [started(worker) for _ in range(2)]
         making = subprocess.Popen(
             [*PROGRAM, *command(tmp_path, "--scheduler", address)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

@@ -142,7 +142,8 @@ def test_runs_over_the_pattern() -> None:
     legs, diagonal, turn = (run_poses(name, 2.5) for name in ("legs", "diagonal", "turn"))
     assert (len(legs), len(diagonal), len(turn)) == (950, 300, 300)
     ends = legs[[0, 249, 349, 599, 699, 949], :2]
-    np.testing.assert_allclose(np.diff(ends, axis=0), [[5, 0], [0, 1.2], [-5, 0], [0, 1.1], [5, 0]], atol=1e-9)
+    wanted = np.array([[5, 0], [0, 1.2], [-5, 0], [0, 1.1], [5, 0]])
+    np.testing.assert_allclose(np.diff(ends, axis=0), wanted, atol=1e-9)
     steps = np.linalg.norm(np.diff(legs[:, :2], axis=0), axis=1)
     assert steps.max() < 0.0202
     np.testing.assert_allclose(diagonal[-1] - diagonal[0], [5, 2.3, 0, 0, 0, 0], atol=1e-9)

@@ -278,6 +278,7 @@ def test_samples_are_the_stored_pings(made: Path) -> None:
         received = samples.responses(index)
         np.testing.assert_array_equal(received.response, stored)
         np.testing.assert_array_equal(samples.matrix(index), packed(stored))
+        assert received.poses is not None
         np.testing.assert_allclose(samples.target(index), motions(received.poses[[0, -1]])[0])
         np.testing.assert_allclose(received.time_s, [0, 0.025, 0.05])
         assert received.velocity is not None

@@ -64,7 +64,7 @@ def test_a_sample_is_consecutive_frames_and_the_motion_between_them(made: Path) 
         east, north = there.x - here.x, there.y - here.y
         sin, cos = np.sin(there.heading), np.cos(there.heading)
         wanted = [east * cos - north * sin, east * sin + north * cos, there.heading - here.heading]
-        np.testing.assert_allclose(label, np.float32(wanted), atol=1e-8)
+        np.testing.assert_allclose(label, np.array(wanted, dtype=np.float32), atol=1e-8)
 
 
 def test_three_frames_have_the_mean_motion_and_one_its_height(made: Path) -> None:

@@ -109,7 +109,9 @@ def test_answers_become_motions(checkpoint: Checkpoint) -> None:
     assert (law == np.eye(3)).all()
     # the noise of training was not validated: the mean over the levels that were
     wanted = np.diag([(3e-3**2 + 6e-3**2) / 2, 2e-3**2, np.radians(1) ** 2 * (0.1**2 + 0.2**2) / 2])
-    assert np.allclose(checkpoint.covariance, wanted, rtol=1e-12, atol=0)
+    covariance = checkpoint.covariance
+    assert covariance is not None
+    assert np.allclose(covariance, wanted, rtol=1e-12, atol=0)
     at_home = dataclasses.replace(checkpoint, noise="high").covariance
     assert at_home is not None
     assert np.allclose(np.sqrt(np.diag(at_home)), [6e-3, 2e-3, np.radians(0.2)])

@@ -81,10 +81,11 @@ Average 4×4 1024 1×1 1×4 No
 def table_4_1() -> dict[str, tuple[int, int, int, int, bool]]:
     """Kernel, channels, rows, columns, and whether ReLU and normalisation follow, of each layer."""
     rows = [line.split() for line in TABLE_4_1.strip().splitlines()]
-    return {
-        name.lower(): (int(kernel[0]), int(channels), *map(int, size.split("×")), after == "Yes")
-        for name, kernel, channels, _, size, after in rows
-    }
+    table = {}
+    for name, kernel, channels, _, size, after in rows:
+        height, width = map(int, size.split("×"))
+        table[name.lower()] = (int(kernel[0]), int(channels), height, width, after == "Yes")
+    return table
 
 
 def test_posenet_is_table_4_1() -> None:
@@ -219,6 +220,7 @@ def test_same_padding_against_sums_by_hand(length: int, kernel: int, stride: int
     image, weight = rng.normal(size=(length, length + 1)), rng.normal(size=(kernel, kernel))
     with torch.no_grad():
         convolution.weight[:] = torch.tensor(weight)
+        assert convolution.bias is not None
         convolution.bias[:] = 0.25
         seen = convolution(torch.tensor(image, dtype=torch.float32)[None, None])[0, 0].numpy()
     cells = [math.ceil(one / stride) for one in image.shape]
