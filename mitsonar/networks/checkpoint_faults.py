@@ -62,7 +62,7 @@ def unpacked(content: bytes, source: str) -> Table:
             packed = [part for part in parts.infolist() if part.compress_type != zipfile.ZIP_STORED]
             if packed or sum(part.file_size for part in parts.infolist()) > min(LARGEST, len(content)):
                 raise MitsonarError(
-                    f"{source} would unpack to more than its own size, or than {LARGEST >> 30} GiB: it is not one of mitsonar"
+                    f"{source} would unpack to more than its own size, or than {LARGEST >> 30} GiB: it is none of mitsonar"
                 )
             wrong = parts.testzip()
         if wrong is not None:

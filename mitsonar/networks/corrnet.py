@@ -127,7 +127,7 @@ class CorrNet(nn.Module):
         return GaussianHead(*(torch.stack(values) for values in zip(*heads, strict=True)))
 
     def _head(self, motion: Tensor, normal: Tensor, unit: Tensor) -> GaussianHead:
-        """Compute mean and covariance: errors of cells are correlated, a floor remains, scale errors grow with the motion."""
+        """Compute mean and covariance: cells have correlated errors, a floor remains, scale errors grow with the motion."""
         inverse = torch.linalg.inv(normal)
         far = motion.detach()
         covariance = torch.exp(2 * self.scale) * (inverse + inverse.mT) / 2 + torch.diag_embed(

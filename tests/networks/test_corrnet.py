@@ -57,7 +57,8 @@ def seen_pair(motion: NDArray[np.float64], noise: float = 0.0, bearing: Bearing 
     there = moved(ground.points, inverse(motion))
     images = np.stack([texture(ground.points), texture(there)])
     images += noise * np.random.default_rng(1).normal(size=images.shape)
-    return torch.from_numpy(np.clip(images, 0, 1)[None].astype(np.float32))
+    pair: Tensor = torch.from_numpy(np.clip(images, 0, 1)[None].astype(np.float32))
+    return pair
 
 
 # ---------------------------------------------------------------- geometry
