@@ -19,6 +19,8 @@ from mitsonar.errors import MitsonarError
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = pytest.mark.learn
 
+from torch import nn  # noqa: E402
+
 from mitsonar.datasets.torch_pairs import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import FILE, Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
@@ -31,7 +33,7 @@ ABOUT: dict[str, Any] = {
 }
 
 
-def tiny(seed: int = 0, **options: Any) -> Any:
+def tiny(seed: int = 0, **options: object) -> nn.Module:
     torch.manual_seed(seed)
     return create_network("posenet", **{"width": 1 / 16, "size": (40, 24), **options})
 
@@ -50,8 +52,8 @@ def test_what_is_saved_comes_back(checkpoint: Checkpoint, tmp_path: Path) -> Non
     checkpoint.save(tmp_path / FILE)
     state = torch.get_rng_state()
     for found in (Checkpoint.load(tmp_path), Checkpoint.load(tmp_path / FILE)):
-        told = {one.name: getattr(found, one.name) for one in dataclasses.fields(found) if one.name != "weights"}
-        assert told == {name: getattr(checkpoint, name) for name in told}
+        kept = {one.name: getattr(found, one.name) for one in dataclasses.fields(found) if one.name != "weights"}
+        assert kept == {name: getattr(checkpoint, name) for name in kept}
         image = torch.rand(2, 1, 40, 24, generator=torch.Generator().manual_seed(1))
         assert torch.equal(found.build()(image), network(image))
         assert found.digest == checkpoint.digest
@@ -98,15 +100,15 @@ def test_it_says_what_it_was_trained_on(checkpoint: Checkpoint) -> None:
 
 
 def test_answers_become_motions(checkpoint: Checkpoint) -> None:
-    """Labels of +-10 are the limits of the flight; laws are in SI already; errors in validation stand for a covariance."""
-    motions, law = checkpoint.decode(torch.tensor([[10.0, -10.0, 5.0]]))
+    """Labels of +-10 are the limits of the flight; distributions are in SI; errors in validation give a covariance."""
+    motions, spread = checkpoint.decode(torch.tensor([[10.0, -10.0, 5.0]]))
     assert np.allclose(motions, [[0.02, -0.02, np.radians(0.225)]])
-    assert law is None
+    assert spread is None
     said = GaussianHead(torch.full((2, 3), 0.25), torch.eye(3).expand(2, 3, 3))
-    motions, law = checkpoint.decode(said)
+    motions, spread = checkpoint.decode(said)
     assert motions.shape == (2, 3)
-    assert law is not None
-    assert (law == np.eye(3)).all()
+    assert spread is not None
+    assert (spread == np.eye(3)).all()
     # the noise of training was not validated: the mean over the levels that were
     wanted = np.diag([(3e-3**2 + 6e-3**2) / 2, 2e-3**2, np.radians(1) ** 2 * (0.1**2 + 0.2**2) / 2])
     covariance = checkpoint.covariance
@@ -130,7 +132,7 @@ def test_only_our_networks_and_plain_values(checkpoint: Checkpoint) -> None:
 # ---------------------------------------------------------------- hostile files
 
 
-def packed(table: Any) -> bytes:
+def packed(table: object) -> bytes:
     buffer = io.BytesIO()
     torch.save(table, buffer)
     return buffer.getvalue()
@@ -152,7 +154,7 @@ class Evil:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, (str(self.path),)
 
 

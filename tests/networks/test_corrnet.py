@@ -24,7 +24,7 @@ corrnet = pytest.importorskip("mitsonar.networks.corrnet")
 warp_grid = pytest.importorskip("mitsonar.networks.warp_grid")
 matching = pytest.importorskip("mitsonar.networks.matching")
 slopes = pytest.importorskip("mitsonar.networks.slopes")
-law = pytest.importorskip("mitsonar.networks.gaussian_head")
+head = pytest.importorskip("mitsonar.networks.gaussian_head")
 augment = pytest.importorskip("mitsonar.training.augment")
 
 pytestmark = pytest.mark.learn
@@ -160,12 +160,12 @@ def test_what_lies_between_cells_keeps_its_fineness() -> None:
 
 
 def test_later_iterations_count_more() -> None:
-    said = law.GaussianHead(torch.zeros(2, 1, 3), torch.eye(3).expand(2, 1, 3, 3) * 1e-6)
+    said = head.GaussianHead(torch.zeros(2, 1, 3), torch.eye(3).expand(2, 1, 3, 3) * 1e-6)
     wrong = said.mean.clone()
     wrong[0] = 1e-3
-    early = law.likelihood(law.GaussianHead(wrong, said.covariance), torch.zeros(1, 3))
-    late = law.likelihood(law.GaussianHead(wrong.flip(0), said.covariance), torch.zeros(1, 3))
-    assert float(late) > float(early) > float(law.likelihood(said, torch.zeros(1, 3)))
+    early = head.likelihood(head.GaussianHead(wrong, said.covariance), torch.zeros(1, 3))
+    late = head.likelihood(head.GaussianHead(wrong.flip(0), said.covariance), torch.zeros(1, 3))
+    assert float(late) > float(early) > float(head.likelihood(said, torch.zeros(1, 3)))
 
 
 # ---------------------------------------------------------------- the network
@@ -200,7 +200,7 @@ def test_it_learns() -> None:
     optimiser = torch.optim.AdamW(network.parameters(), lr=5e-4)
     losses = []
     for _ in range(14):
-        loss = law.likelihood(network(images, ground), target)
+        loss = head.likelihood(network(images, ground), target)
         optimiser.zero_grad()
         loss.backward()
         assert all(weight.grad is not None and torch.isfinite(weight.grad).all() for weight in network.parameters())
@@ -218,7 +218,7 @@ def test_it_learns_after_it_was_asked() -> None:
     network, image, ground = create_network("corrnet", finer=1), seen_pair(np.array([0.01, 0.0, 0.0])), batch()
     with torch.inference_mode():
         network(image, ground)
-    law.likelihood(network(image, ground), torch.zeros(1, 3)).backward()
+    head.likelihood(network(image, ground), torch.zeros(1, 3)).backward()
 
 
 def test_it_stays_below_a_million_parameters() -> None:
