@@ -535,7 +535,7 @@ def test_wrong_labels_are_found(made: Path, tmp_path: Path) -> None:
         [
             ("motion", (3, 0), 0.019, "labels differ from poses"),
             ("pose", (7, 0), 9.9, "labels differ|footprint|jumps"),
-            ("sequence", 149, 77, "sequences"),
+            ("sequence", 149, 77, "sequence is damaged"),
             ("motion", (4, 1), 0.0, "last frame"),
             ("range_m", 0, 1.0, "range_m"),
         ]
