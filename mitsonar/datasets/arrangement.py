@@ -1,10 +1,10 @@
-"""How frames become what a network reads, and motions its labels; written on the array API, for NumPy and torch alike."""
+"""How frames become the input of a network, and motions its labels; on the array API, for NumPy and torch alike."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 from array_api_compat import array_namespace, device
@@ -15,17 +15,25 @@ from mitsonar.config.data_recipe import Recipe
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
 
-__all__ = ["LABELS", "Arrangement", "Labels", "arrangement_of"]
+__all__ = ["LABELS", "Arrangement", "ArrayOfAnyLibrary", "Labels", "arrangement_of"]
+
+ArrayOfAnyLibrary: TypeAlias = Any
+"""An array of NumPy or torch, on any device: code on the array API takes both and returns what it was given."""
+
+InputOfAnyLibrary: TypeAlias = ArrayOfAnyLibrary | tuple[ArrayOfAnyLibrary, ...]
+"""The input of a network: one array, or a polar and a Cartesian one."""
 
 LABELS = ("raw", "quantised", "normx10")
+"""Kinds of labels; see :class:`Labels`."""
+
 LEVELS = 32
 """Values of a quantised label, 0 to 31 (Almanza-Medina, 3.4.1)."""
 
 SCALE = 10.0
-"""Normalised labels lie in +-10 ("Normx10", 3.4.2)."""
+"""Normalised labels lie in +-10 ("Normx10", Almanza-Medina, 3.4.2)."""
 
 WHICH_LEVEL = 0x1E7E1
-"""Between the seed of noise and the seed that draws its level."""
+"""Difference of the seed of noise and the seed that draws its level."""
 
 Layout = Literal["side", "stack", "channels"]
 Coordinates = Literal["polar", "cartesian", "both"]
@@ -33,11 +41,11 @@ Coordinates = Literal["polar", "cartesian", "both"]
 
 @dataclass(frozen=True)
 class Labels:
-    """Targets as a network learns them, and back.
+    """Encodes targets as a network learns them, and decodes them.
 
     Attributes:
         kind: ``raw`` (m, m, rad; or m of height), ``quantised`` to 32 levels 0..31, or ``normx10``, in +-10.
-        low, high: limits of the targets, from the recipe.
+        low, high: limits of the targets, from the recipe ``(targets,)``.
         names: of the targets, with units.
     """
 
@@ -48,7 +56,11 @@ class Labels:
 
     @classmethod
     def of(cls, kind: str, recipe: Recipe, frames: int) -> Labels:
-        """The labels of samples of ``frames`` frames: their motion, or the height where a sample is one frame."""
+        """Return the labels of samples of ``frames`` frames: their motion, or the height if a sample is one frame.
+
+        Raises:
+            MitsonarError: an unknown kind.
+        """
         if kind not in LABELS:
             raise MitsonarError(f"unknown labels {kind!r}: {nearest_names(kind, LABELS)}")
         flight = recipe.flight
@@ -59,46 +71,45 @@ class Labels:
         return cls(kind, -limit, limit, ("sideways (m)", "forward (m)", "yaw (rad)"))
 
     def encode(self, targets: ArrayLike) -> NDArray[np.float32]:
-        """Labels ``(..., targets)`` of targets [m, rad]; quantised ones are clipped to the limits."""
+        """Compute the labels ``(..., targets)`` of targets [m, rad]. Quantised labels are clipped to the limits."""
         values = np.asarray(targets, dtype=float)
         if self.kind == "raw":
             return values.astype(np.float32)
-        place = self._place(values)
+        part = self._part(values)
         if self.kind == "quantised":
-            return np.rint(np.clip(place, 0, 1) * (LEVELS - 1)).astype(np.float32)
-        return ((2 * place - 1) * SCALE).astype(np.float32)
+            return np.rint(np.clip(part, 0, 1) * (LEVELS - 1)).astype(np.float32)
+        return ((2 * part - 1) * SCALE).astype(np.float32)
 
-    def decode(self, labels: Any) -> NDArray[np.float64]:
-        """Targets [m, rad] of labels or estimates of them ``(..., targets)``."""
+    def decode(self, labels: ArrayLike) -> NDArray[np.float64]:
+        """Compute the targets [m, rad] of labels, or of estimates of them ``(..., targets)``."""
         values = np.asarray(labels, dtype=float)
         if self.kind == "raw":
             return values
-        place = values / (LEVELS - 1) if self.kind == "quantised" else (values / SCALE + 1) / 2
-        return np.asarray(self.low + place * (self.high - self.low), dtype=np.float64)
+        part = values / (LEVELS - 1) if self.kind == "quantised" else (values / SCALE + 1) / 2
+        return np.asarray(self.low + part * (self.high - self.low), dtype=np.float64)
 
-    def _place(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """0 at the lower limit, 1 at the upper; 1/2 where both are one."""
+    def _part(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Compute 0 at the lower limit and 1 at the upper one; 1/2 where the limits are equal."""
         span = self.high - self.low
         return np.where(span > 0, (values - self.low) / np.where(span > 0, span, 1), 0.5)
 
 
 @dataclass(frozen=True)
 class Arrangement:
-    """From frames of a batch to the input of a network.
+    """Turns the frames of a batch into the input of a network.
 
     Attributes:
         views: names of the views, in the order in which they are placed.
         kind: ``image`` or ``vector``.
-        layout: ``side``, frames side by side, view by view: (batch, 1, bins, frames * beams); ``stack``, one below the
-            other; ``channels``, one channel each. Vectors are columns: (batch, 1, bins, frames * views), or channels.
+        layout: ``side``: frames side by side, view by view (batch, 1, bins, frames * beams); ``stack``: one below the
+            other; ``channels``: one channel each. Vectors are columns (batch, 1, bins, frames * views), or channels.
         coordinates: ``polar``; ``cartesian``, fans in metres; ``both``, a pair of the two.
         noise: drawn from (seed, frame, cell).
-        beams: of each view.
-        maps: of scan conversion, for each view.
-        range_levels: of vectors, neighbouring ones added up to so many; None: as they are.
-        halves: vectors of the port and of the starboard half of each image, a pseudo-quadrant each (Almanza-Medina, fig.
-            4.18).
-        levels: of noise, of which each sample draws one by (seed, its first frame); empty: ``noise``, the first of them.
+        beams: number of beams of each view.
+        maps: scan conversion of each view.
+        range_levels: number of levels of a vector, whose bins are added up in groups; None: one level a bin.
+        halves: whether images become vectors of their port and starboard halves (Almanza-Medina, fig. 4.18).
+        levels: levels of noise, of which each sample draws one by (seed, its first frame); empty: ``noise`` for all.
     """
 
     views: tuple[str, ...]
@@ -112,19 +123,22 @@ class Arrangement:
     range_levels: int | None = None
     halves: bool = False
 
-    def __call__(self, frames: dict[str, Any], numbers: Any, seed: int) -> Any:
-        """The input of a network.
+    def __call__(self, frames: Mapping[str, ArrayOfAnyLibrary], numbers: ArrayOfAnyLibrary, seed: int) -> InputOfAnyLibrary:
+        """Arrange the input of a network.
 
         Args:
             frames: by view ``(batch, frames, bins, beams)`` uint8 or float 0..1; as vectors ``(batch, frames, bins)`` with
                 ``nonzero_VIEW`` beside; NumPy or torch, on any device.
-            numbers: of the frames ``(batch, frames)``, integers: noise is theirs.
+            numbers: of the frames ``(batch, frames)``, integers, from which noise is drawn.
             seed: of the noise.
+
+        Returns:
+            One array ``(batch, channels, rows, columns)`` float32, or a polar and a Cartesian one.
         """
         if self.levels:
-            return self._each_its_level(frames, numbers, seed)
+            return self._with_drawn_levels(frames, numbers, seed)
         xp = array_namespace(numbers)
-        parts = [self.noisy(frames, view, numbers, seed + place) for place, view in enumerate(self.views)]
+        parts = [self.noisy(frames, view, numbers, seed + index) for index, view in enumerate(self.views)]
         if self.kind == "vector":
             axis = 1 if self.layout == "channels" else 3
             parts = [part[..., side] for part in parts for side in (0, 1)] if self.halves else parts
@@ -136,8 +150,10 @@ class Arrangement:
         fan = self._laid_out([self.maps[view].apply(part) for view, part in zip(self.views, parts, strict=True)])
         return fan if polar is None else (polar, fan)
 
-    def _each_its_level(self, frames: dict[str, Any], numbers: Any, seed: int) -> Any:
-        """Inputs of a batch whose samples draw their noise levels; made level by level, in the order of the batch."""
+    def _with_drawn_levels(
+        self, frames: Mapping[str, ArrayOfAnyLibrary], numbers: ArrayOfAnyLibrary, seed: int
+    ) -> InputOfAnyLibrary:
+        """Arrange a batch whose samples draw their noise levels, level by level, in the order of the batch."""
         xp = array_namespace(numbers)
         drawn, _ = uniform((numbers.shape[0], 1, 1), seed=seed + WHICH_LEVEL, frames=numbers[:, 0], like=numbers)
         level = xp.floor(drawn[:, 0, 0] * len(self.levels))
@@ -145,23 +161,35 @@ class Arrangement:
         mine = {name: values for name, values in frames.items() if name.removeprefix("nonzero_") in self.views}
         parts = [
             replace(self, noise=model, levels=())(
-                {name: xp.take(values, place, axis=0) for name, values in mine.items()},
-                xp.take(numbers, place, axis=0),
+                {name: xp.take(values, chosen, axis=0) for name, values in mine.items()},
+                xp.take(numbers, chosen, axis=0),
                 seed,
             )
-            for model, place in groups
-            if place.shape[0]
+            for model, chosen in groups
+            if chosen.shape[0]
         ]
-        back = xp.argsort(xp.concat([place for _, place in groups]))
+        back = xp.argsort(xp.concat([chosen for _, chosen in groups]))
 
-        def joined(pieces: Any) -> Any:
+        def joined(pieces: Iterable[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
             return xp.take(xp.concat(list(pieces), axis=0), back, axis=0)
 
         return tuple(map(joined, zip(*parts, strict=True))) if isinstance(parts[0], tuple) else joined(parts)
 
-    def noisy(self, frames: dict[str, Any], view: str, numbers: Any, seed: int) -> Any:
-        """Float32 frames of a view ``(batch, frames, bins, beams)``, with noise; vectors ``(batch, frames, bins)``, and of
-        halves one more axis of 2."""
+    def noisy(
+        self, frames: Mapping[str, ArrayOfAnyLibrary], view: str, numbers: ArrayOfAnyLibrary, seed: int
+    ) -> ArrayOfAnyLibrary:
+        """Add noise to the frames of a view.
+
+        Args:
+            frames: as for a call.
+            view: whose frames are wanted.
+            numbers: of the frames ``(batch, frames)``.
+            seed: of the noise.
+
+        Returns:
+            Images ``(batch, frames, bins, beams)`` float32, vectors ``(batch, frames, bins)``, or halves of images
+            ``(batch, frames, bins, 2)``.
+        """
         values = frames[view]
         xp = array_namespace(values)
         batch, count, *shape = values.shape
@@ -178,20 +206,20 @@ class Arrangement:
             return xp.reshape(flat, values.shape)
         if not self.halves:
             return xp.reshape(xp.sum(flat, axis=-1), values.shape[:-1])
-        half = flat.shape[-1] // 2  # of odd beams the middle one is in neither
+        half = flat.shape[-1] // 2  # an odd beam in the middle is in neither half
         both = [xp.sum(side, axis=-1) for side in (flat[..., :half], flat[..., flat.shape[-1] - half :])]
         return xp.reshape(xp.stack(both, axis=-1), (*values.shape[:-1], 2))
 
-    def _coarser(self, vectors: Any) -> Any:
-        """Vectors ``(batch, bins)`` with neighbouring bins added up."""
+    def _coarser(self, vectors: ArrayOfAnyLibrary) -> ArrayOfAnyLibrary:
+        """Add up neighbouring bins of vectors ``(batch, bins)``."""
         if self.range_levels is None:
             return vectors
         batch, bins = vectors.shape
         split = array_namespace(vectors).reshape(vectors, (batch, self.range_levels, bins // self.range_levels))
         return array_namespace(vectors).sum(split, axis=-1)
 
-    def _laid_out(self, parts: list[Any]) -> Any:
-        """Frames of all views in one tensor ``(batch, channels, rows, columns)``."""
+    def _laid_out(self, parts: list[ArrayOfAnyLibrary]) -> ArrayOfAnyLibrary:
+        """Join frames of all views in one array ``(batch, channels, rows, columns)``."""
         xp = array_namespace(parts[0])
         pictures = [part[:, q, ...] for part in parts for q in range(part.shape[1])]
         if self.layout == "channels":
@@ -211,60 +239,82 @@ def arrangement_of(
     range_levels: int | None = None,
     halves: bool = False,
 ) -> Arrangement:
-    """The arrangement that these words say, for the frames of a recipe; of several noise levels each sample draws one.
+    """Build the arrangement of a recipe's frames; of several noise levels each sample draws one.
+
+    The options are those of :class:`Arrangement`. By default all stored views are taken, of the first stored kind.
+    ``cartesian_rows`` is the number of pixels of a fan in the forward direction.
 
     Raises:
-        MitsonarError: a word that is not known, or that does not fit the others.
+        MitsonarError: an option that is unknown, or that does not fit the others.
     """
     known = {view.name: view for view in recipe.views}
     chosen = (views,) if isinstance(views, str) else tuple(known if views is None else views)
+    models = _noise_models(noise)
+    kind = kind or recipe.kinds[0]
+    _check_names(recipe, chosen, kind, layout, coordinates)
+    _check_vectors(recipe, kind, range_levels, halves)
+    beams = {name: len(known[name].bearing_rad) for name in chosen}
+    if kind == "image" and len(set(beams.values())) > 1 and layout != "side":
+        raise MitsonarError(f"views of different widths can only be side by side: {beams}; give layout='side'")
+    maps = {}
+    if coordinates != "polar":
+        for name in chosen:
+            maps[name] = cartesian_map(known[name].sonar.range_m, known[name].bearing_rad, cartesian_rows)
+        if len({conversion.index.shape for conversion in maps.values()}) > 1 and layout != "side":
+            raise MitsonarError("fans of different sizes can only be side by side: give layout='side'")
+    return Arrangement(
+        views=chosen,
+        kind=kind,
+        layout=cast(Layout, layout),
+        coordinates=cast(Coordinates, coordinates),
+        noise=models[0],
+        beams=beams,
+        maps=maps,
+        levels=models if len(models) > 1 else (),
+        range_levels=range_levels,
+        halves=halves,
+    )
+
+
+def _noise_models(noise: str | NoiseModel | Sequence[str | NoiseModel]) -> tuple[NoiseModel, ...]:
+    """Return the models of one level of noise, or of several.
+
+    Raises:
+        MitsonarError: something else, or an unknown name.
+    """
     levels = [noise] if isinstance(noise, str | NoiseModel) else list(noise) if isinstance(noise, Sequence) else []
     if not levels or not all(isinstance(level, str | NoiseModel) for level in levels):
         raise MitsonarError(f"noise must be a name, three numbers as text, or a NoiseModel: got {noise!r}; 'none' for none")
-    kind = kind or recipe.kinds[0]
+    return tuple(load_noise(level) if isinstance(level, str) else level for level in levels)
+
+
+def _check_names(recipe: Recipe, views: tuple[str, ...], kind: str, layout: str, coordinates: str) -> None:
+    """Check the options that are names, and whether they fit each other and what is stored.
+
+    Raises:
+        MitsonarError: an unknown name, or names that do not fit.
+    """
     for word, name, allowed in (
         (kind, "kind", ("image", "vector")),
-        (layout, "layout", ("side", "stack", "channels")),
-        (coordinates, "coordinates", ("polar", "cartesian", "both")),
+        (layout, "layout", get_args(Layout)),
+        (coordinates, "coordinates", get_args(Coordinates)),
     ):
         if word not in allowed:
             raise MitsonarError(f"{name} must be one of {', '.join(allowed)}: got {word!r}")
-    wrong = [name for name in chosen if name not in known]
-    if wrong or not chosen:
+    known = [view.name for view in recipe.views]
+    wrong = [name for name in views if name not in known]
+    if wrong or not views:
         raise MitsonarError(
             f"unknown view {wrong[0] if wrong else 'none'}: {nearest_names(wrong[0] if wrong else '', known)}"
         )
     if kind == "image" and "image" not in recipe.kinds:
         raise MitsonarError("the data set holds vectors only: read kind='vector', or make one with store: images or both")
     if kind == "vector" and (coordinates != "polar" or layout == "stack"):
-        raise MitsonarError("vectors have no cartesian form and stand side by side or in channels: got " + layout)
-    _check_vectors(recipe, kind, range_levels, halves)
-    beams = {name: len(known[name].bearing_rad) for name in chosen}
-    if kind == "image" and len(set(beams.values())) > 1 and layout != "side":
-        raise MitsonarError(f"views of different widths stand side by side only: {beams}")
-    maps = {}
-    if coordinates != "polar":
-        for name in chosen:
-            maps[name] = cartesian_map(known[name].sonar.range_m, known[name].bearing_rad, cartesian_rows)
-        if len({conversion.index.shape for conversion in maps.values()}) > 1 and layout != "side":
-            raise MitsonarError("fans of different sizes stand side by side only")
-    models = tuple(load_noise(level) if isinstance(level, str) else level for level in levels)
-    return Arrangement(
-        chosen,
-        kind,
-        layout,  # type: ignore[arg-type]
-        coordinates,  # type: ignore[arg-type]
-        models[0],
-        beams,
-        maps,
-        models if len(models) > 1 else (),
-        range_levels,
-        halves,
-    )
+        raise MitsonarError(f"vectors have no cartesian form, and layout side or channels only: got {coordinates}, {layout}")
 
 
 def _check_vectors(recipe: Recipe, kind: str, range_levels: int | None, halves: bool) -> None:
-    """Words that are for vectors only.
+    """Check the options that are for vectors only.
 
     Raises:
         MitsonarError: they do not fit the others.

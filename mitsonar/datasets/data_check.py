@@ -1,4 +1,4 @@
-"""Is a data set what it says: checksums, counts, ranges, and labels that follow from poses."""
+"""Checks of a data set: checksums, counts, ranges, and labels that follow from poses."""
 
 from __future__ import annotations
 
@@ -16,21 +16,30 @@ from mitsonar.motion.composition import motions
 __all__ = ["check"]
 
 LABEL_TOLERANCE = 1e-9
+"""Largest difference of labels and limits [m, rad]."""
 
 
 def check(store: DataStore, progress: Callable[[int], None] = lambda frames: None) -> list[str]:
-    """What is wrong, a sentence each; nothing where all is well. Reads everything."""
+    """Check a data set. Everything is read.
+
+    Args:
+        store: of the data set.
+        progress: called with the number of frames that were checked.
+
+    Returns:
+        A sentence for each fault.
+    """
     wrong = _files(store, progress)
-    for look in (_plan, _counts, _labels, _flight):
+    for check_part in (_plan, _counts, _labels, _flight):
         try:
-            wrong += look(store)
+            wrong += check_part(store)
         except MitsonarError as error:
             wrong.append(str(error))
     return wrong
 
 
 def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
-    """Every file against its seal, and what is in it against what may be."""
+    """Check every file against its seal, and its values against their limits."""
     wrong: list[str] = []
     unwritten: list[int] = []
     empty: list[int] = []
@@ -66,13 +75,13 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
 
 
 def _plan(store: DataStore) -> list[str]:
-    """What recipe and seed say of each frame, planned again."""
+    """Check the planned arrays against a plan that is made anew from recipe and seed."""
     plan = Plan.of(store.recipe, int(store.about["sequences"]))
     return [f"{name} is not what recipe and seed give" for name in store.unplanned(plan)]
 
 
 def _counts(store: DataStore) -> list[str]:
-    """Numbers of frames, sequences and scenes."""
+    """Check the numbers of frames, sequences and scenes."""
     about, wrong = store.about, []
     scene, sequence = store.read("scene"), store.read("sequence")
     lengths = np.bincount(sequence)
@@ -98,7 +107,7 @@ def _vehicle(store: DataStore) -> NDArray[np.float64]:
 
 
 def _labels(store: DataStore) -> list[str]:
-    """Motions computed from poses again."""
+    """Check the motions against the poses."""
     sequence, motion, vehicle = store.read("sequence"), store.read("motion"), _vehicle(store)
     inner = np.append(sequence[1:] == sequence[:-1], False)
     wrong = []
@@ -111,7 +120,7 @@ def _labels(store: DataStore) -> list[str]:
 
 
 def _flight(store: DataStore) -> list[str]:
-    """Limits of motions and jumps, footprints inside their scenes."""
+    """Check the limits of motions and jumps, and that footprints lie inside their scenes."""
     recipe = store.recipe
     flight = recipe.flight
     if flight.kind != "random":
@@ -135,7 +144,7 @@ def _flight(store: DataStore) -> list[str]:
 
 
 def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.int32]) -> float:
-    """How far footprints leave their scenes at most [m]."""
+    """Return how far footprints leave their scenes at most [m]."""
     recipe = store.recipe
     half = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
     limit = np.array([half[int(number)] for number in scene])

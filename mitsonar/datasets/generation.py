@@ -1,4 +1,4 @@
-"""Making a data set: shard by shard, by one process or many; what is whole is never made twice, whatever was killed."""
+"""Making a data set: shard by shard, by one process or many. A whole shard is never made twice, whatever was killed."""
 
 from __future__ import annotations
 
@@ -23,10 +23,13 @@ from mitsonar.simulation.variant import ensure_variant
 __all__ = ["Made", "make_dataset"]
 
 HALF_A_GROUP = re.compile(r"zarr\.[0-9a-f]{32}\.partial")
-"""What a kill leaves before anything else is there; any other file is somebody's."""
+"""What a kill leaves before anything else is there. Any other file belongs to the user."""
 
 ROUNDS = 3
-"""How often shards that are not there at the end are made."""
+"""How often shards that are missing at the end are made."""
+
+SHARDS_TO_CHECK = 32
+"""Shards of a large data set that are searched for empty frames. `mitsonar dataset check` reads all of them."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,9 @@ class Made:
     """What making a data set did.
 
     Attributes:
-        url: where it lies.
+        url: of the store.
         frames: of the data set.
-        made: shards that were written now.
+        made: shards that this call wrote.
         shards: of the data set.
         warnings: a sentence each.
     """
@@ -59,31 +62,31 @@ def make_dataset(
     begun: Callable[[int, int], None] = lambda frames, done: None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> Made:
-    """Make a data set, or go on with one that was broken off; the result is the same bit for bit.
+    """Make a data set, or continue one that was interrupted. The result is the same bit for bit.
 
     Args:
-        recipe: what it is.
+        recipe: of the data set.
         url: folder or URL of the store.
         sequences: only so many of the recipe's sequences.
-        workers: processes on this machine; one renders in this process, with all its threads.
-        scheduler: address of a dask scheduler that runs already; its workers render instead.
-        verify: compare what is there with its digests, not only sizes, and make again what differs.
-        begun: called with the frames of the data set and those that are there already.
+        workers: processes on this machine; with 1 this process renders, with all its threads.
+        scheduler: address of a running dask scheduler, whose workers render instead.
+        verify: whether existing shards are compared with their digests, too, and remade where these differ.
+        begun: called with the number of frames of the data set and the number of those that exist already.
         progress: called with the number of frames that were added.
 
     Raises:
-        MitsonarError: the store is another data set, is written by somebody else, or was begun with other versions.
+        MitsonarError: the store is another data set, another process writes it, or it was begun with other versions.
     """
-    place = Storage(url)
-    _refuse_what_is_not_ours(place)
-    with place.locked() as still_ours:
+    storage = Storage(url)
+    _refuse_other_files(storage)
+    with storage.locked() as still_ours:
         variant = ensure_variant()
-        store = _begun_or_new(place, recipe, sequences, variant, verify)
-        _clear_parts(place)
+        store = _open_or_create(storage, recipe, sequences, variant, verify)
+        _clear_parts(storage)
         todo = store.missing(verify=verify)
         begun(len(store), len(store) - _frames(store, todo))
         written = 0
-        for _ in range(ROUNDS):  # what somebody damaged meanwhile is made again
+        for _ in range(ROUNDS):  # what was damaged meanwhile is remade
             if not todo:
                 break
             _check_versions(store)
@@ -94,38 +97,42 @@ def make_dataset(
             written += len(todo)
             todo = store.missing()
         if todo:
-            raise MitsonarError(f"{url}: shards vanish while others are written; does somebody else write there?")
+            raise MitsonarError(f"{url}: shards vanish while others are written; does another program write there?")
         store.finish()
-        return Made(place.url, len(store), written, store.shards, _warnings(store))
+        return Made(storage.url, len(store), written, store.shards, _warnings(store))
 
 
-def _refuse_what_is_not_ours(place: Storage) -> None:
-    """Arrays are made by removing what has their names: there must be nothing else."""
-    there = [name for name in place.sizes() if not HALF_A_GROUP.fullmatch(name)]
+def _refuse_other_files(storage: Storage) -> None:
+    """Refuse a folder with other files: creating an array removes what has its name.
+
+    Raises:
+        MitsonarError: there are other files.
+    """
+    there = [name for name in storage.sizes() if not HALF_A_GROUP.fullmatch(name)]
     if there and "zarr.json" not in there:
-        raise MitsonarError(f"{place.url} holds other things ({min(there)}) and is kept as it is: choose another -o")
+        raise MitsonarError(f"{storage.url} holds other things ({min(there)}) and is kept as it is: choose another -o")
 
 
-def _begun_or_new(place: Storage, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
-    """The store that is there, if it is the same data set, or a new one."""
+def _open_or_create(storage: Storage, recipe: Recipe, sequences: int | None, variant: str, verify: bool) -> DataStore:
+    """Open the existing store if it is the same data set, or create a new one."""
     count = recipe.sequences if sequences is None else sequences
-    scenes_of(recipe, count)  # before anything is rendered: are there so many?
-    if "zarr.json" in place.sizes():
-        store = DataStore.open(place, write=True, unfinished=True)
+    scenes_of(recipe, count)  # refuses a wrong number before anything is rendered
+    if "zarr.json" in storage.sizes():
+        store = DataStore.open(storage, write=True, unfinished=True)
         _check_same(store, recipe, count, variant)
         if store.ready:
             if verify:
                 store.mend_known(Plan.of(recipe, count))
             return store
     about = {**renderer_of(modality_of(recipe)).settled(recipe), "variant": variant, "versions": versions(PACKAGES)}
-    return DataStore.create(place, recipe, Plan.of(recipe, count), about)
+    return DataStore.create(storage, recipe, Plan.of(recipe, count), about)
 
 
 def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) -> None:
-    """The store was begun as this recipe, with these versions.
+    """Check that the store was begun with this recipe, number of sequences and variant.
 
     Raises:
-        MitsonarError: it was not; what differs is named.
+        MitsonarError: it was not; the message names what differs.
     """
     about = store.about
     asked = {**recipe.model_dump(mode="json"), "sequences": sequences}
@@ -139,10 +146,10 @@ def _check_same(store: DataStore, recipe: Recipe, sequences: int, variant: str) 
 
 
 def _check_versions(store: DataStore) -> None:
-    """What is still to be rendered fits what is there.
+    """Check that the missing shards would fit the existing ones.
 
     Raises:
-        MitsonarError: it was begun with other versions.
+        MitsonarError: the store was begun with other versions.
     """
     changed = store.other_versions()
     if changed:
@@ -152,16 +159,16 @@ def _check_versions(store: DataStore) -> None:
         )
 
 
-def _clear_parts(place: Storage) -> None:
-    """Remove what a killed writer left half written; files get their name only when they are whole."""
-    if place.local:
-        for name in place.sizes():
+def _clear_parts(storage: Storage) -> None:
+    """Remove the partial files of a killed writer. A file gets its name only when it is whole."""
+    if storage.local:
+        for name in storage.sizes():
             if name.endswith(".partial"):
-                place.remove(name)
+                storage.remove(name)
 
 
 def _too_few(store: DataStore) -> list[str]:
-    """Whether the recipe's own split can be read."""
+    """Return a sentence if the recipe's own split has too few scenes or sequences."""
     split = store.recipe.split
     worlds = world_of(store.recipe, store.scenes)[store.read("scene")]
     try:
@@ -176,7 +183,7 @@ def _frames(store: DataStore, shards: list[int]) -> int:
 
 
 def _warnings(store: DataStore) -> list[str]:
-    """What the user should know of a finished data set."""
+    """List what the user should know of a finished data set, a sentence each."""
     sentences = [*_too_few(store)]
     over_nothing = int(np.isnan(store.read("height_m")).sum())
     if over_nothing:
@@ -187,13 +194,9 @@ def _warnings(store: DataStore) -> list[str]:
     return [*sentences, *_empty(store), *store.modality.warnings(store.read)]
 
 
-SHARDS_TO_LOOK_AT = 32
-"""Of a large data set: to read all of it again would take minutes, and `mitsonar dataset check` does."""
-
-
 def _empty(store: DataStore) -> list[str]:
-    """Whether frames hold no echo, in shards spread evenly over the data set."""
-    shards = np.unique(np.linspace(0, store.shards - 1, min(SHARDS_TO_LOOK_AT, store.shards)).round().astype(int))
+    """Return a sentence if frames hold no echo, in shards spread evenly over the data set."""
+    shards = np.unique(np.linspace(0, store.shards - 1, min(SHARDS_TO_CHECK, store.shards)).round().astype(int))
     empty, frames = [], 0
     for shard in shards:
         here = store.frames_of(int(shard))
@@ -202,5 +205,5 @@ def _empty(store: DataStore) -> list[str]:
         except MitsonarError:  # damaged: `mitsonar dataset check` says which
             continue
         frames += here.stop - here.start
-    looked_at = "" if frames == len(store) else f" that were looked at (of {len(store):,})"
-    return [empty_sentence(empty, frames, looked_at)] if empty else []
+    checked = "" if frames == len(store) else f" that were checked (of {len(store):,})"
+    return [empty_sentence(empty, frames, checked)] if empty else []

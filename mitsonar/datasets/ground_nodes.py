@@ -1,4 +1,4 @@
-"""The geometry of level ground as networks take it: at a few nodes of an image, in bins and beams."""
+"""The geometry of level ground as networks read it: at a few nodes of an image, in bins and beams."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from mitsonar.records.sonar_frames import SonarFrames
 __all__ = ["NODES", "ground_at", "ground_of"]
 
 NODES = (17, 9)
-"""Along range and bearing: the geometry is smooth, linear interpolation between so many errs by less than 1e-3 cells."""
+"""Nodes along range and bearing. The geometry is smooth: linear interpolation between them errs by less than 1e-3 cells."""
 
 RISE = 0.05
-"""Part of the height by which ground is raised and lowered to see what changes."""
+"""Part of the height by which the ground is raised and lowered to compute the derivative by relief."""
 
 
 def ground_at(
     range_m: ArrayLike, bearing_rad: ArrayLike, bearing: Bearing, height_m: float, pitch_rad: float, roll_rad: float = 0.0
 ) -> dict[str, NDArray[np.float32]]:
-    """Where the nodes of an image lie on the ground, and how they move with the sonar.
+    """Compute where the nodes of an image lie on the ground, and how they move with the sonar.
 
     Args:
         range_m: of the bins ``(bins,)`` [m], rising.
         bearing_rad: of the beams ``(beams,)`` [rad], rising.
-        bearing: which angle that is.
-        height_m: of the sonar over what is seen.
-        pitch_rad: > 0 looks down.
+        bearing: the kind of that angle.
+        height_m: of the sonar over the ground [m].
+        pitch_rad: > 0 tilts the sonar down.
         roll_rad: > 0 puts starboard down.
 
     Returns:
         By name, float32: ``points (R, C, 2)`` [m], ``turn (3, 3)``, ``height ()`` [m], ``place (2, R, C)`` range [m] and
         bearing [rad] of the nodes, ``cell (2, R, C)`` bin [m] and beam [rad] there, ``derivative (2, 3, R, C)`` in bins and
-        beams by motion [m, m, rad], ``by_relief (2, 3, R, C)`` its change where what is seen stands higher, by parts of the
-        height, ``cone ()``: 1 where the bearing is a cone's.
+        beams by motion [m, m, rad], ``by_relief (2, 3, R, C)`` its change with relief above the ground, by parts of the
+        height, ``cone ()``: 1 where the bearing is the angle of a cone.
     """
     axes = [np.asarray(values, dtype=float) for values in (range_m, bearing_rad)]
     index = [np.linspace(0, len(axis) - 1, count) for axis, count in zip(axes, NODES, strict=True)]
@@ -48,7 +48,7 @@ def ground_at(
     cells = np.stack(np.meshgrid(*cell, indexing="ij"))
 
     def derivative(part: float) -> NDArray[np.float64]:
-        """By motion, over ground at this part of the height."""
+        """Compute the derivative by motion, over ground at this part of the height."""
         own = GroundGeometry(nodes[0], nodes[1], bearing, part * height_m, pitch_rad, roll_rad)
         values = np.nan_to_num(own.derivative[row, column]) / np.moveaxis(cells, 0, -1)[..., None]
         return np.moveaxis(values, (2, 3), (0, 1))
@@ -67,13 +67,13 @@ def ground_at(
     return {name: np.array(values, dtype=np.float32) for name, values in table.items()}
 
 
-def ground_of(frames: SonarFrames, standing: Attitude) -> dict[str, NDArray[np.float32]]:
-    """The geometry of frames, as they stand over what they see; see :func:`ground_at`."""
+def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
+    """Compute the geometry of frames at their attitude over the ground; see :func:`ground_at`."""
     return ground_at(
         frames.range_m,
         frames.bearing_rad,
         frames.sonar.bearing,
-        standing.height_m,
-        standing.pitch_rad,
-        standing.roll_rad,
+        attitude.height_m,
+        attitude.pitch_rad,
+        attitude.roll_rad,
     )

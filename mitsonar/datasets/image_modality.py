@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise
 from mitsonar.config.data_recipe import Recipe, array_names
-from mitsonar.datasets.modality import Read, StoredArray, StoredAxis, ground_reach
+from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, Values, ground_reach
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
@@ -20,7 +19,7 @@ from mitsonar.records.sonar_frames import LABELS
 __all__ = ["ImageModality", "footprint"]
 
 RAYS = 61
-"""Over azimuth and over elevation, whose ends on the ground make a footprint: arcs bulge less than 0.2 mm between them."""
+"""Rays over azimuth and over elevation whose ends make a footprint. Arcs bulge less than 0.2 mm between them."""
 
 TEXTS = {
     "image": "{}: level times gain, 0..255 (or 0..1), row 0 nearest, column 0 most to port; zero means no echo",
@@ -58,19 +57,19 @@ class ImageModality:
 
     @property
     def stored(self) -> dict[str, StoredArray]:
-        """Pixels, and what rendering tells of each frame."""
+        """Return the arrays of pixels, and what rendering reports of each frame."""
         views = {view.name: view for view in self.recipe.views}
         table = {}
         for name, (kind, view_name) in array_names(self.recipe).items():
             view, sums = views[view_name], kind in ("vector", "nonzero")
             shape: tuple[int, ...] = (view.sonar.range_bins, *(() if sums else (len(view.bearing_rad),)))
             dims = ("range", *(() if sums else (f"beam{self.recipe.suffix(view_name)}",)))
-            table[name] = StoredArray(self._type(kind), TEXTS[kind].format(view_name), shape, dims)
+            table[name] = self._stored(kind, view_name, shape, dims)
         return table | PER_FRAME
 
     @property
     def axes(self) -> dict[str, StoredAxis]:
-        """Bearings of each view, and ranges."""
+        """Return the bearings of each view, and the ranges."""
         table = {}
         for view in self.recipe.views:
             suffix = self.recipe.suffix(view.name)
@@ -79,14 +78,14 @@ class ImageModality:
         return table | {"range_m": StoredAxis(self.recipe.views[0].sonar.range_m, "range", "centre of each range bin [m]")}
 
     @property
-    def attributes(self) -> dict[str, Any]:
-        """The sonar, and that of each view."""
+    def attributes(self) -> Fields:
+        """Return the sonar, and that of each view."""
         views = {view.name: view.sonar.model_dump() for view in self.recipe.views}
         return {"sonar": self.sonar.model_dump(), "views": views, "level": "linear"}
 
     @property
     def ping_bytes(self) -> int:
-        """Pixels and labels of a frame; of vectors alone their sums and counts."""
+        """Return the size of a frame's pixels and labels; of vectors alone that of sums and counts [bytes]."""
         if "image" not in self.recipe.kinds:
             return sum(view.sonar.range_bins * 8 for view in self.recipe.views)
         size = 1 if self.recipe.pixel == "uint8" else 4
@@ -95,28 +94,36 @@ class ImageModality:
 
     @property
     def sample_frames(self) -> int:
-        """Records of a sample."""
+        """Return 2: estimators of images are compared on pairs."""
         return 2
 
     def reach(self, height: float) -> NDArray[np.float64]:
-        """Corners of the footprint, or of that of the field of view that the flight names."""
+        """Compute the footprint ``(n, 2)`` [m], or that of the field of view that the flight names.
+
+        Raises:
+            MitsonarError: the ground is out of range.
+        """
         return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg)
 
-    def _type(self, kind: str) -> np.dtype[Any]:
-        """The type of an array of this kind."""
+    def _stored(self, kind: str, view: str, shape: tuple[int, ...], dims: tuple[str, ...]) -> StoredArray:
+        """Return an array of this kind for a view."""
         known = {"image": self.recipe.pixel, "vector": np.float32, "nonzero": np.uint32}
-        return np.dtype(known[kind] if kind in known else LABELS[kind])
+        return StoredArray(np.dtype(known[kind] if kind in known else LABELS[kind]), TEXTS[kind].format(view), shape, dims)
 
     # ---------------------------------------------------------------- noise
 
     def noise_model(self, name: str) -> NoiseModel:
-        """Return the noise model of a name."""
+        """Return the noise model of a name.
+
+        Raises:
+            MitsonarError: unknown name.
+        """
         return load_noise(name)
 
     # ---------------------------------------------------------------- checks
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
-        """Frames without a pixel above 0 in any view ``(frames,)``."""
+        """Find the frames without a pixel above 0 in any view ``(frames,)``."""
         dark = np.ones(here.stop - here.start, dtype=bool)
         for name, (kind, _) in array_names(self.recipe).items():
             if kind in ("image", "vector"):
@@ -124,7 +131,7 @@ class ImageModality:
         return dark
 
     def faults(self, read: Read, here: slice) -> list[str]:
-        """Ranges of pixels, sums and labels."""
+        """Check the limits of pixels, sums and labels. Return a sentence for each fault."""
         wrong = []
         beams = {view.name: len(view.bearing_rad) for view in self.recipe.views}
         for name, (kind, view) in array_names(self.recipe).items():
@@ -145,7 +152,7 @@ class ImageModality:
         return wrong
 
     def warnings(self, read: Read) -> list[str]:
-        """Motions far below a bin, returns outside the window, a gain that is too high."""
+        """Warn of motions far below a bin, of returns outside the window, and of a gain that is too high."""
         sentences = []
         flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m
         largest_mm = max(flight.sideways_mm, flight.forward_mm)
@@ -170,7 +177,8 @@ class ImageModality:
         return sentences
 
 
-def _limits(kind: str, values: NDArray[Any], beams: int) -> tuple[float, float]:
+def _limits(kind: str, values: Values, beams: int) -> tuple[float, float]:
+    """Return the lowest and the highest value that an array of this kind may hold."""
     match kind:
         case "image":
             return 0, 255 if values.dtype == np.uint8 else 1
@@ -186,7 +194,13 @@ def _limits(kind: str, values: NDArray[Any], beams: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=8)
 def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None) -> NDArray[np.float64]:
-    """Corners of what a sonar can see of the ground z = 0, from a vehicle at ``height`` ``(n, 2)`` starboard, forward [m].
+    """Compute a sonar's footprint on the ground z = 0: corners ``(n, 2)``, starboard and forward of the vehicle [m].
+
+    Args:
+        sonar: whose field of view it is.
+        mount: pose of the sonar on the vehicle.
+        height: of the vehicle [m].
+        fov_deg: azimuth and elevation in place of the sonar's own [deg].
 
     Raises:
         MitsonarError: the ground is out of range.

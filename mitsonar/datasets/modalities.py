@@ -1,4 +1,4 @@
-"""The recording of a recipe, by its instrument."""
+"""The modality of a recipe, by its instrument."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ __all__ = ["modality_of"]
 
 
 def modality_of(recipe: Recipe) -> Modality:
-    """What the recipe's instrument records."""
+    """Return the modality of the recipe's instrument."""
     return ImageModality(recipe) if recipe.channel is None else ResponseModality(recipe)

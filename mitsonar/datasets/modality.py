@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Instrument
 
 __all__ = [
+    "Fields",
     "Modality",
     "Read",
     "Renderer",
     "StoredArray",
     "StoredAxis",
+    "Values",
     "empty_sentence",
     "ground_reach",
     "renderer_of",
@@ -34,8 +36,18 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Read = Callable[..., NDArray[Any]]
-"""Values of an array of a store by its name, all or those of a slice of frames."""
+
+Values: TypeAlias = NDArray[Any]
+"""Values of a stored array; their type is the array's own."""
+
+Fields: TypeAlias = dict[str, Any]
+"""Attributes or keys by name, as JSON holds them."""
+
+OpenedSamples: TypeAlias = Any
+"""An object of the class that :attr:`Modality.samples_class` names, which is loaded only when it is used."""
+
+Read = Callable[..., Values]
+"""Reads values of an array of a store by its name, all or those of a slice of frames."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ class StoredArray:
 
     Attributes:
         kind: its type.
-        about: a sentence on it, kept in the store.
+        about: a description, kept in the store.
         shape: of one ping's values.
         dims: names of these dimensions.
     """
@@ -65,46 +77,46 @@ class StoredAxis:
 
 
 class Renderer(Protocol):
-    """One scene, loaded."""
+    """Renders one scene, which is loaded."""
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None: ...
 
     @staticmethod
-    def settled(recipe: Recipe) -> dict[str, Any]:
-        """Return numbers of the whole data set, which are set before its first ping is recorded.
+    def settled(recipe: Recipe) -> Fields:
+        """Compute the numbers of the whole data set, which are set before its first ping is recorded.
 
         Raises:
             MitsonarError: the first frames are empty.
         """
 
-    def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        """Return what is stored of consecutive pings of the scene, by name.
+    def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
+        """Render consecutive pings of the scene. Return what is stored of them, by name.
 
         Args:
-            planned: what the plan says of them: ``pose``, and what the modality names.
+            planned: values of the plan for these pings: ``pose``, and what the modality names.
             first: number of the first in the scene.
             about: attributes of the store.
         """
 
 
 class Modality(Protocol):
-    """What a recipe's instrument records, from simulation to comparison.
+    """Everything that depends on what a recipe's instrument records, from simulation to comparison.
 
     Attributes:
-        what: one ping's record is called.
-        sonar: the instrument: its name, model and frame rate are what all have.
+        what: the name of one ping's record.
+        sonar: the instrument; all have a name, a model and a frame rate.
         stored: arrays that are filled ping by ping, those with a shape first.
         axes: arrays along their dimensions.
         attributes: of the store.
         settled: names of attributes that are numbers of the whole data set, set before its first ping is recorded.
         planned: arrays of the plan that are stored beside the poses.
         decided_by: packages whose versions decide what is recorded, beside those that always do.
-        ping_bytes: of one ping, about.
+        ping_bytes: approximate size of one ping.
         renderer_class: what renders a scene of the recipe, ``module:class``; see :func:`renderer_of`.
         samples_class: what reads the samples that estimators are compared on, ``module:class``.
         sample_frames: records of a sample in a comparison.
-        estimators: that a comparison asks unless others are named, by name with commas between.
-        variations: whether estimators can be told something wrong of its samples, in a comparison.
+        estimators: that a comparison runs unless others are named, by name with commas between.
+        variations: whether a comparison can give estimators wrong assumptions on its samples.
     """
 
     what: str
@@ -117,49 +129,62 @@ class Modality(Protocol):
     variations: bool
 
     @property
-    def sonar(self) -> Instrument: ...
+    def sonar(self) -> Instrument:
+        """Return the instrument."""
+
     @property
-    def stored(self) -> dict[str, StoredArray]: ...
+    def stored(self) -> dict[str, StoredArray]:
+        """Return the arrays that are filled ping by ping, those with a shape first."""
+
     @property
-    def axes(self) -> dict[str, StoredAxis]: ...
+    def axes(self) -> dict[str, StoredAxis]:
+        """Return the arrays along dimensions."""
+
     @property
-    def attributes(self) -> dict[str, Any]: ...
+    def attributes(self) -> Fields:
+        """Return the attributes of the store."""
+
     @property
-    def ping_bytes(self) -> int: ...
+    def ping_bytes(self) -> int:
+        """Return the approximate size of one ping [bytes]."""
+
     @property
-    def sample_frames(self) -> int: ...
+    def sample_frames(self) -> int:
+        """Return the number of records of a sample in a comparison."""
 
     def reach(self, height: float) -> Array:
-        """Corners ``(n, 2)`` of what is seen of the ground z = 0, from a level vehicle so high, starboard, forward [m].
+        """Compute the footprint of a level vehicle at a height [m]: corners ``(n, 2)`` on the ground z = 0.
+
+        The corners are starboard and forward of the vehicle [m].
 
         Raises:
             MitsonarError: no ground is seen.
         """
 
     def noise_model(self, name: str) -> NoiseModel | None:
-        """Return the noise of a name; None where the name is all there is to it.
+        """Return the noise model of a name, or None if the name alone defines the noise.
 
         Raises:
-            MitsonarError: unknown.
+            MitsonarError: unknown name.
         """
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
-        """Which of some pings hold no echo at all, in no view and at no receiver ``(pings,)``."""
+        """Find the pings without any echo, in all views or at all receivers ``(pings,)``."""
 
     def faults(self, read: Read, here: slice) -> list[str]:
-        """What is wrong with the values of some frames, a sentence each."""
+        """Check the values of some frames. Return a sentence for each fault."""
 
     def warnings(self, read: Read) -> list[str]:
-        """What the user should know of a finished data set, a sentence each."""
+        """List what the user should know of a finished data set, a sentence each."""
 
 
 def renderer_of(modality: Modality) -> type[Renderer]:
-    """Return the class that renders scenes; loaded here, so that reading a stored set enters no simulator."""
+    """Load the class that renders scenes. It is loaded here, so that reading a stored set loads no simulator."""
     found: type[Renderer] = resolve_name(modality.renderer_class)
     return found
 
 
-def samples_of(modality: Modality, url: str | Path, **options: Any) -> Any:
+def samples_of(modality: Modality, url: str | Path, **options: Any) -> OpenedSamples:
     """Open the samples of a store, as estimators are compared on them.
 
     Raises:
@@ -169,14 +194,14 @@ def samples_of(modality: Modality, url: str | Path, **options: Any) -> Any:
 
 
 def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
-    """Corners ``(n, 2)`` of where rays meet the ground z = 0 [m].
+    """Compute the corners ``(n, 2)`` of the area where rays meet the ground z = 0 [m].
 
-    Rays that meet it beyond ``range_max``, or never, count as far as that allows.
+    Rays that meet it beyond ``range_max``, or never, end at that range.
 
     Args:
-        eye: where they start ``(3,)``.
+        eye: where the rays start ``(3,)`` [m].
         directions: ``(rays, 3)``, unit.
-        range_max: of the instrument.
+        range_max: of the instrument [m].
 
     Raises:
         MitsonarError: the ground is out of range.
@@ -197,17 +222,17 @@ def ground_reach(eye: Array, directions: Array, range_max: float) -> Array:
     return np.asarray(points[ConvexHull(points).vertices])
 
 
-def empty_sentence(empty: Sequence[int], frames: int, looked_at: str = "") -> str:
-    """What to say of frames without echoes.
+def empty_sentence(empty: Sequence[int], frames: int, checked: str = "") -> str:
+    """Write the sentence on frames without echoes.
 
     Args:
         empty: their numbers.
-        frames: how many were looked at.
-        looked_at: which these are, where not all.
+        frames: number of frames that were checked.
+        checked: which frames these are, unless all.
     """
     which = ", ".join(f"{number:,}" for number in empty[:6]) + (" ..." if len(empty) > 6 else "")
     return (
-        f"{len(empty):,} of {frames:,} frames{looked_at} are empty, without a single echo ({which}): there the sonar sees "
+        f"{len(empty):,} of {frames:,} frames{checked} are empty, without a single echo ({which}): there the sonar sees "
         "nothing of the scene within its window; check world.size_m, flight.height_m, mount, range_min and range_max, and "
         "make another data set"
     )

@@ -1,7 +1,7 @@
-"""Where the vehicle is in every frame of a data set: sequences of pings at a constant rate, jumps between them, runs.
+"""The vehicle's pose in every frame of a data set: sequences of pings at a constant rate, jumps between them, runs.
 
-Everything here is a function of recipe, seed, scene and sequence: whoever plans gets the same numbers, and the sequences of
-a small data set are the first ones of each scene of a large one.
+A plan is a function of recipe, seed, scene and sequence: every process computes the same numbers. The sequences of a small
+data set are the first ones of each scene of a large one.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ from mitsonar.worlds.world import Family, stream
 __all__ = ["Plan", "Scene", "Sequence", "footprints_at", "scenes_of", "sequences_of"]
 
 FEWEST_SEQUENCES = 10
-"""Sequences of a scene before a small data set opens another: worlds cost more than frames."""
+"""Sequences of a scene before a small data set opens another scene: worlds cost more than frames."""
 
 CANDIDATES = 64
+"""Positions and headings that are drawn at once for a sequence."""
+
 TRIES = 200
+"""How often they are drawn before the recipe is refused."""
 
 FLIGHT, WORLD = 3, 4
 """Purposes of random numbers (see worlds.world.stream)."""
@@ -50,7 +53,7 @@ class Sequence:
     vehicle: NDArray[np.float64]
 
     def at_rate(self, rate_hz: float) -> Trajectory:
-        """The vehicle's path at so many pings a second."""
+        """Return the vehicle's trajectory at a rate of pings [Hz]."""
         return Trajectory(self.vehicle, np.arange(len(self.vehicle)) / rate_hz)
 
 
@@ -62,9 +65,9 @@ class Plan:
         scenes: those that have frames.
         scene: number of the scene of each frame ``(frames,)``.
         sequence: number of the sequence of each frame, counted over the data set ``(frames,)``.
-        time_s: since the sequence began ``(frames,)``.
-        vehicle: poses of the vehicle ``(frames, 6)``.
-        poses: of the sonar ``(frames, 6)``.
+        time_s: since the sequence began ``(frames,)`` [s].
+        vehicle: poses of the vehicle ``(frames, 6)`` [m, rad].
+        poses: of the sonar ``(frames, 6)`` [m, rad].
         motion: sideways, forward [m], yaw [rad] to the next frame of the sequence ``(frames, 3)``; nan for its last.
         velocity: of the vehicle in its own axes; see :func:`~mitsonar.motion.trajectory.velocities` ``(frames, 4)``.
     """
@@ -83,7 +86,7 @@ class Plan:
 
     @classmethod
     def of(cls, recipe: Recipe, sequences: int | None = None) -> Plan:
-        """The plan of a recipe, or of its first ``sequences`` sequences.
+        """Plan a recipe, or its first ``sequences`` sequences.
 
         Raises:
             MitsonarError: more sequences than the recipe has, none, or a footprint that fits no scene.
@@ -111,10 +114,10 @@ class Plan:
 
 
 def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
-    """The scenes that ``sequences`` sequences are spread over, in proportion to the recipe's own numbers.
+    """Spread ``sequences`` sequences over scenes, in proportion to the recipe's own numbers.
 
     Raises:
-        MitsonarError: none, or more than the recipe has.
+        MitsonarError: no sequence, or more than the recipe has.
     """
     if not 1 <= sequences <= recipe.sequences:
         raise MitsonarError(
@@ -136,16 +139,17 @@ def scenes_of(recipe: Recipe, sequences: int) -> list[Scene]:
 
 
 def world_seed(seed: int, scene: int) -> int:
-    """The seed of a scene's world."""
+    """Compute the seed of a scene's world."""
     return int(np.random.SeedSequence([seed, WORLD, scene]).generate_state(1)[0])
 
 
 def _first(sequences: Iterator[Sequence], count: int) -> list[Sequence]:
+    """Take the first sequences of a scene."""
     return [next(sequences) for _ in range(count)]
 
 
 def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
-    """The sequences of a scene, one after the other; random flights have no end.
+    """Yield the sequences of a scene, one after the other; random flights have no end.
 
     Raises:
         MitsonarError: the footprint does not fit the scene.
@@ -167,7 +171,11 @@ def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
 def _sequence(
     recipe: Recipe, family: Family, rng: np.random.Generator, last: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """The next sequence ``(pings, 6)``: motion first, then places until one keeps all footprints inside."""
+    """Draw the next sequence ``(pings, 6)``: its motion, then positions until one keeps all footprints in the scene.
+
+    Raises:
+        MitsonarError: no position was found.
+    """
     flight, half = recipe.flight, family.half_m
     low, high = flight.heights
     draws = rng.random(4)
@@ -176,14 +184,14 @@ def _sequence(
     motion = Motion(*(largest * (2 * draws[1:] - 1)))
     corners = _corners(recipe, height, _drive(Pose(0, 0, height), motion, flight.pings))
     for _ in range(TRIES):
-        place = _places(flight, half, rng, last)
+        position = _positions(flight, half, rng, last)
         heading = np.pi * (2 * rng.random(CANDIDATES) - 1)
         sin, cos = np.sin(heading)[:, None], np.cos(heading)[:, None]
         x, y = corners.T[0] * cos + corners.T[1] * sin, corners.T[1] * cos - corners.T[0] * sin
-        outermost = np.maximum(np.abs(x + place[:, :1]), np.abs(y + place[:, 1:])).max(axis=1)
+        outermost = np.maximum(np.abs(x + position[:, :1]), np.abs(y + position[:, 1:])).max(axis=1)
         found = int((outermost <= half).argmax())
         if outermost[found] <= half:
-            start = Pose(float(place[found, 0]), float(place[found, 1]), height, 0, 0, float(heading[found]))
+            start = Pose(float(position[found, 0]), float(position[found, 1]), height, 0, 0, float(heading[found]))
             return _drive(start, motion, flight.pings)
     raise MitsonarError(
         f"no place for a sequence found in {TRIES * CANDIDATES:,} tries: its footprint reaches "
@@ -193,23 +201,23 @@ def _sequence(
 
 
 def _corners(recipe: Recipe, height: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vehicle and the corners of its footprint ``(n, 2)`` [m] in all pings, about the first and in its axes."""
+    """Compute positions and footprints of all pings ``(n, 2)`` [m], relative to the first ping and in its axes."""
     reach = modality_of(recipe).reach(height)
     return np.concatenate([footprints_at(driven, reach).reshape(-1, 2), driven[:, :2]])
 
 
 def footprints_at(vehicle: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A footprint ``(n, 2)`` in the vehicle's axes, in the world's, at each pose: ``(poses, n, 2)``."""
+    """Transform a footprint ``(n, 2)`` from the vehicle's axes to the world's at each pose: ``(poses, n, 2)`` [m]."""
     sin, cos = np.sin(vehicle[:, 5:]), np.cos(vehicle[:, 5:])
     x = vehicle[:, :1] + reach.T[0] * cos + reach.T[1] * sin
     y = vehicle[:, 1:2] + reach.T[1] * cos - reach.T[0] * sin
     return np.stack([x, y], axis=-1)
 
 
-def _places(
+def _positions(
     flight: Flight, half_m: float, rng: np.random.Generator, last: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Candidates for the next place ``(n, 2)``: anywhere, or a jump away in x and in y."""
+    """Draw candidates for the next position ``(n, 2)``: anywhere, or a jump away in x and in y."""
     draws = rng.random((2, CANDIDATES, 2))
     if last is None or flight.jump_m is None:
         return np.asarray(half_m * (2 * draws[0] - 1), dtype=np.float64)
@@ -218,7 +226,7 @@ def _places(
 
 
 def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
-    """Poses at a constant rate (eq. 3.4)."""
+    """Compose poses at a constant rate (Almanza-Medina, eq. 3.4)."""
     poses = [start]
     for _ in range(pings - 1):
         poses.append(compose(poses[-1], motion))
@@ -226,12 +234,12 @@ def _drive(start: Pose, motion: Motion, pings: int) -> NDArray[np.float64]:
 
 
 def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
-    """A run of Almanza-Medina, 2.3, over the pattern, or of 4.4.4: poses of the vehicle ``(frames, 6)``.
+    """Return a run over the pattern (Almanza-Medina, 2.3 or 4.4.4): poses of the vehicle ``(frames, 6)`` [m, rad].
 
     ``legs``: 250 frames over 5 m to starboard, 100 over 1.2 m forward, 250 over 5 m to port, 100 over 1.1 m forward, 250
     over 5 m to starboard. ``diagonal``: 300 frames, 5 m to starboard and 2.3 m forward. ``turn``: 300 frames over 120 deg on
-    the spot, the T ahead half-way. ``sideways_50``, ``sideways_54``: so many steps from the middle of a scene, almost all to
-    starboard, once back again near the end (figures 4.16 and 4.17, which print no numbers: these are ours).
+    the spot, the T ahead half-way. ``sideways_50``, ``sideways_54``: 50 and 54 steps from the middle of a scene, almost all
+    to starboard, some back near the end. Figures 4.16 and 4.17 show them without numbers; the numbers are ours.
     """
     x, y = -2.5, -4.85
     match name:
@@ -240,17 +248,17 @@ def run_poses(name: str, height_m: float) -> NDArray[np.float64]:
             counts = (250, 100, 250, 100, 250)
             legs = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(corners, corners[1:], counts, strict=False)]
             legs[0] = np.linspace(corners[0], corners[1], counts[0])
-            place, heading = np.concatenate(legs), np.zeros(sum(counts))
+            position, heading = np.concatenate(legs), np.zeros(sum(counts))
         case "diagonal":
-            place, heading = np.linspace((x, y), (x + 5, y + 2.3), 300), np.zeros(300)
+            position, heading = np.linspace((x, y), (x + 5, y + 2.3), 300), np.zeros(300)
         case "sideways_50" | "sideways_54":
             step = np.arange(int(name[-2:]))
             back = (step >= len(step) - 14) & (step < len(step) - 6)
             sideways = np.where(back, -8.0, 15.0 + 3 * np.sin(step / 5))
             forward = np.where(back, -9.0, 5 * np.cos(step / (7 if len(step) == 50 else 4)))
-            place = np.concatenate([np.zeros((1, 2)), np.cumsum(np.column_stack([sideways, forward]) / 1e3, axis=0)])
-            heading = np.zeros(len(place))
+            position = np.concatenate([np.zeros((1, 2)), np.cumsum(np.column_stack([sideways, forward]) / 1e3, axis=0)])
+            heading = np.zeros(len(position))
         case _:
-            place, heading = np.tile([0.0, -4.2], (300, 1)), np.radians(np.linspace(-60, 60, 300))
-    rest = np.column_stack([np.full(len(place), height_m), np.zeros((len(place), 2)), heading])
-    return np.column_stack([place, rest])
+            position, heading = np.tile([0.0, -4.2], (300, 1)), np.radians(np.linspace(-60, 60, 300))
+    rest = np.column_stack([np.full(len(position), height_m), np.zeros((len(position), 2)), heading])
+    return np.column_stack([position, rest])

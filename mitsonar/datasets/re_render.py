@@ -1,4 +1,4 @@
-"""Pairs of a data set rendered again with something changed: heave between the pings, rays that move within their cells."""
+"""Pairs of a data set re-rendered with a change: heave between the pings, or rays that move within their cells."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def re_rendered(
     shift: Callable[[int, NDArray[np.float64]], NDArray[np.float64]] | None = None,
     jitter: bool | None = None,
 ) -> Iterator[tuple[int, SonarFrames]]:
-    """Samples of a data set as (number, frames), scene by scene, with the gain and the noise of the stored ones.
+    """Re-render samples of a data set. Yield (number, frames) scene by scene, with the stored gain and noise.
 
     Args:
-        pairs: of a store of images of one view; its worlds are built again.
+        pairs: samples of a store of images of one view. Its worlds are rebuilt.
         numbers: of the samples.
-        shift: from a sample's number and its poses ``(frames, 6)`` to those that are rendered; the frames still tell the
-            poses, heights and times of the stored ones.
-        jitter: whether rays move within their cells, anew each ping; default: as in the data set.
+        shift: from a sample's number and its poses ``(frames, 6)`` to the poses that are rendered. The frames
+            keep the stored poses, heights and times.
+        jitter: whether rays move at random within their cells in each ping; default: as in the data set.
 
     Raises:
         MitsonarError: a store of vectors, or of several views.

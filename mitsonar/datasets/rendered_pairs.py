@@ -1,4 +1,4 @@
-"""Samples rendered while a network trains, never stored: other worlds and other motions as long as it asks."""
+"""Samples that are rendered while a network trains, and never stored: new worlds and motions without end."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
 from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
+from mitsonar.datasets.batches import Batch, Device, RawSample
+from mitsonar.datasets.modality import Values
 from mitsonar.datasets.plan import Scene, sequences_of, world_seed
 from mitsonar.datasets.scene_rendering import SceneRenderer, calibrate
 from mitsonar.datasets.torch_pairs import Samples
@@ -25,30 +27,30 @@ from mitsonar.simulation.variant import ensure_variant, release_memory, use_thre
 __all__ = ["RawStream", "RenderedPairs"]
 
 
-class RenderedPairs(IterableDataset[Any], Samples):
-    """Endless samples of a recipe's kind, whose worlds and flights are in no data set that ``dataset make`` writes (a world
-    that does not depend on its seed, as a scene file, stays what it is).
+class RenderedPairs(IterableDataset[Batch], Samples):
+    """Endless samples of a recipe. Their worlds and flights are in no data set that ``dataset make`` writes.
 
-    Iterating gives ``(input, label)`` as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` does; :meth:`loader` gives
-    batches with
-    noise and layout made on their device. Each worker of a ``DataLoader`` renders worlds of its own; workers must be started
-    by spawn, since the ray tracer does not survive a fork: ``DataLoader(pairs, num_workers=2,
+    A world that does not depend on its seed, such as a scene file, is the same in both.
+
+    Iteration yields ``(input, label)`` as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` does. :meth:`loader` yields
+    batches, with noise and layout computed on their device. Each worker of a ``DataLoader`` renders worlds of its own.
+    Workers must be started by spawn, since the ray tracer does not survive a fork: ``DataLoader(pairs, num_workers=2,
     multiprocessing_context="spawn")``.
 
     Args:
         recipe: a recipe, its name, or a YAML file.
         seed: of worlds, flights, jitter and noise.
         length: samples of an epoch over all workers; None: no end.
-        sequences_a_world: sequences before the next world is built.
-        buffer: samples among which the next is drawn.
+        sequences_a_world: number of sequences of a world.
+        buffer: number of samples among which the next one is drawn.
         gain: of the pixels; default: that of the recipe's own data set, which is computed first.
         arrangement: as for ``SonarPairs``: frames, views, kind, layout, coordinates, noise, labels.
 
     Attributes:
-        worlds: the recipe with the seed that its worlds, flights and jitter have here.
+        worlds: the recipe with the seed of these worlds, flights and jitter.
 
     Raises:
-        MitsonarError: unknown recipe or words; workers that were forked.
+        MitsonarError: an unknown recipe or option; workers that were forked.
     """
 
     def __init__(
@@ -69,50 +71,49 @@ class RenderedPairs(IterableDataset[Any], Samples):
         if self.frames > recipe.flight.pings:
             raise MitsonarError(f"frames must be at most flight.pings, {recipe.flight.pings}: got {self.frames}")
         own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
-        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # a copy would keep what it has cached
+        self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # a copy would keep cached values
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
-    def __iter__(self) -> Iterator[tuple[Any, torch.Tensor]]:
+    def __iter__(self) -> Iterator[Batch]:
         for sample in self.raw():
             yield self.one(sample)
 
-    def raw(self, skip: int = 0, share: tuple[int, int] | None = None) -> Iterator[dict[str, Any]]:
-        """Raw samples of this worker; :meth:`~mitsonar.datasets.torch_pairs.Samples.finished` makes inputs of a batch of
-        them.
+    def raw(self, skip: int = 0, share: tuple[int, int] | None = None) -> Iterator[RawSample]:
+        """Yield raw samples of this worker; :meth:`~mitsonar.datasets.torch_pairs.Samples.finished` makes a batch of them.
 
         Args:
-            skip: so many samples, which are not rendered, but for those among which the next ones were still waiting.
-            share: number of the worker and how many there are; default: as torch says.
+            skip: number of samples to skip. They are not rendered, except those that lie between samples that are needed.
+            share: number of the worker and number of workers; default: as torch has them.
         """
         known = self._ready()
         worker, workers = share or known
         self._calibrate()
         mine = None if self.length is None else self.length // workers + (worker < self.length % workers)
         order = self._order(worker, mine)
-        gone: set[int] = set()
+        skipped: set[int] = set()
         first = 0
         for number in itertools.islice(order, skip):
-            gone.add(number)
-            while first in gone:
-                gone.remove(first)
+            skipped.add(number)
+            while first in skipped:
+                skipped.remove(first)
                 first += 1
         rendered = self._rendered(worker, workers, first)
-        waiting: dict[int, dict[str, Any]] = {}
+        waiting: dict[int, RawSample] = {}
         for number in order:
             while number not in waiting:
-                place, sample = next(rendered)
-                if place >= first and place not in gone:
-                    waiting[place] = sample
+                made, sample = next(rendered)
+                if made >= first and made not in skipped:
+                    waiting[made] = sample
             yield waiting.pop(number)
 
     def _order(self, worker: int, length: int | None) -> Iterator[int]:
-        """Numbers of the samples as rendered, in the order in which they are given: one of ``buffer`` that wait."""
+        """Yield the numbers of rendered samples in a random order: each time one of ``buffer`` that wait."""
         rng = np.random.default_rng([self.seed, 7, self.epoch, worker])
         waiting: list[int] = []
 
         def drawn() -> int:
-            place = int(rng.integers(len(waiting)))
-            waiting[place], waiting[-1] = waiting[-1], waiting[place]
+            index = int(rng.integers(len(waiting)))
+            waiting[index], waiting[-1] = waiting[-1], waiting[index]
             return waiting.pop()
 
         for number in itertools.count() if length is None else range(length):
@@ -122,11 +123,15 @@ class RenderedPairs(IterableDataset[Any], Samples):
         while waiting:
             yield drawn()
 
-    def loader(
-        self, batch_size: int, *, device: torch.device | str | None = None, workers: int = 0
-    ) -> Iterator[tuple[Any, torch.Tensor]]:
-        """Batches on a device."""
-        if workers:  # once here, not in each of them
+    def loader(self, batch_size: int, *, device: Device = None, workers: int = 0) -> Iterator[Batch]:
+        """Yield batches on a device.
+
+        Args:
+            batch_size: samples of a batch.
+            device: of inputs and labels.
+            workers: processes that render; 0: this process.
+        """
+        if workers:  # once here, not in each worker
             ensure_variant()
             self._calibrate()
         yield from self.batches(RawStream(self, batch_size), batch_size, device, workers)
@@ -136,7 +141,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
             self.gain = calibrate(self.recipe)
 
     def _ready(self) -> tuple[int, int]:
-        """Number of this worker and how many there are; the renderer is set up for it."""
+        """Set up the renderer. Return the number of this worker and the number of workers."""
         info = get_worker_info()
         if info is None:
             ensure_variant()
@@ -150,9 +155,11 @@ class RenderedPairs(IterableDataset[Any], Samples):
         use_threads(1)
         return info.id, info.num_workers
 
-    def _rendered(self, worker: int, workers: int, first: int = 0) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Samples with their numbers in the order in which they are rendered, world after world, from ``first`` on or a few
-        before it, where its sequence begins."""
+    def _rendered(self, worker: int, workers: int, first: int = 0) -> Iterator[tuple[int, RawSample]]:
+        """Render samples, world after world. Yield each with its number.
+
+        The first sample is the first one of the sequence that holds number ``first``.
+        """
         weights = np.array([group.count * group.sequences for group in self.worlds.scenes], dtype=float)
         of_sequence = self.worlds.flight.pings - self.frames + 1
         turn, sequence = divmod(first // of_sequence, self.sequences_a_world)
@@ -168,8 +175,8 @@ class RenderedPairs(IterableDataset[Any], Samples):
                 count += 1
             number, sequence = number + workers, 0
 
-    def _of_world(self, renderer: SceneRenderer, begin: int = 0) -> Iterator[dict[str, Any]]:
-        """Samples of one world from a sequence on, as many sequences a launch as fit."""
+    def _of_world(self, renderer: SceneRenderer, begin: int = 0) -> Iterator[RawSample]:
+        """Render samples of one world from a sequence on, as many sequences a launch as fit."""
         assert self.gain is not None
         recipe, pings = renderer.recipe, renderer.recipe.flight.pings
         together = max(1, renderer.simulator.pings_per_launch // pings)
@@ -184,9 +191,24 @@ class RenderedPairs(IterableDataset[Any], Samples):
                     yield self._sample(values, vehicle, poses, k * pings, first, before + start * pings)
 
     def _sample(
-        self, values: dict[str, Any], vehicle: Any, poses: Any, begin: int, first: int, number: int
-    ) -> dict[str, Any]:
-        """One sample of a batch of frames."""
+        self,
+        values: dict[str, Values],
+        vehicle: NDArray[np.float64],
+        poses: NDArray[np.float64],
+        begin: int,
+        first: int,
+        number: int,
+    ) -> RawSample:
+        """Cut one sample from a batch of frames.
+
+        Args:
+            values: of all frames of the batch, by array name.
+            vehicle: poses of the sample's sequence ``(pings, 6)``.
+            poses: of the sonar in all frames of the batch ``(frames, 6)``.
+            begin: first frame of the sequence in the batch.
+            first: first frame of the sample in the sequence.
+            number: of the first frame of the batch, for its noise.
+        """
         here = slice(begin + first, begin + first + self.frames)
         if self.frames == 1:
             target = vehicle[first : first + 1, 2]
@@ -194,7 +216,7 @@ class RenderedPairs(IterableDataset[Any], Samples):
             target = motions(poses[here]).mean(axis=0)
         else:
             target = motions(vehicle[first : first + self.frames]).mean(axis=0)
-        sample: dict[str, Any] = {
+        sample: RawSample = {
             "frames": np.arange(here.start, here.stop) + number,
             "label": self.labels.encode(target),
         }
@@ -208,23 +230,23 @@ class RenderedPairs(IterableDataset[Any], Samples):
         return sample
 
 
-class RawStream(IterableDataset[Any]):
+class RawStream(IterableDataset[RawSample]):
     """The raw samples, for workers that only render.
 
     Args:
-        pairs: what to render.
+        pairs: the samples to render.
         batch_size: of the loader.
-        skip: batches that were read before: with as many workers as then, the loader goes on with the next.
-        share: number of this loader and how many there are, where several processes train together.
+        skip: number of batches that were read before. The loader continues with the next one, if it has as many workers.
+        share: number of this loader and number of loaders, where several processes train together.
     """
 
     def __init__(self, pairs: RenderedPairs, batch_size: int = 1, skip: int = 0, share: tuple[int, int] = (0, 1)) -> None:
         self.pairs, self.batch_size, self.skip, self.share = pairs, batch_size, skip, share
 
-    def __iter__(self) -> Iterator[dict[str, Any]]:
+    def __iter__(self) -> Iterator[RawSample]:
         info = get_worker_info()
         worker, workers = (info.id, info.num_workers) if info else (0, 1)
-        worker = (worker + self.skip) % workers  # torch asks worker 0 first, whoever's turn it was
+        worker = (worker + self.skip) % workers  # torch starts with worker 0, whichever was next
         had = len(range(worker, self.skip, workers))  # batches come from the workers in turn
         loader, loaders = self.share
         return self.pairs.raw(self.batch_size * had, (loader * workers + worker, loaders * workers))

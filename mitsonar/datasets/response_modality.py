@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.signal_to_noise import snr_of
 from mitsonar.config.data_recipe import Recipe
-from mitsonar.datasets.modality import Read, StoredArray, StoredAxis, ground_reach
+from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, ground_reach
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 
 __all__ = ["ResponseModality"]
 
 RAYS = 61
-"""Across and along each field of view, whose ends on the ground make a footprint."""
+"""Rays across and along each field of view whose ends on the ground make a footprint."""
 
 
 class ResponseModality:
@@ -37,7 +36,7 @@ class ResponseModality:
 
     @property
     def stored(self) -> dict[str, StoredArray]:
-        """Responses, and what the simulation tells of each ping."""
+        """Return the array of responses, and what the simulation reports of each ping."""
         count = len(self.sonar.receivers)
         response = "complex baseband responses; receivers in the order of the attribute sonar"
         return {
@@ -51,38 +50,46 @@ class ResponseModality:
 
     @property
     def axes(self) -> dict[str, StoredAxis]:
-        """Delays."""
+        """Return the delays."""
         return {"delay_s": StoredAxis(self.sonar.delay_s, "tap", "delay of each tap [s]")}
 
     @property
-    def attributes(self) -> dict[str, Any]:
-        """The instrument and the names of its receivers."""
+    def attributes(self) -> Fields:
+        """Return the instrument and the names of its receivers."""
         return {"sonar": self.sonar.model_dump(mode="json"), "receivers": [one.name for one in self.sonar.receivers]}
 
     @property
     def ping_bytes(self) -> int:
-        """Responses of a ping."""
+        """Return the size of the responses of a ping [bytes]."""
         return 8 * len(self.sonar.receivers) * self.sonar.taps
 
     @property
     def sample_frames(self) -> int:
-        """Records of a sample."""
+        """Return the number of pings of a sample, as the recipe has it."""
         return self.recipe.frames
 
     def reach(self, height: float) -> NDArray[np.float64]:
-        """Corners of what any receiver sees."""
+        """Compute the corners ``(n, 2)`` of what the receivers cover of the ground [m].
+
+        Raises:
+            MitsonarError: a receiver has no ground in range.
+        """
         return _reach(self.sonar, height)
 
     def noise_model(self, name: str) -> None:
-        """Check a ratio of signal to noise, whose name says all."""
+        """Check a signal-to-noise ratio, whose name alone defines the noise.
+
+        Raises:
+            MitsonarError: not a ratio.
+        """
         snr_of(name)
 
     def empty(self, read: Read, here: slice) -> NDArray[np.bool_]:
-        """Pings of which no receiver heard an echo ``(pings,)``."""
+        """Find the pings of which no receiver recorded an echo ``(pings,)``."""
         return np.asarray((read("echoes", here) == 0).all(axis=1))
 
     def faults(self, read: Read, here: slice) -> list[str]:
-        """Responses are finite; counts are none below zero."""
+        """Check that responses are finite and that no count is below 0. Return a sentence for each fault."""
         wrong = [
             f"response, pings {here.start}..{here.stop - 1}: values that are not finite"
             for _ in range(not np.isfinite(read("response", here)).all())
@@ -93,16 +100,16 @@ class ResponseModality:
         return wrong
 
     def warnings(self, read: Read) -> list[str]:
-        """Receivers that hear nothing, echoes beyond the response's end, steps far below a wavelength."""
+        """Warn of receivers without echoes, of echoes that were dropped, and of motions far below a wavelength."""
         sentences = []
         echoes, dropped = read("echoes"), read("dropped")
         for number, receiver in enumerate(self.sonar.receivers):
             silent = int((echoes[:, number] == 0).sum())
             if silent:
                 sentences.append(
-                    f"receiver {receiver.name} hears nothing in {silent:,} of {len(echoes):,} pings: check where it looks "
-                    f"(heading {receiver.field.heading_deg:g} deg, tilt {receiver.field.tilt_deg:g} deg), height_m and "
-                    "range_max"
+                    f"receiver {receiver.name} records no echo in {silent:,} of {len(echoes):,} pings: check where it "
+                    f"points (heading {receiver.field.heading_deg:g} deg, tilt {receiver.field.tilt_deg:g} deg), height_m "
+                    "and range_max"
                 )
         if dropped.any():
             share = 100 * dropped.sum() / max(1, dropped.sum() + echoes.sum())
@@ -122,6 +129,7 @@ class ResponseModality:
 
 @lru_cache(maxsize=8)
 def _reach(sonar: ChannelSonar, height: float) -> NDArray[np.float64]:
+    """Compute the footprints of all receivers, one after the other."""
     parts = [
         ground_reach(np.array([*one.position[:2], height + one.position[2]]), _rays(one.field), sonar.range_max)
         for one in sonar.receivers
@@ -130,7 +138,7 @@ def _reach(sonar: ChannelSonar, height: float) -> NDArray[np.float64]:
 
 
 def _rays(field: FieldOfView) -> NDArray[np.float64]:
-    """Directions over a field of view, borders included, in the vehicle's axes ``(n, 3)``."""
+    """Compute directions over a field of view, borders included, in the vehicle's axes ``(n, 3)``."""
     part = np.linspace(-1, 1, RAYS)
     match field.shape:
         case "rectangular":

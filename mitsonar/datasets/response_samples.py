@@ -1,20 +1,20 @@
-"""Impulse responses of a data set, sample by sample, as estimators and regressors take them; NumPy only."""
+"""Impulse responses of a data set, sample by sample, for estimators and regressors; NumPy only."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.signal_to_noise import snr_of
-from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.datasets.response_packing import Packing, packed
-from mitsonar.datasets.sample_index import Part
+from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import motions
@@ -23,11 +23,13 @@ from mitsonar.records.impulse_responses import ImpulseResponses
 __all__ = ["ImpulseSamples", "Leak", "displacement_labels"]
 
 Leak = Literal["none", "one_ping", "strangers"]
+"""What a sample keeps of the motion; see :class:`ImpulseSamples`."""
+
 LEAKS = ("none", "one_ping", "strangers")
 
 
 def displacement_labels(kind: str, recipe: Recipe, pings: int) -> Labels:
-    """Labels of displacements from the first of ``pings`` pings to the last; yaw only where the recipe turns."""
+    """Return the labels of displacements from the first of ``pings`` pings to the last; yaw only where the recipe turns."""
     step = Labels.of(kind, recipe, 2)
     count = 3 if recipe.flight.yaw_deg > 0 else 2
     return Labels(kind, (pings - 1) * step.low[:count], (pings - 1) * step.high[:count], step.names[:count])
@@ -41,21 +43,20 @@ class ImpulseSamples:
         part: ``train``, ``validation``, ``test``, or ``all``.
         split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
         frames: Q, pings of a sample; default: the recipe's.
-        noise: ``none``, a ratio of signal to noise as ``20 dB`` (see
-        :func:`~mitsonar.datasets.response_packing.noise_power`), or a
-            list of them, of which each sample draws one.
+        noise: ``none``, a signal-to-noise ratio such as ``20 dB`` (see
+            :func:`~mitsonar.datasets.response_packing.noise_power`), or a list of them, of which each sample draws one.
         labels: ``raw`` (m, m, rad), ``quantised`` or ``normx10``.
         seed: of the noise.
-        leak: for tests of what the motion is read from: ``one_ping`` has the first response in place of all others,
-            ``strangers`` all but the first from a sample of another scene: neither shows the motion.
-        one_a_sequence: only one sample of each sequence.
+        leak: for tests of where an estimator finds the motion. ``one_ping`` repeats the first response, ``strangers`` takes
+            all but the first response from a sample of another scene. Neither holds the motion.
+        one_a_sequence: whether only one sample of each sequence is taken.
 
     Attributes:
         sonar: the instrument.
         arrange: packing and noise.
 
     Raises:
-        MitsonarError: no finished data set of responses there, words that are not known, a part without samples.
+        MitsonarError: no finished data set of responses there, an unknown option, a part without samples.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class ImpulseSamples:
         url: str | Path,
         *,
         part: str = "train",
-        split: str | Split | dict[str, Any] | None = None,
+        split: AnySplit = None,
         frames: int | None = None,
         noise: str | Sequence[str] = "none",
         labels: str = "normx10",
@@ -95,21 +96,24 @@ class ImpulseSamples:
         return len(self.first)
 
     def frame_numbers(self, index: int) -> slice:
-        """The pings of a sample, as numbered in the store."""
+        """Return the pings of a sample, as numbered in the store."""
         return self.chosen.frame_numbers(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
-        """Displacement from the first ping to the last (eq. 3.4): sideways, forward [m], yaw [rad] if the recipe turns."""
+        """Return the displacement from the first ping to the last (Almanza-Medina, eq. 3.4).
+
+        It is sideways, forward [m] and, if the recipe turns, yaw [rad].
+        """
         here = self.frame_numbers(index)
         ends = self.chosen.pose[[here.start, here.stop - 1]]
         return np.asarray(motions(ends)[0, : len(self.labels.names)])
 
     def targets(self) -> NDArray[np.float64]:
-        """Of all samples ``(samples, 2 or 3)``."""
+        """Return the displacements of all samples ``(samples, 2 or 3)``."""
         return np.array([self.target(index) for index in range(len(self))])
 
     def response(self, index: int) -> NDArray[np.complex64]:
-        """The responses of a sample ``(Q, M, taps)``, without noise, as ``leak`` has them."""
+        """Read the responses of a sample ``(Q, M, taps)``, without noise, changed as ``leak`` says."""
         mine = self.store.read("response", self.frame_numbers(index))
         if self.leak == "one_ping":
             return np.repeat(mine[:1], self.frames, axis=0)
@@ -121,25 +125,32 @@ class ImpulseSamples:
 
     @property
     def noise_seed(self) -> int:
-        """Of this epoch's noise."""
+        """Return the seed of the noise."""
         return self.seed
 
     def received(self, index: int) -> NDArray[np.complexfloating]:
-        """The responses of a sample ``(Q, M, taps)``, with its noise."""
+        """Read the responses of a sample ``(Q, M, taps)``, with its noise."""
         here = self.frame_numbers(index)
         return self.arrange.received(self.response(index), np.arange(here.start, here.stop), self.noise_seed)
 
     def matrix(self, index: int) -> NDArray[np.float32]:
-        """The packed matrix ``(taps, 2 M Q)`` of a sample, with its noise."""
+        """Read the packed matrix ``(taps, 2 M Q)`` of a sample, with its noise."""
         return packed(self.received(index))
 
     def responses(self, index: int) -> ImpulseResponses:
-        """A sample with its noise, for estimators."""
+        """Read a sample with its noise, as estimators take it."""
         here = self.frame_numbers(index)
-        known: dict[str, Any] = {name: values[here] for name, values in self._per_ping.items()}
-        return ImpulseResponses(response=self.received(index), sonar=self.sonar, poses=self.chosen.pose[here], **known)
+        known = self._per_ping
+        return ImpulseResponses(
+            response=self.received(index),
+            sonar=self.sonar,
+            poses=self.chosen.pose[here],
+            time_s=known["time_s"][here],
+            velocity=known["velocity"][here],
+            height_m=known["height_m"][here],
+        )
 
     @cached_property
     def _per_ping(self) -> dict[str, NDArray[np.float64]]:
-        """Small arrays of the whole store: one chunk each."""
+        """Read the small arrays of the whole store, one chunk each."""
         return {name: self.store.read(name) for name in ("time_s", "velocity", "height_m")}

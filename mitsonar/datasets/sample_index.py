@@ -1,19 +1,23 @@
-"""The samples of a part of a data set: which frames they are, where and in which scene."""
+"""The samples of a part of a data set: their frames, poses and scenes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.config.data_recipe import Recipe, Split, split_from
+from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Part", "split_for"]
+__all__ = ["AnySplit", "Part", "split_for"]
+
+AnySplit: TypeAlias = str | Split | Fields | None
+"""A split by name, as an object, or by the keys of a recipe; None: the recipe's own."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +25,8 @@ class Part:
     """Samples of consecutive frames of one sequence.
 
     Attributes:
-        split: that deals out the frames.
-        frames: of a sample.
+        split: that assigns the frames.
+        frames: number of frames of a sample.
         first: the first frame of each sample ``(samples,)``.
         scene, sequence: of each frame of the store ``(frames,)``.
         pose: of the sonar ``(frames, 6)``.
@@ -42,30 +46,30 @@ class Part:
         cls,
         store: DataStore,
         part: str,
-        split: str | Split | dict[str, Any] | None,
+        split: AnySplit,
         frames: int,
         *,
         seed: int = 0,
         one_a_sequence: bool = False,
     ) -> Part:
-        """The samples of a part.
+        """Find the samples of a part.
 
         Args:
             store: of the data set.
             part: ``train``, ``validation``, ``test``, or ``all``.
             split: see :func:`split_for`.
-            frames: of a sample.
-            seed: of the choice of one a sequence.
-            one_a_sequence: only one sample of each sequence.
+            frames: number of frames of a sample.
+            seed: of the choice of one sample a sequence.
+            one_a_sequence: whether only one sample of each sequence is taken.
 
         Raises:
-            MitsonarError: words that are not known, a part without samples.
+            MitsonarError: unknown part or split, a part without samples.
         """
         dealt = split_for(split, store.recipe)
         scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
         first = np.arange(max(0, len(sequence) - frames + 1))
         first = first[sequence[first] == sequence[first + frames - 1]]
-        if dealt.by == "sample":  # neighbours share frames, and a sequence has one motion: what is validated has been seen
+        if dealt.by == "sample":  # neighbours share frames and motion: validation meets what training has used
             number = np.arange(len(first), dtype=np.int32)
             first = first[deal(number.astype(np.int64), number, dealt, part)]
         else:
@@ -82,16 +86,16 @@ class Part:
         return cls(dealt, frames, first, scene, sequence, pose, motion)
 
     def frame_numbers(self, index: int) -> slice:
-        """The frames of a sample, as numbered in the store."""
+        """Return the frames of a sample, as numbered in the store."""
         first = int(self.first[index])
         return slice(first, first + self.frames)
 
 
-def split_for(split: str | Split | dict[str, Any] | None, recipe: Recipe) -> Split:
-    """The split that is asked for, of a data set of this recipe; see :class:`~mitsonar.datasets.torch_pairs.SonarPairs`.
+def split_for(split: AnySplit, recipe: Recipe) -> Split:
+    """Return a split of a data set of this recipe; see :class:`~mitsonar.datasets.torch_pairs.SonarPairs`.
 
     Raises:
-        MitsonarError: a word or keys that are not known.
+        MitsonarError: an unknown name or key.
     """
     if isinstance(split, Split):
         return split

@@ -1,17 +1,18 @@
-"""A scene of a recipe becomes pixels: what both the store and training with rendered frames are filled from."""
+"""A scene of a recipe becomes pixels, for stores and for training with rendered frames."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.image_modality import ImageModality
+from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.pose import mounted
@@ -21,10 +22,14 @@ from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import release_memory
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 __all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_small_worlds"]
 
 FRAMES_A_SCENE = 10_000_000
-"""Pings are numbered by scene times this, plus their place in it: jitter does not depend on the size of the data set."""
+"""A ping's number is its scene's number times this, plus its position in the scene: jitter does not depend on the size of
+the data set."""
 
 
 class SceneRenderer:
@@ -40,18 +45,18 @@ class SceneRenderer:
         self.simulator = Simulator(loaded_world(recipe, scene), recipe.instrument, views=recipe.views)
 
     @staticmethod
-    def settled(recipe: Recipe) -> dict[str, Any]:
-        """Return the gain of the data set and its inverse; see :func:`calibrate`."""
+    def settled(recipe: Recipe) -> Fields:
+        """Compute the gain of the data set and its inverse; see :func:`calibrate`."""
         refuse_small_worlds(recipe)
         gain = calibrate(recipe)
         return {"gain": gain, "level_scale": 1 / gain}
 
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
-        """Levels of frames ``first``, ``first + 1`` ... of the scene, in batches, a part for each view."""
+        """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view."""
         return self.simulator.render_views(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)
 
-    def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, NDArray[Any]]:
-        """What is stored of frames of the scene: kind and view -> values ``(frames, ...)``; see ``array_names``.
+    def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, Values]:
+        """Render frames of the scene. Return what is stored of them, ``(frames, ...)`` by array name.
 
         Args:
             poses: of the sonar ``(frames, 6)``.
@@ -59,24 +64,24 @@ class SceneRenderer:
             gain: of the data set.
         """
         values = self._empty(len(poses))
-        for looks in self.render_views(poses, first, labels=bool(self.recipe.labels)):
-            start = looks[0].first - (self.scene.number * FRAMES_A_SCENE + first)
-            self._fill({name: array[start : start + len(looks[0])] for name, array in values.items()}, looks, gain)
+        for batch in self.render_views(poses, first, labels=bool(self.recipe.labels)):
+            start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
+            self._fill({name: array[start : start + len(batch[0])] for name, array in values.items()}, batch, gain)
         return values
 
-    def recorded(self, planned: dict[str, NDArray[Any]], first: int, about: dict[str, Any]) -> dict[str, NDArray[Any]]:
-        """Frames where the plan has them; see :class:`~mitsonar.datasets.modality.Renderer`."""
+    def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
+        """Render frames at the poses of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
         return self.frames(planned["pose"], first, float(about["gain"]))
 
-    def _empty(self, frames: int) -> dict[str, NDArray[Any]]:
-        """Arrays to fill; counts begin at 0."""
+    def _empty(self, frames: int) -> dict[str, Values]:
+        """Allocate the arrays to fill; counts begin at 0."""
         stored = ImageModality(self.recipe).stored
         return {name: np.zeros((frames, *one.shape), dtype=one.kind) for name, one in stored.items()}
 
-    def _fill(self, values: dict[str, NDArray[Any]], looks: list[RenderedPings], gain: float) -> None:
-        """What is stored of one batch."""
-        values["height_m"][:] = looks[0].height_m
-        for view, pings in zip(self.simulator.views, looks, strict=True):
+    def _fill(self, values: dict[str, Values], batch: list[RenderedPings], gain: float) -> None:
+        """Write what is stored of one batch into the arrays."""
+        values["height_m"][:] = batch[0].height_m
+        for view, pings in zip(self.simulator.views, batch, strict=True):
             suffix = self.recipe.suffix(view.name)
             outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
             np.maximum(values["dropped"], outside, out=values["dropped"])  # portions overlap
@@ -92,8 +97,8 @@ class SceneRenderer:
                 values[f"{label}{suffix}"][:] = pings.labels[label]
 
 
-def loaded_world(recipe: Recipe, scene: Scene) -> Any:
-    """A scene's world, built in a folder that is gone again once it is loaded.
+def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
+    """Build a scene's world in a temporary folder, and load it.
 
     Raises:
         MitsonarError: a scene of the user's own that is smaller than the recipe says.
@@ -120,10 +125,10 @@ def refuse_small_worlds(recipe: Recipe) -> None:
 
 
 def calibrate(recipe: Recipe) -> float:
-    """The gain of a data set: the 99.9th percentile of all pixels of the first 20 frames of its first scene becomes 0.9.
+    """Compute the gain: the 99.9th percentile of all pixels of the first 20 frames of the first scene becomes 0.9.
 
-    The frames are those of the recipe, however few of them are made. A recipe may also say the gain: that of another data
-    set, since a sonar has one.
+    The frames are those of the recipe, however few of them are made. A recipe may also give the gain, such as that of
+    another data set of the same sonar.
 
     Raises:
         MitsonarError: these frames are empty.
@@ -141,7 +146,7 @@ def calibrate(recipe: Recipe) -> float:
     batches = list(renderer.render_views(table, 0))
     del renderer
     release_memory()
-    if not any(pings.levels.any() for looks in batches for pings in looks):
+    if not any(pings.levels.any() for batch in batches for pings in batch):
         raise MitsonarError(
             "the first frames are empty: no ray met anything within the window; check height_m, mount, range_min and "
             "range_max"
@@ -150,9 +155,9 @@ def calibrate(recipe: Recipe) -> float:
 
 
 def _joined(batches: list[list[RenderedPings]]) -> RenderedPings:
-    """All views of all frames, as if they were frames of one column: the gain is one constant for all."""
+    """Join all views of all frames as frames of one column, since the gain is one constant for all."""
     first = batches[0][0]
     frames = []
-    for looks in batches:
-        frames += [np.concatenate([pings.levels[k].ravel() for pings in looks]) for k in range(len(looks[0]))]
+    for batch in batches:
+        frames += [np.concatenate([pings.levels[k].ravel() for pings in batch]) for k in range(len(batch[0]))]
     return RenderedPings(first.first, np.stack(frames)[:, :, None], first.counts, first.height_m)

@@ -1,14 +1,12 @@
-"""One shard of a data set: rendered, written, sealed, in whatever process it falls to."""
+"""One shard of a data set: rendered, written and sealed, in any process."""
 
 from __future__ import annotations
 
 import threading
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mitsonar.datasets.modality import Renderer, renderer_of
+from mitsonar.datasets.modality import Renderer, Values, renderer_of
 from mitsonar.datasets.plan import Scene
 from mitsonar.datasets.store import DataStore
 from mitsonar.simulation.variant import ensure_variant, release_memory
@@ -16,14 +14,14 @@ from mitsonar.simulation.variant import ensure_variant, release_memory
 __all__ = ["forget", "make_shard"]
 
 _RENDERER: dict[tuple[str, Scene], Renderer] = {}
-"""The last scene, by all that it depends on: the recipe, and which of its scenes."""
+"""The last scene, by all that it depends on: the recipe, and the scene's plan."""
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A process renders one shard at a time, whatever threads its scheduler has: they share one ray tracer."""
+"""A process renders one shard at a time, since the threads of a dask worker share one ray tracer."""
 
 
 def make_shard(store: DataStore, shard: int) -> int:
-    """Render and write one shard; its number again. The last scene stays open for the next call."""
+    """Render and write one shard, and return its number. The last scene stays loaded for the next call."""
     with _ONE_AT_A_TIME:
         ensure_variant(store.about["variant"])
         store.write_shard(shard, _shard_values(store, shard))
@@ -31,18 +29,18 @@ def make_shard(store: DataStore, shard: int) -> int:
 
 
 def forget() -> None:
-    """Close what :func:`make_shard` keeps open."""
+    """Close the scene that :func:`make_shard` keeps loaded."""
     _RENDERER.clear()
     release_memory()
 
 
-def _shard_values(store: DataStore, shard: int) -> dict[str, NDArray[Any]]:
-    """All rendered arrays of a shard; frames of several scenes one after the other."""
+def _shard_values(store: DataStore, shard: int) -> dict[str, Values]:
+    """Render all arrays of a shard, by name; frames of several scenes follow each other."""
     here = store.frames_of(shard)
     scene_of = store.read("scene")[here]
     planned = {name: store.read(name, here) for name in ("pose", *store.modality.planned)}
     firsts = _first_frames(store)
-    parts: dict[str, list[NDArray[Any]]] = {}
+    parts: dict[str, list[Values]] = {}
     for number in np.unique(scene_of):
         mine = np.flatnonzero(scene_of == number)
         first = here.start + int(mine[0]) - firsts[int(number)]
@@ -53,12 +51,13 @@ def _shard_values(store: DataStore, shard: int) -> dict[str, NDArray[Any]]:
 
 
 def _first_frames(store: DataStore) -> dict[int, int]:
-    """The first frame of each scene; frames of a scene are consecutive."""
+    """Find the first frame of each scene. Frames of a scene are consecutive."""
     numbers, first = np.unique(store.read("scene"), return_index=True)
     return dict(zip(numbers.tolist(), first.tolist(), strict=True))
 
 
 def _renderer(store: DataStore, number: int) -> Renderer:
+    """Return the renderer of a scene; the last one is kept."""
     scene = store.scenes[number]
     key = (store.recipe.model_dump_json(), scene)
     if key not in _RENDERER:

@@ -1,4 +1,4 @@
-"""A data set as torch reads it: pairs (or more) of consecutive frames with their labels."""
+"""Samples of a data set for torch: two or more consecutive frames with their labels."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from torch.utils.data import Dataset
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, load_noise
-from mitsonar.config.data_recipe import Recipe, Split, array_names
+from mitsonar.config.data_recipe import Recipe, array_names
 from mitsonar.datasets.arrangement import Arrangement, Labels, arrangement_of
-from mitsonar.datasets.batches import Batches, StoredBatches
+from mitsonar.datasets.batches import Batch, Batches, Device, RawSample, StoredBatches
 from mitsonar.datasets.ground_nodes import ground_of
-from mitsonar.datasets.sample_index import Part
+from mitsonar.datasets.modality import Fields, Values
+from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.attitude import attitude_of
@@ -27,10 +28,10 @@ from mitsonar.records.sonar_frames import SonarFrames
 __all__ = ["Samples", "SonarPairs"]
 
 GROUND = "ground/"
-"""Before the names of the ground's geometry in a raw sample."""
+"""Prefix of the names of the ground's geometry in a raw sample."""
 
 KEPT_BYTES = 2**28
-"""Of an array of vectors that is kept in memory once it has been read."""
+"""Largest array of vectors that is kept in memory once it has been read."""
 
 
 class Samples(Batches):
@@ -38,9 +39,9 @@ class Samples(Batches):
 
     Attributes:
         recipe: of the data set.
-        frames: of a sample.
-        arrange: from frames to inputs.
-        labels: from targets to labels and back.
+        frames: number of frames of a sample.
+        arrange: turns frames into inputs.
+        labels: encodes and decodes targets.
         seed: of noise and order.
         epoch: changes both; see :meth:`set_epoch`.
         ground: whether inputs come with the geometry of the ground.
@@ -86,29 +87,43 @@ class Samples(Batches):
                 f"{', '.join(self.arrange.views)}, kind='image'"
             )
 
-    def finished(self, batch: dict[str, torch.Tensor], device: torch.device | str | None = None) -> tuple[Any, torch.Tensor]:
-        """Inputs and labels of a batch of raw samples; noise and layout are made on ``device``."""
+    def finished(self, batch: dict[str, Tensor], device: Device = None) -> Batch:
+        """Make inputs and labels of a batch of raw samples. Noise and layout are computed on ``device``."""
         moved = {name: values.to(device, non_blocking=True) for name, values in batch.items()}
         ground = {name.removeprefix(GROUND): moved.pop(name) for name in list(moved) if name.startswith(GROUND)}
         inputs = self.arrange(moved, moved["frames"], self.epoch_seed)
         return (inputs, ground) if self.ground else inputs, moved["label"]
 
-    def ground_below(self, image: NDArray[Any], poses: NDArray[np.float64], height_m: NDArray[np.float64]) -> dict[str, Any]:
-        """The geometry of a raw sample's frames, as networks that know it take it; by name, to be added to the sample.
+    def ground_below(self, image: Values, poses: NDArray[np.float64], height_m: NDArray[np.float64]) -> RawSample:
+        """Compute the ground's geometry for a raw sample's frames, by name, to be added to the sample.
 
         Args:
             image: of the one view ``(frames, bins, beams)``, without noise.
-            poses: of the sonar.
-            height_m: over the ground.
+            poses: of the sonar ``(frames, 6)`` [m, rad].
+            height_m: over the ground ``(frames,)`` [m].
         """
         frames = self.frames_of(image, poses, height_m, time_s=np.arange(len(image), dtype=float))
-        standing = attitude_of(frames, "the ground", None, None)
-        return {f"{GROUND}{name}": values for name, values in ground_of(frames, standing).items()}
+        attitude = attitude_of(frames, "the ground", None, None)
+        return {f"{GROUND}{name}": values for name, values in ground_of(frames, attitude).items()}
 
     def frames_of(
-        self, image: NDArray[Any], poses: NDArray[np.float64], height_m: NDArray[np.float64], **more: Any
+        self,
+        image: Values,
+        poses: NDArray[np.float64],
+        height_m: NDArray[np.float64],
+        *,
+        time_s: NDArray[np.float64],
+        level_scale: float = 1.0,
     ) -> SonarFrames:
-        """Frames of the one view."""
+        """Build the frames of the one view.
+
+        Args:
+            image: ``(frames, bins, beams)``.
+            poses: of the sonar ``(frames, 6)`` [m, rad].
+            height_m: over the ground ``(frames,)`` [m].
+            time_s: of each frame ``(frames,)`` [s].
+            level_scale: level of a pixel of 1.
+        """
         view = next(view for view in self.recipe.views if view.name == self.arrange.views[0])
         return SonarFrames(
             image=image,
@@ -117,20 +132,25 @@ class Samples(Batches):
             sonar=view.sonar,
             poses=poses,
             height_m=height_m,
-            **more,
+            time_s=time_s,
+            level_scale=level_scale,
         )
 
     @property
     def stored_kind(self) -> str:
-        """What samples are made of: images also where vectors are wanted and only images are there, or halves of them."""
+        """Return the stored kind that is read. Vectors are made of images if only images are stored, and for halves."""
         return self.arrange.kind if self.arrange.kind in self.recipe.kinds and not self.arrange.halves else "image"
 
     def at_noise(self, level: str) -> Arrangement:
-        """The arrangement with one level of noise."""
+        """Return the arrangement with one level of noise.
+
+        Raises:
+            MitsonarError: an unknown level.
+        """
         return replace(self.arrange, noise=load_noise(level), levels=())
 
-    def described(self) -> dict[str, Any]:
-        """What a checkpoint keeps of the samples that a network was trained on."""
+    def described(self) -> Fields:
+        """Describe the samples, as a checkpoint keeps it; see :meth:`~mitsonar.datasets.batches.Batches.described`."""
         recipe, mount, arrange = self.recipe, self.recipe.mount, self.arrange
         rows = {conversion.index.shape[1] for conversion in arrange.maps.values()}
         return {
@@ -152,39 +172,39 @@ class Samples(Batches):
                 "roll_deg": mount.roll_deg,
             },
             "model": recipe.instrument.model,
-            "noise": "; ".join(map(_said, arrange.levels or [arrange.noise])),
+            "noise": "; ".join(map(_noise_name, arrange.levels or [arrange.noise])),
         }
 
 
 class SonarPairs(StoredBatches, Samples, Dataset[Any]):
-    """Samples of a data set's store, each ``frames`` consecutive frames with the motion between them.
+    """Samples of a data set's store. Each has ``frames`` consecutive frames and the motion between them.
 
-    ``pairs[i]`` is ``(input, label)``, float32 tensors, ready for ``torch.utils.data.DataLoader``; :meth:`loader` does the
-    same with noise and layout made on the device of the batch.
+    ``pairs[i]`` is ``(input, label)``, float32 tensors, ready for ``torch.utils.data.DataLoader``. :meth:`loader` yields
+    batches, with noise and layout computed on their device.
 
     Args:
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
-        split: ``sequence`` (the thesis's: 95 % and 5 % of the sequences), ``scene`` (80, 10 and 10 % of the scenes: worlds
-            that training never saw; scenes of one world stay together), or by, train, validation, test and seed as a
-            dictionary or :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
-        frames: of a sample; 1 gives heights as labels; default: the recipe's.
+        split: ``sequence`` (Almanza-Medina's: 95 % and 5 % of the sequences), ``scene`` (80, 10 and 10 % of the scenes:
+            other worlds than those of training; scenes of one world stay together), or by, train, validation, test and seed
+            as a dictionary or :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
+        frames: number of frames of a sample; with 1 the labels are heights; default: the recipe's.
         views: which views; default: all.
         kind: ``image`` or ``vector``; default: what is stored.
         layout: ``side``, ``stack`` or ``channels``; see :class:`~mitsonar.datasets.arrangement.Arrangement`.
         coordinates: ``polar``, ``cartesian`` or ``both`` (then the input is a pair).
         cartesian_rows: pixels of a fan in the forward direction.
-        range_levels: of vectors, neighbouring ones of the stored added up to so many (with their noise); default: as stored.
-        halves: vectors of both halves of each image in azimuth (fig. 4.18), port first.
+        range_levels: number of levels of a vector, whose bins are added up in groups, with their noise; default: one a bin.
+        halves: whether images become vectors of their halves in azimuth (Almanza-Medina, fig. 4.18), port first.
         noise: ``none``, ``low``, ``high``, ``chapter2``, three numbers, or a model; of a list each sample draws one.
-        labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` goes back.
-        seed: of noise and order; the split has its own (``Split.seed``), so that another seed never mixes its parts.
-        ground: the input is a pair of images and the geometry of the ground below them, as ``corrnet`` takes it; labels are
-            then the sonar's motions, not those of a vehicle that it is mounted on.
-        one_a_sequence: only one sample of each sequence, for independent tests.
+        labels: ``raw`` (m, m, rad), ``quantised`` (0..31) or ``normx10`` (+-10); ``pairs.labels.decode`` inverts them.
+        seed: of noise and order. The split has its own (``Split.seed``), so that another seed never mixes its parts.
+        ground: whether the input is images and the geometry of the ground below them, as ``corrnet`` takes it. The labels
+            are then motions of the sonar, not those of the vehicle that carries it.
+        one_a_sequence: whether only one sample of each sequence is taken, for independent tests.
 
     Raises:
-        MitsonarError: no finished data set there, words that are not known, a part without frames.
+        MitsonarError: no finished data set there, an unknown option, a part without frames.
     """
 
     def __init__(
@@ -192,7 +212,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         url: str | Path,
         *,
         part: str = "train",
-        split: str | Split | dict[str, Any] | None = None,
+        split: AnySplit = None,
         one_a_sequence: bool = False,
         **arrangement: Any,
     ) -> None:
@@ -202,29 +222,32 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         self.split, self.first = self.chosen.split, self.chosen.first
         self.scene, self.sequence = self.chosen.scene, self.chosen.sequence
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
-        self._grounds: dict[int, dict[str, Any]] = {}
-        self._whole: dict[str, NDArray[Any]] = {}
+        self._grounds: dict[int, RawSample] = {}
+        self._whole: dict[str, Values] = {}
 
     def __len__(self) -> int:
         return len(self.first)
 
     def frame_numbers(self, index: int) -> slice:
-        """The frames of a sample, as numbered in the store."""
+        """Return the frames of a sample, as numbered in the store."""
         return self.chosen.frame_numbers(index)
 
     def target(self, index: int) -> NDArray[np.float64]:
-        """The mean motion from frame to frame (sideways m, forward m, yaw rad); of one frame its height over z = 0 [m]."""
+        """Return the mean motion from frame to frame (sideways m, forward m, yaw rad).
+
+        Of a sample of one frame the target is its height over z = 0 [m].
+        """
         here = self.frame_numbers(index)
         if self.frames == 1:
             return self.pose[here, 2]
         if self.ground:  # in the axes of the sonar, which its geometry has
-            return motions(self.pose[here]).mean(axis=0)
+            return np.asarray(motions(self.pose[here]).mean(axis=0))
         return np.asarray(self.motion[here.start : here.stop - 1].mean(axis=0))
 
-    def raw(self, index: int) -> dict[str, Any]:
-        """A sample as it is stored: frames by view, their numbers, and the label; :meth:`finished` makes a batch of them."""
+    def raw(self, index: int) -> RawSample:
+        """Read a sample as it is stored: frames by view, their numbers, and the label; see :meth:`finished`."""
         here = self.frame_numbers(index)
-        sample: dict[str, Any] = {
+        sample: RawSample = {
             "frames": np.arange(here.start, here.stop),
             "label": self.labels.encode(self.target(index)),
         }
@@ -234,14 +257,14 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             elif view in self.arrange.views and kind == "nonzero" and self.stored_kind == "vector":
                 sample[f"nonzero_{view}"] = self._read(name, here).astype(np.int32)
         if self.ground:
-            if index not in self._grounds:  # an epoch later it is the same
+            if index not in self._grounds:  # it is the same in every epoch
                 image = sample[self.arrange.views[0]]
                 self._grounds[index] = self.ground_below(image, self.pose[here], self.store.read("height_m", here))
             sample |= self._grounds[index]
         return sample
 
-    def _read(self, name: str, here: slice) -> NDArray[Any]:
-        """Frames of an array; vectors are small and kept in memory: reading them one by one costs more than learning."""
+    def _read(self, name: str, here: slice) -> Values:
+        """Read frames of an array. Vectors are small and kept in memory: reading each of them costs more than learning."""
         levels = int(np.prod(self.store.modality.stored[name].shape))
         if self.stored_kind != "vector" or 4 * levels * len(self.sequence) > KEPT_BYTES:
             return self.store.read(name, here)
@@ -249,16 +272,19 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             self._whole[name] = self.store.read(name)
         return self._whole[name][here]
 
-    def __getstate__(self) -> dict[str, Any]:
-        """For other processes, which read for themselves."""
+    def __getstate__(self) -> Fields:
+        """Return the state without what was read: other processes read for themselves."""
         return {**vars(self), "_whole": {}}
 
-    def sonar_frames(self, index: int, image: NDArray[Any] | None = None) -> SonarFrames:
-        """A sample as frames, with noise, for estimators: image, poses, heights (one view).
+    def sonar_frames(self, index: int, image: Values | None = None) -> SonarFrames:
+        """Read a sample of one view as frames with noise, poses and heights, as estimators take it.
 
         Args:
             index: of the sample.
-            image: in place of the stored frames, like them ``(frames, bins, beams)``; it gets the same noise.
+            image: replaces the stored frames ``(frames, bins, beams)``; it gets the same noise.
+
+        Raises:
+            MitsonarError: samples of vectors, or of several views.
         """
         if len(self.arrange.views) > 1 or self.arrange.kind != "image":
             raise MitsonarError(f"frames hold images of one view: choose one of {', '.join(self.arrange.views)}")
@@ -276,6 +302,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         )
 
 
-def _said(noise: NoiseModel) -> str:
+def _noise_name(noise: NoiseModel) -> str:
+    """Return the name of a noise model, or its three numbers."""
     names = [name for name, model in NOISE_MODELS.items() if model == noise]
     return names[0] if names else f"{noise.mean:g},{noise.std:g},{noise.scale:g}"

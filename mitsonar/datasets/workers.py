@@ -6,8 +6,9 @@ import contextlib
 import socket
 import time
 from collections import Counter
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from typing import Protocol
 
 import numpy as np
 
@@ -16,38 +17,63 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.simulation.variant import use_threads
 
-if TYPE_CHECKING:
-    from distributed import Client, Future
-
 __all__ = ["Queue", "made_by"]
 
 AHEAD = 2
-"""Shards that a worker is given at a time: one that it makes, one that waits."""
+"""Shards that a worker holds at a time: one that it makes, one that waits."""
 
 ASK_S = 1.0
-"""How often the scheduler is asked who is there."""
+"""Seconds between two requests for the list of workers."""
 
 LOSSES = 3
-"""How often workers may be lost with the same shard."""
+"""Number of workers that may be lost with the same shard."""
 
 SILENCE_S = 90.0
-"""How long there may be no worker at all."""
+"""Seconds for which there may be no worker at all."""
 
 ANSWERS_WITHIN = "10s"
-"""How long a scheduler may take to answer first, in dask's words."""
+"""Time for the scheduler's first answer, in dask's notation."""
+
+
+class Future(Protocol):
+    """A task of dask, which has no types of its own."""
+
+    status: str
+
+    def done(self) -> bool:
+        """Return whether the task has ended."""
+
+    def exception(self) -> BaseException:
+        """Return the error of a task that failed."""
+
+    def cancel(self) -> None:
+        """Withdraw the task."""
+
+
+class Client(Protocol):
+    """A client of a dask scheduler."""
+
+    def ncores(self) -> dict[str, int]:
+        """Return the threads of each worker, by address."""
+
+    def submit(self, task: Callable[[str, int], int], /, *args: object, workers: list[str], pure: bool) -> Future:
+        """Hand a task to one of the workers."""
+
+    def cancel(self, futures: list[Future]) -> None:
+        """Withdraw tasks."""
 
 
 def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: str | None = None) -> Iterator[int]:
-    """Make the shards; their numbers, as they get done.
+    """Make shards. Yield the number of each when it is done.
 
     Args:
-        store: where they belong.
+        store: to which they belong.
         todo: their numbers.
-        workers: 1, this process with all its threads; more, so many processes here, one thread each.
-        scheduler: address of a dask scheduler that runs already; its workers instead.
+        workers: processes on this machine, one thread each; with 1 this process renders, with all its threads.
+        scheduler: address of a running dask scheduler, whose workers render instead.
 
     Raises:
-        MitsonarError: no scheduler there, no worker left, a worker that was lost again and again, or what a worker says.
+        MitsonarError: no scheduler there, no worker left, too many workers lost at one shard, or a worker's error.
     """
     if scheduler is None and workers <= 1:
         try:
@@ -62,45 +88,48 @@ def made_by(store: DataStore, todo: list[int], *, workers: int = 1, scheduler: s
 
 @contextlib.contextmanager
 def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """A client of the scheduler; a local one starts its workers by spawn, one thread each."""
+    """Open a client of the scheduler. Local workers are started by spawn, with one thread each."""
     import logging
 
     import dask
-    from distributed import Client, LocalCluster
+    import distributed
+
+    connect: Callable[..., AbstractContextManager[Client]] = distributed.Client
+    start: Callable[..., AbstractContextManager[object]] = distributed.LocalCluster
 
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=ANSWERS_WITHIN, set_as_default=False)
+            connected = connect(scheduler, timeout=ANSWERS_WITHIN, set_as_default=False)
         except (OSError, ValueError) as error:
             reason = " ".join(str(error).split())[:160]
             raise MitsonarError(
                 f"no dask scheduler at {scheduler}: {reason}; start one with `dask scheduler` and give the address it prints"
             ) from None
-        with client:
+        with connected as client:
             yield client
         return
     settings = {
         "distributed.worker.multiprocessing-method": "spawn",
         "distributed.comm.timeouts.connect": "60s",
-        # dask lets workers return memory at each release, which doubles the time of NumPy here, and samples their stacks
+        # by default dask makes workers return memory at each release, which doubles NumPy's time, and samples their stacks
         "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": "1"},
         "distributed.worker.profile.enabled": False,
-        # Ctrl-C reaches all processes of a terminal: this one stops the others
+        # Ctrl-C reaches all processes of a terminal: this process stops the others
         "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     }
-    quiet = logging.CRITICAL  # what a user should know of a lost worker, we say
+    quiet = logging.CRITICAL  # mitsonar itself reports a lost worker
     with (
         dask.config.set(settings),
-        LocalCluster(
+        start(
             n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address=None, silence_logs=quiet
         ) as cluster,
-        Client(cluster, set_as_default=False) as client,
+        connect(cluster, set_as_default=False) as client,
     ):
         yield client
 
 
 class Queue:
-    """Shards that wait: a worker goes on where it is, whose scene it has; where it cannot, it begins a stretch of its own.
+    """Shards that wait. A worker continues after its last shard, whose scene it has loaded, or begins a stretch of its own.
 
     Args:
         todo: numbers of the shards.
@@ -115,18 +144,18 @@ class Queue:
         return bool(self.waiting)
 
     def next(self, worker: str) -> int:
-        """The next shard for a worker."""
+        """Choose the next shard for a worker."""
         shard = self.at.get(worker, -2) + 1
         if shard not in self.waiting:
             first, end = self._longest()
-            taken = first - 1 in self.at.values()  # somebody will go on there
+            taken = first - 1 in self.at.values()  # another worker will continue there
             shard = (first + end) // 2 if taken else first
         self.waiting.remove(shard)
         self.at[worker] = shard
         return shard
 
     def _longest(self) -> tuple[int, int]:
-        """The longest stretch of shards that wait: its first, and the one after its last."""
+        """Find the longest stretch of shards that wait: its first, and the one after its last."""
         waiting = np.sort(np.fromiter(self.waiting, dtype=int))
         ends = np.flatnonzero(np.append(np.diff(waiting) > 1, True)) + 1
         lengths = np.diff(ends, prepend=0)
@@ -135,48 +164,42 @@ class Queue:
         return first, first + int(lengths[longest])
 
     def give_back(self, shard: int) -> None:
-        """A worker was lost with this shard: another makes it.
+        """Return a shard whose worker was lost, so that another worker makes it.
 
         Raises:
-            MitsonarError: it was lost too often.
+            MitsonarError: too many workers were lost with it.
         """
         self.lost[shard] += 1
         if self.lost[shard] > LOSSES:
             raise MitsonarError(
-                f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; what is whole "
-                "stays, the same command goes on"
+                f"a worker was lost again and again at shard {shard} (out of memory?): use fewer workers; whole shards "
+                "stay, the same command continues"
             )
         self.waiting.add(shard)
 
     def forget(self, alive: list[str]) -> None:
-        """Workers that are gone are nowhere."""
+        """Forget the workers that are gone."""
         self.at = {worker: shard for worker, shard in self.at.items() if worker in alive}
 
 
 def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
-    """Keep every worker supplied until all shards are made."""
+    """Supply every worker with shards until all are made. Yield the number of each when it is done."""
     url = store.place.root if store.place.local else store.place.url
     given: dict[Future, tuple[str, int]] = {}
-    asked, received, alive = 0.0, time.monotonic(), []
+    asked, received, alive = 0.0, time.monotonic(), list[str]()
     try:
         while queue or given:
             if time.monotonic() - asked > ASK_S:
                 alive, asked = list(client.ncores()), time.monotonic()
                 queue.forget(alive)
-                # dask itself leaves a task waiting for ever that was meant for a worker which is gone
+                # dask would keep a task waiting for ever whose worker is gone
                 for future in [future for future, (worker, _) in given.items() if worker not in alive]:
                     queue.give_back(given.pop(future)[1])
                     future.cancel()
             if alive:
                 received = time.monotonic()
             elif time.monotonic() - received > SILENCE_S:
-                raise MitsonarError(
-                    f"workers were lost at shards {', '.join(map(str, queue.lost))} and none has come back for "
-                    f"{SILENCE_S:.0f} s (out of memory?): use fewer workers; what is whole stays, the same command goes on"
-                    if queue.lost
-                    else f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`; "
-                    "what is whole stays, the same command goes on"
-                )
+                raise _no_worker(queue)
             for worker in alive:
                 while queue and sum(owner == worker for owner, _ in given.values()) < AHEAD:
                     shard = queue.next(worker)
@@ -187,7 +210,7 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
                 if future.status == "finished":
                     yield shard
                 elif future.status == "error" and not _is_lost(future):
-                    raise future.exception()  # type: ignore[misc]
+                    raise future.exception()
                 else:
                     queue.give_back(shard)
             if not done:
@@ -197,18 +220,30 @@ def _hand_out(client: Client, store: DataStore, queue: Queue) -> Iterator[int]:
             client.cancel(list(given))
 
 
+def _no_worker(queue: Queue) -> MitsonarError:
+    """Write the error of a scheduler without workers."""
+    lost = ", ".join(map(str, queue.lost))
+    cause = (
+        f"workers were lost at shards {lost} and none has come back for {SILENCE_S:.0f} s "
+        "(out of memory?): use fewer workers"
+        if lost
+        else f"the scheduler has had no worker for {SILENCE_S:.0f} s: start some with `dask worker ADDRESS`"
+    )
+    return MitsonarError(f"{cause}; whole shards stay, the same command continues")
+
+
 def _is_lost(future: Future) -> bool:
-    """Whether the worker died, not the work failed."""
+    """Return whether the worker died, rather than its task failed."""
     from distributed import KilledWorker
 
     return isinstance(future.exception(), KilledWorker)
 
 
 def _work(url: str, shard: int) -> int:
-    """One shard, in a dask worker: as many threads of the ray tracer as the worker has.
+    """Make one shard in a dask worker, with as many threads of the ray tracer as the worker has.
 
     Raises:
-        MitsonarError: this worker does not see the store, or has other versions.
+        MitsonarError: this worker cannot open the store, or has other versions.
     """
     from distributed import get_worker
 

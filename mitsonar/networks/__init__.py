@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 __all__ = ["create_network"]
 
+AnyNetwork: TypeAlias = Any
+"""A module of one of the classes of :mod:`mitsonar.networks.create`, each with attributes of its own."""
 
-def create_network(name: str, **options: Any) -> Any:
-    """The network of that name; see :func:`mitsonar.networks.create.create_network`."""
-    from mitsonar.networks.create import create_network as create  # torch is loaded when it is needed
+
+def create_network(name: str, **options: object) -> AnyNetwork:
+    """Create a network by name; see :func:`mitsonar.networks.create.create_network`."""
+    from mitsonar.networks.create import create_network as create  # torch is loaded only here
 
     return create(name, **options)

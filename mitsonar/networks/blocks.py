@@ -1,4 +1,4 @@
-"""What the thesis's networks are made of: layers padded and initialised as MATLAB does, and the options that all take."""
+"""Building blocks of Almanza-Medina's networks: layers padded and initialised as in MATLAB, and the common options."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError
 
 __all__ = [
@@ -39,24 +40,24 @@ Table = Sequence[tuple[int, int, int]]
 
 
 class Network(nn.Module):
-    """A network whose options can be written down, so that a checkpoint can make it again.
+    """A network that keeps its options, so that a checkpoint can rebuild it.
 
     Attributes:
-        options: what the network was made with, defaults included; plain values.
-        needs: words of the input's arrangement that it cannot do without.
-        any_sonar: whether it serves sonars that it was not trained on.
-        says_law: whether it returns a :class:`~mitsonar.networks.gaussian_head.GaussianHead` rather than labels.
+        options: of the network, defaults included; plain values.
+        needs: options of the input's arrangement that it requires.
+        any_sonar: whether it works with sonars that it was not trained on.
+        has_covariance: whether it returns a :class:`~mitsonar.networks.gaussian_head.GaussianHead` rather than labels.
     """
 
-    needs: ClassVar[dict[str, Any]] = {}
+    needs: ClassVar[Fields] = {}
     any_sonar: ClassVar[bool] = False
     has_covariance: ClassVar[bool] = False
 
     def __init__(self, *, outputs: int, width: float, dropout: float, channels: int | None = None, **sizes: Size) -> None:
-        """Check and keep the options that networks share.
+        """Check and keep the common options.
 
         Raises:
-            MitsonarError: a value that no network can have.
+            MitsonarError: a value out of its range.
         """
         super().__init__()
         counts = {"outputs": outputs} | ({} if channels is None else {"channels": channels})
@@ -64,17 +65,17 @@ class Network(nn.Module):
             if not isinstance(count, int) or count < 1:
                 raise MitsonarError(f"{name} must be a whole number of at least 1: got {count!r}")
         if not isinstance(width, int | float) or not 0 < width < math.inf:
-            raise MitsonarError(f"width must be a number above 0 (1 for the thesis's channels): got {width!r}")
+            raise MitsonarError(f"width must be a number above 0 (1 for Almanza-Medina's channels): got {width!r}")
         if not isinstance(dropout, int | float) or not 0 <= dropout < 1:
             raise MitsonarError(f"dropout must be a rate from 0 to below 1: got {dropout!r}")
-        self.options: dict[str, Any] = {"width": width, "dropout": dropout, **counts}
+        self.options: Fields = {"width": width, "dropout": dropout, **counts}
         for name, size in sizes.items():
             if not _is_size(size):
                 raise MitsonarError(f"{name} must be the input's rows and columns, such as [512, 192]: got {size!r}")
             self.options[name] = [int(length) for length in size]
 
     def expect(self, image: Tensor, name: str = "size") -> None:
-        """Refuse an input of another size than the network was made for.
+        """Refuse an input of another size than that of the network.
 
         Raises:
             MitsonarError: another number of channels, rows or columns.
@@ -87,18 +88,20 @@ class Network(nn.Module):
             )
 
 
-def _is_size(size: Any) -> bool:
-    whole = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(length, int) for length in size)
-    return whole and min(size) >= 1
+def _is_size(size: object) -> bool:
+    """Return whether this is a number of rows and a number of columns, each at least 1."""
+    if not isinstance(size, Sequence) or len(size) != 2:
+        return False
+    return all(isinstance(length, int) for length in size) and min(size) >= 1
 
 
 def scaled(channels: int, width: float) -> int:
-    """Channels of a layer in a network of that width; at least 1."""
+    """Scale the channels of a layer by the width of its network; at least 1 is left."""
     return max(1, round(channels * width))
 
 
 def cells_after(size: Size, strides: Iterable[int]) -> tuple[int, int]:
-    """Rows and columns after layers of those strides with "same" padding: each divides and rounds up."""
+    """Compute rows and columns after layers with "same" padding: each stride divides and rounds up."""
     rows, columns = size
     for stride in strides:
         rows, columns = -(-rows // stride), -(-columns // stride)
@@ -109,6 +112,7 @@ class SameConv2d(nn.Conv2d):
     """Convolution with MATLAB's "same" padding: ceil(input / stride) cells, zeros around, an odd one below and right."""
 
     def forward(self, input: Tensor) -> Tensor:
+        """Convolve ``(batch, channels, rows, columns)``."""
         rows, columns = (
             _padding(length, kernel, stride)
             for length, kernel, stride in zip(input.shape[-2:], self.kernel_size, self.stride, strict=True)
@@ -119,7 +123,7 @@ class SameConv2d(nn.Conv2d):
 
 
 def _padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
-    """Zeros before and after."""
+    """Compute the zeros before and after."""
     total = max(0, (-(-length // stride) - 1) * stride + kernel - length)
     return total // 2, total - total // 2
 
@@ -127,17 +131,18 @@ def _padding(length: int, kernel: int, stride: int) -> tuple[int, int]:
 class SameAverage(nn.Module):
     """Mean over 4 x 4 cells, stride 1, as many cells out as in (Table 4.1): one cell before, itself, two after.
 
-    Cells outside the image do not count (ours): a map of one cell stays as it is. Zeros that count, as MATLAB's do unless
-    told otherwise, would divide the one cell that 512 x 192 leaves by 16, and slow down the last layer's learning as much.
+    Cells outside the image do not count (ours): a map of one cell does not change. By MATLAB's default zeros count:
+    they would divide the one cell that 512 x 192 leaves by 16, and slow down the last layer's learning by as much.
     """
 
     def forward(self, image: Tensor) -> Tensor:
+        """Average ``(batch, channels, rows, columns)``."""
         mean = functional.avg_pool2d(image, 4, stride=1, padding=2, count_include_pad=False)
         return mean[..., 1:, 1:]  # the first window has two cells before
 
 
 def convolution(inputs: int, outputs: int, kernel: int, stride: int = 2) -> nn.Sequential:
-    """Convolution, batch normalisation, ReLU; the convolution has no bias, which the normalisation would take away again."""
+    """Build convolution, batch normalisation and ReLU. The convolution has no bias: the normalisation would remove it."""
     return nn.Sequential(
         SameConv2d(inputs, outputs, kernel, stride, bias=False),
         nn.BatchNorm2d(outputs),
@@ -146,19 +151,19 @@ def convolution(inputs: int, outputs: int, kernel: int, stride: int = 2) -> nn.S
 
 
 def convolutions(table: Table, channels: int, width: float, *, bare_end: bool = True) -> OrderedDict[str, nn.Module]:
-    """``conv1``, ``conv2`` ... of a table.
+    """Build the layers ``conv1``, ``conv2`` ... of a table.
 
     Args:
         table: of the layers.
         channels: of the input.
         width: factor on the table's channels.
-        bare_end: the last convolution has a bias in place of normalisation and ReLU.
+        bare_end: whether the last convolution has a bias in place of normalisation and ReLU.
     """
     layers: OrderedDict[str, nn.Module] = OrderedDict()
-    for place, (kernel, full, stride) in enumerate(table, start=1):
-        bare = bare_end and place == len(table)
+    for number, (kernel, full, stride) in enumerate(table, start=1):
+        bare = bare_end and number == len(table)
         kind = SameConv2d if bare else convolution
-        layers[f"conv{place}"] = kind(channels, scaled(full, width), kernel, stride)
+        layers[f"conv{number}"] = kind(channels, scaled(full, width), kernel, stride)
         channels = scaled(full, width)
     return layers
 
@@ -166,8 +171,9 @@ def convolutions(table: Table, channels: int, width: float, *, bare_end: bool = 
 def column_convolutions(
     kernels: Sequence[int], table: Sequence[int], across: int, width: float, channels: int = 1
 ) -> list[nn.Module]:
-    """Convolutions of stride 2 along the rows and 1 across columns, which stay as many as they are; each with normalisation
-    and ReLU but for the last, which has a bias.
+    """Build convolutions of stride 2 along the rows and 1 across columns, whose number does not change.
+
+    Each is followed by normalisation and ReLU, except the last, which has a bias.
 
     Args:
         kernels: rows of each.
@@ -177,8 +183,8 @@ def column_convolutions(
         channels: of the input.
     """
     layers: list[nn.Module] = []
-    for place, (kernel, full) in enumerate(zip(kernels, table, strict=True), start=1):
-        outputs, bare = scaled(full, width), place == len(kernels)
+    for number, (kernel, full) in enumerate(zip(kernels, table, strict=True), start=1):
+        outputs, bare = scaled(full, width), number == len(kernels)
         layers.append(SameConv2d(channels, outputs, (kernel, across), (2, 1), bias=bare))
         layers += [] if bare else [nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)]
         channels = outputs
@@ -186,13 +192,13 @@ def column_convolutions(
 
 
 def values_after(table: Table, size: Size, width: float) -> int:
-    """Values that the convolutions of a table leave of an input of that size."""
+    """Compute the number of values that the convolutions of a table leave of an input of a size."""
     rows, columns = cells_after(size, [stride for _, _, stride in table])
     return scaled(table[-1][1], width) * rows * columns
 
 
 def fully_connected(sizes: Sequence[int]) -> nn.Sequential:
-    """Fully connected layers from sizes[0] values to sizes[-1], each followed by a ReLU."""
+    """Build fully connected layers from sizes[0] values to sizes[-1], each followed by a ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
         layers += [nn.Linear(inputs, outputs), nn.ReLU(inplace=True)]
@@ -202,14 +208,14 @@ def fully_connected(sizes: Sequence[int]) -> nn.Sequential:
 class ConvolutionNetwork(Network):
     """Convolutions, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
 
-    Dropout stands before the fully connected layer (where, the text does not say: ours).
+    Dropout lies before the fully connected layer (ours; the text gives no position).
 
     Args:
         outputs: estimates.
         width: factor on the channels.
         dropout: rate in training.
         size: rows and columns of the input.
-        channels: of the input; the thesis's 1 has the frames side by side.
+        channels: of the input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
         MitsonarError: a value out of its range.
@@ -234,7 +240,7 @@ class ConvolutionNetwork(Network):
         glorot(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
 
         Raises:
             MitsonarError: frames of another size.
@@ -244,13 +250,15 @@ class ConvolutionNetwork(Network):
 
 
 class Quadrants(nn.Module):
-    """Two images side by side cut into quadrants: ``(batch, channels, rows, columns)`` becomes four pairs of quadrants.
+    """Cuts two images side by side into four pairs of quadrants.
 
-    Each is ``(batch, channels, rows / 2, columns / 2)``, the quadrant of the left image beside that of the right: upper
-    left, upper right, lower left, lower right (3.3.3).
+    The input is ``(batch, channels, rows, columns)``. Each pair is ``(batch, channels, rows / 2, columns / 2)``, the
+    quadrant of the left image beside that of the right. Their order is upper left, upper right, lower left, lower right
+    (Almanza-Medina, 3.3.3).
     """
 
     def forward(self, pair: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Cut two images side by side."""
         batch, channels, rows, columns = pair.shape
         cut = pair.reshape(batch, channels, 2, rows // 2, 2, 2, columns // 4)  # half of rows, row, image, half, column
         upper_left, upper_right, lower_left, lower_right = (
@@ -262,7 +270,7 @@ class Quadrants(nn.Module):
 
     @staticmethod
     def size(pair: Size) -> tuple[int, int]:
-        """Rows and columns of a pair of quadrants.
+        """Compute rows and columns of a pair of quadrants.
 
         Raises:
             MitsonarError: rows that cannot be halved, or columns that cannot be cut into four.
@@ -277,7 +285,7 @@ class Quadrants(nn.Module):
 
 
 def glorot(network: nn.Module) -> None:
-    """MATLAB's initialisation: weights uniform as Glorot and Bengio (2010), biases 0."""
+    """Initialise a network as MATLAB does: weights uniform after Glorot and Bengio (2010), biases 0."""
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)

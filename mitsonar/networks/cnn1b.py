@@ -11,22 +11,22 @@ from mitsonar.networks.blocks import Network, SameConv2d, Size, fully_connected,
 __all__ = ["SIZES", "Cnn1b", "CoarseFeatures"]
 
 CHANNELS = (64, 20)
-"""Of the two convolutions (ours, after Costante et al.; the text gives only their kernels)."""
+"""Channels of the two convolutions (ours, after Costante et al.; the text gives only their kernels)."""
 
 SIZES = (2400, 1200, 600, 300)
-"""Of the fully connected network; the text gives them for CNN-4b, and four layers for both."""
+"""Values of the fully connected layers. The text gives them for CNN-4b, and four layers for both networks."""
 
 
 class CoarseFeatures(nn.Module):
-    """What CNN-1b and each quarter of CNN-4b see: a coarse image after one convolution, and after two.
+    """Features of CNN-1b and of each quarter of CNN-4b: a coarse image after one convolution, and after two.
 
     ``coarse``, a mean over cells; ``conv1``, 9 x 9; ``pool1``, the maximum over 4 x 4; ``conv2``, 2 x 2; ``pool2``, 2 x 2.
-    Ours, the text being silent: the convolutions have ReLU and "same" padding and move by one cell; pools do not overlap,
-    and what does not fill one is left out, as in MATLAB. The text's layer in which the outputs of both pools come together
-    holds just these, without weights.
+    The text is silent on the following, which is ours. The convolutions have ReLU, "same" padding and stride 1. Pools do not
+    overlap, and cells that do not fill one are left out, as in MATLAB. The text's layer that joins the outputs of both pools
+    has no weights.
 
     Args:
-        cells: over which the mean goes.
+        cells: rows and columns of cells of a mean.
         size: rows and columns of the input.
         width: factor on the channels.
         channels: of the input.
@@ -49,7 +49,7 @@ class CoarseFeatures(nn.Module):
         self.values = first * rows * columns + second * (rows // 2) * (columns // 2)
 
     def forward(self, image: Tensor) -> Tensor:
-        """``(batch, values)`` of ``(batch, channels, rows, columns)``."""
+        """Compute features ``(batch, values)`` of images ``(batch, channels, rows, columns)``."""
         fine = self.pool1(self.conv1(self.coarse(image)))
         return torch.cat((fine.flatten(1), self.pool2(self.conv2(fine)).flatten(1)), dim=1)
 
@@ -57,14 +57,14 @@ class CoarseFeatures(nn.Module):
 class Cnn1b(Network):
     """Means over 8 x 8 cells, two convolutions, and a fully connected network of four layers.
 
-    Dropout stands before the fully connected network (ours; the text names a rate, and no place).
+    Dropout lies before the fully connected network (ours; the text gives a rate, but no position).
 
     Args:
         outputs: estimates.
         width: factor on the channels and on the sizes of the fully connected layers.
         dropout: rate in training.
         size: rows and columns of the input, at least 64 each.
-        channels: of the input; the thesis's 1 has the frames side by side.
+        channels: of the input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
         MitsonarError: a value out of its range.
@@ -87,7 +87,7 @@ class Cnn1b(Network):
         glorot(self)
 
     def forward(self, image: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` of frames ``(batch, channels, rows, columns)``, grey values 0..1.
 
         Raises:
             MitsonarError: frames of another size.

@@ -12,9 +12,9 @@ __all__ = ["Cnn4b"]
 
 
 class Cnn4b(Network):
-    """Four pairs of quadrants, each with CNN-1b's convolutions on means over 4 x 4 cells; one network reads what all see.
+    """Four pairs of quadrants, each with CNN-1b's convolutions on means over 4 x 4 cells, and one fully connected network.
 
-    The four share no weights, and dropout stands before the fully connected network (ours).
+    The four share no weights. Dropout lies before the fully connected network. Both are ours.
 
     Args:
         outputs: estimates.
@@ -46,11 +46,11 @@ class Cnn4b(Network):
         glorot(self)
 
     def forward(self, pair: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
 
         Raises:
             MitsonarError: images of another size.
         """
         self.expect(pair)
-        seen = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
-        return self.regression(self.layers(self.dropout(torch.cat(seen, dim=1))))  # type: ignore[no-any-return]
+        features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
+        return self.regression(self.layers(self.dropout(torch.cat(features, dim=1))))  # type: ignore[no-any-return]

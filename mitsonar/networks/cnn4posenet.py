@@ -23,18 +23,18 @@ from mitsonar.networks.posenet import LAYERS as POSENET
 __all__ = ["Cnn4PoseNet", "QuadPoseNet"]
 
 LAYERS = POSENET[:8]
-"""Of a QuadPoseNet: the text gives their number and kernels; channels and strides are PoseNet's (ours)."""
+"""Convolutions of a QuadPoseNet. The text gives their number and kernels; channels and strides are PoseNet's (ours)."""
 
 VALUES = 1024
-"""Of each of its two fully connected layers."""
+"""Values of each of its two fully connected layers."""
 
 
 class QuadPoseNet(nn.Module):
-    """Eight convolutions, and from the last and the first of them a fully connected layer each: fine features and coarse.
+    """Eight convolutions, with a fully connected layer on the last one and another on the first: coarse and fine features.
 
     The 5 x 5 average after the first convolution does not overlap (ours: MATLAB's stride of 1 would need 200 million weights
-    behind it), and what does not fill it is left out. The fully connected layers have a ReLU (ours). The text's layers of
-    2 x 1024 and 8 x 1024 values are taken for what these make side by side, without weights.
+    after it). Cells that do not fill it are left out. The fully connected layers have a ReLU (ours). We read the text's
+    layers of 2 x 1024 and 8 x 1024 values as these outputs side by side, without weights.
 
     Args:
         size: rows and columns of the input.
@@ -56,7 +56,7 @@ class QuadPoseNet(nn.Module):
         self.values = 2 * values
 
     def forward(self, image: Tensor) -> Tensor:
-        """``(batch, values)`` of ``(batch, 1, rows, columns)``."""
+        """Compute features ``(batch, values)`` of images ``(batch, 1, rows, columns)``."""
         first = self.first(image)
         last = self.from_last(self.others(first).flatten(1))
         return torch.cat((last, self.from_first(self.early(first).flatten(1))), dim=1)
@@ -65,7 +65,7 @@ class QuadPoseNet(nn.Module):
 class Cnn4PoseNet(Network):
     """Four pairs of quadrants, each with its own QuadPoseNet; a fully connected layer reads them all.
 
-    Dropout stands before that layer (ours).
+    Dropout lies before that layer (ours).
 
     Args:
         outputs: estimates.
@@ -95,11 +95,11 @@ class Cnn4PoseNet(Network):
         glorot(self)
 
     def forward(self, pair: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` of two images side by side ``(batch, 1, rows, columns)``, grey values 0..1.
 
         Raises:
             MitsonarError: images of another size.
         """
         self.expect(pair)
-        seen = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
-        return self.regression(self.dropout(torch.cat(seen, dim=1)))  # type: ignore[no-any-return]
+        features = [quarter(image) for quarter, image in zip(self.quarters, self.split(pair), strict=True)]
+        return self.regression(self.dropout(torch.cat(features, dim=1)))  # type: ignore[no-any-return]

@@ -1,26 +1,26 @@
-"""CorrNet: two frames are matched cell by cell, and the known geometry turns what the cells say into one motion (ours).
+"""CorrNet: two frames are matched cell by cell, and the known geometry turns the displacements into one motion (ours).
 
-A shared encoder describes blocks of both frames. The second frame's blocks are drawn where the motion found so far takes
-those of the first; a local correlation volume gives each block a displacement (soft-argmax) and how sure it is of it (a
-2 x 2 information matrix). One weighted least-squares problem with the sonar's derivative turns all of them into a step of
-the motion, in closed form; its normal matrix tells the covariance. Finer looks, one beam wide, take what is left from the
-frames' differences and slopes. Rocks stand above the ground that the geometry knows: a few layers guess from both frames
-by how much.
+A shared encoder describes blocks of both frames. The second frame's blocks are sampled where the motion so far moves those
+of the first. A local correlation volume gives each block a displacement (soft-argmax) and its 2 x 2 information matrix. One
+weighted least-squares problem with the sonar's derivative turns them into a step of the motion, in closed form. Its normal
+matrix gives the covariance. Finer iterations, on cells one beam wide, estimate the rest from the frames' differences and
+slopes. Rocks lie above the ground of the geometry: a few layers estimate their height from both frames.
 
-Correlation volumes and their lookup are from PWC-Net (Sun et al. 2018) and RAFT (Teed and Deng 2020); here flow has
-three parameters, and their derivative is known. The volume's second axis is the beam: how far a motion shifts each cell
-along it, sine or angle, the geometry says, so even beams are not needed.
+Correlation volumes and their lookup are from PWC-Net (Sun et al. 2018) and RAFT (Teed and Deng 2020); here the
+flow has three parameters, and their derivative is known. The volume's second axis is the beam. The geometry defines how far
+a motion shifts each cell along it, so the beams need not be evenly spaced.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.matching import Matching, channels_last, quiet
@@ -30,38 +30,38 @@ from mitsonar.networks.warp_grid import Ground, WarpGrid
 __all__ = ["CorrNet"]
 
 BLOCK = (16, 2)
-"""Bins and beams that are described together."""
+"""Bins and beams of a block."""
 
 FEWEST = (128, 16)
-"""Bins and beams of an image that gives the first look something to match."""
+"""Fewest bins and beams of an image: smaller ones leave the first iteration too few blocks."""
 
 RANGE_M = 4.4
-"""Mean range at which the unit of length is 1 mm, of turns 0.25 mrad: lengths scale with the scene, images then do not
-change."""
+"""Mean range at which the unit of length is 1 mm. The unit scales with the range, since images do not change with scale."""
 
 TURN = 2.5e-4
+"""Unit of yaw [rad]."""
 
 JUDGED = 2
-"""Finer looks that judge anew; later ones keep what these have found."""
+"""Finer iterations that compute weights. Later ones keep these weights."""
 
 TALLEST = 0.2
-"""Relief that can be guessed, as part of the height."""
+"""Largest relief, as part of the height."""
 
 
 class CorrNet(nn.Module):
-    """Matching with known geometry.
+    """A network that matches two frames with known geometry.
 
     Args:
         width: scales the channels.
-        looks: at blocks, their weights tied: the second reaches what was beyond the first one's blocks.
-        finer: looks at differences and slopes, tied as well.
-        relief: whether the height of what is seen above the ground is guessed for each cell.
+        looks: number of iterations on blocks, which share their weights. The second reaches farther than the first.
+        finer: number of iterations on differences and slopes, which share their weights, too.
+        relief: whether the height above the ground is estimated for each cell.
 
     Raises:
-        MitsonarError: a value that no network can have.
+        MitsonarError: a value out of its range.
     """
 
-    needs: ClassVar[dict[str, Any]] = {"layout": "channels", "ground": True}
+    needs: ClassVar[Fields] = {"layout": "channels", "ground": True}
     any_sonar: ClassVar[bool] = True
     has_covariance: ClassVar[bool] = True
 
@@ -72,7 +72,7 @@ class CorrNet(nn.Module):
             raise MitsonarError(
                 f"corrnet takes a width above 0, looks and finer of at least 1: got {width!r}, {looks!r} and {finer!r}"
             )
-        self.options: dict[str, Any] = {"width": width, "looks": looks, "finer": finer, "relief": relief}
+        self.options: Fields = {"width": width, "looks": looks, "finer": finer, "relief": relief}
         first, second, channels, hidden, filters = (max(2, round(width * count)) for count in (12, 24, 16, 16, 6))
         self.encoder = channels_last(
             nn.Conv2d(1, first, (8, 3), stride=(4, 1), padding=(2, 1)),
@@ -89,14 +89,14 @@ class CorrNet(nn.Module):
         self.share = nn.Parameter(torch.tensor(-4.0))
 
     def forward(self, images: Tensor, ground: Ground) -> GaussianHead:
-        """The motion between two frames.
+        """Estimate the motion between two frames.
 
         Args:
             images: ``(batch, 2, bins, beams)`` in 0..1.
             ground: a batch of :func:`mitsonar.datasets.ground_nodes.ground_at`.
 
         Returns:
-            The law of the motion; in training that of each look.
+            The distribution of the motion; in training that of each iteration.
 
         Raises:
             MitsonarError: images that are too small, or not pairs.
@@ -110,24 +110,24 @@ class CorrNet(nn.Module):
         frames = _even(images).reshape(2 * batch, 1, *size)
         blocks = tuple(cells.contiguous() for cells in _pair(self.encoder(frames)))
         cells = self.slopes.prepared(*_pair(self.slopes.filter(frames)))
-        unit, laws = _units(ground), []
+        unit, estimates = _units(ground), []
         relief = None if self.relief is None else self.relief(*blocks)
         motion, judged = images.new_zeros(batch, 3), None
         warp_grid = WarpGrid(ground, unit, BLOCK, size, blocks[0].shape[-2:], relief)
         for _ in range(self.options["looks"]):
             motion, normal = self.matching(blocks, warp_grid, motion)
-            laws.append((motion, normal))
+            estimates.append((motion, normal))
         warp_grid = WarpGrid(ground, unit, (STEP, 1), size, cells[0].shape[-2:], _resized(relief, cells[0]))
         for k in range(self.options["finer"]):
             motion, normal, judged = self.slopes(cells, warp_grid, motion, judged if k >= JUDGED else None)
-            laws.append((motion, normal))
+            estimates.append((motion, normal))
         if not self.training:
-            return self._law(motion, normal, unit)
-        return GaussianHead(*(torch.stack(values) for values in zip(*(self._law(*law, unit) for law in laws), strict=True)))
+            return self._head(motion, normal, unit)
+        heads = [self._head(*estimate, unit) for estimate in estimates]
+        return GaussianHead(*(torch.stack(values) for values in zip(*heads, strict=True)))
 
-    def _law(self, motion: Tensor, normal: Tensor, unit: Tensor) -> GaussianHead:
-        """Mean and covariance: what cells say is not independent, something remains always, and scale errors grow with the
-        motion."""
+    def _head(self, motion: Tensor, normal: Tensor, unit: Tensor) -> GaussianHead:
+        """Compute mean and covariance: cells have correlated errors, a floor remains, scale errors grow with the motion."""
         inverse = torch.linalg.inv(normal)
         far = motion.detach()
         covariance = torch.exp(2 * self.scale) * (inverse + inverse.mT) / 2 + torch.diag_embed(
@@ -137,7 +137,7 @@ class CorrNet(nn.Module):
 
 
 class Relief(nn.Module):
-    """How far what each block shows stands above the ground, as part of the height, from both frames."""
+    """Height of each block above the ground, as part of the sonar's height, from both frames."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -150,29 +150,29 @@ class Relief(nn.Module):
         )
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """``(batch, 1, rows, columns)``."""
+        """Estimate the relief ``(batch, 1, rows, columns)`` from descriptions of both frames."""
         return TALLEST * torch.tanh(self.layers(torch.cat([first, second], dim=1)))
 
 
 def _units(ground: Ground) -> Tensor:
-    """Units of motions ``(batch, 3)`` [m, m, rad]."""
+    """Compute the units of motions ``(batch, 3)`` [m, m, rad]."""
     length = 1e-3 * ground["place"][:, 0].mean(dim=(1, 2)) / RANGE_M
     return torch.stack([length, length, torch.full_like(length, TURN)], dim=1)
 
 
 def _even(images: Tensor) -> Tensor:
-    """Pairs of frames with mean 0 and standard deviation 1: levels carry no motion."""
+    """Scale pairs of frames to mean 0 and standard deviation 1: their levels hold no information on the motion."""
     mean, std = images.mean(dim=(1, 2, 3), keepdim=True), images.std(dim=(1, 2, 3), keepdim=True)
     return (images - mean) / (std + 1e-6)
 
 
 def _pair(frames: Tensor) -> tuple[Tensor, ...]:
-    """First and second frames ``(batch, ...)`` of frames in turn ``(2 * batch, ...)``."""
+    """Separate first and second frames ``(batch, ...)`` of alternating frames ``(2 * batch, ...)``."""
     return frames.reshape(-1, 2, *frames.shape[1:]).unbind(dim=1)
 
 
 def _resized(relief: Tensor | None, cells: Tensor) -> Tensor | None:
-    """Relief at cells of another size."""
+    """Interpolate the relief to cells of another size."""
     if relief is None or relief.shape[-2:] == cells.shape[-2:]:
         return relief
     return functional.interpolate(relief, size=cells.shape[-2:], mode="bilinear")

@@ -1,12 +1,14 @@
-"""All networks by name."""
+"""All networks, by name."""
 
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from typing import Any, TypeAlias
 
 from torch import Tensor, nn
 
+from mitsonar.datasets.batches import Inputs
+from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.networks.cnn1b import Cnn1b
 from mitsonar.networks.cnn4b import Cnn4b
@@ -21,6 +23,9 @@ from mitsonar.networks.sfmnet import SfMNet
 
 __all__ = ["NETWORKS", "called", "create_network", "options_for", "options_of"]
 
+Output: TypeAlias = Any
+"""The output of a network: labels ``(batch, outputs)``, or a :class:`~mitsonar.networks.gaussian_head.GaussianHead`."""
+
 NETWORKS: dict[str, Any] = {
     "posenet": PoseNet,
     "sfmnet": SfMNet,
@@ -33,17 +38,17 @@ NETWORKS: dict[str, Any] = {
     "posenetvec": PoseNetVec,
     "profilenet": ProfileNet,
 }
-"""Classes of networks; of each: ``needs``, ``any_sonar``, ``has_covariance``, as in
+"""Classes of networks. Each has ``needs``, ``any_sonar`` and ``has_covariance``; see
 :class:`~mitsonar.networks.blocks.Network`."""
 
 
-def create_network(name: str, **options: Any) -> nn.Module:
-    """The network of that name, with weights drawn from torch's generator.
+def create_network(name: str, **options: object) -> nn.Module:
+    """Create a network by name, with weights drawn from torch's generator.
 
     Args:
         name: of :data:`NETWORKS`.
-        options: of that network; see its class. Those of the thesis's networks are outputs, width, dropout, size and, where
-            frames may come as channels, channels.
+        options: of that network; see its class. Those of Almanza-Medina's networks are outputs, width, dropout, size and,
+            where frames may be channels, channels.
 
     Raises:
         MitsonarError: unknown name or option, or a value out of its range.
@@ -56,13 +61,13 @@ def create_network(name: str, **options: Any) -> nn.Module:
     return network
 
 
-def called(network: nn.Module, inputs: Any) -> Any:
-    """The network's output; several inputs, a tuple, are given one by one."""
+def called(network: nn.Module, inputs: Inputs) -> Output:
+    """Call a network. The inputs of a tuple are passed one by one."""
     return network(*inputs) if isinstance(inputs, tuple) else network(inputs)
 
 
 def options_of(name: str) -> list[str]:
-    """The options of the network of that name.
+    """List the options of a network.
 
     Raises:
         MitsonarError: unknown name.
@@ -72,20 +77,20 @@ def options_of(name: str) -> list[str]:
     return list(inspect.signature(NETWORKS[name]).parameters)
 
 
-def options_for(name: str, inputs: Any, labels: Tensor, receivers: int = 1) -> dict[str, Any]:
-    """The options of a network that samples settle: number of labels, sizes and channels of the input.
+def options_for(name: str, inputs: Inputs, labels: Tensor, receivers: int = 1) -> Fields:
+    """Derive the options of a network that samples define: number of labels, sizes and channels of the input.
 
     Args:
         name: of :data:`NETWORKS`.
-        inputs: of a batch, as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` gives them: one tensor or a tuple.
+        inputs: of a batch, as :class:`~mitsonar.datasets.torch_pairs.SonarPairs` makes them: one tensor or a tuple.
         labels: ``(batch, outputs)``.
-        receivers: whose impulse responses the input holds.
+        receivers: number of receivers whose impulse responses the input holds.
 
     Raises:
         MitsonarError: unknown name.
     """
     first, *others = inputs if isinstance(inputs, tuple) else (inputs,)
-    settled: dict[str, Any] = {"outputs": labels.shape[-1], "size": list(first.shape[-2:]), "channels": first.shape[-3]}
+    settled: Fields = {"outputs": labels.shape[-1], "size": list(first.shape[-2:]), "channels": first.shape[-3]}
     settled["receivers"] = receivers
     if others and isinstance(others[0], Tensor):
         settled["cartesian_size"] = list(others[0].shape[-2:])

@@ -1,4 +1,4 @@
-"""What a network that knows how sure it is says: a Gaussian law of the motion."""
+"""The output of networks that estimate their uncertainty: a Gaussian distribution of the motion, and its likelihood."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["GaussianHead", "likelihood"]
 
 
 class GaussianHead(NamedTuple):
-    """Mean and covariance of motions (sideways, forward [m], yaw [rad]).
+    """Mean and covariance of motions: sideways, forward [m], yaw [rad].
 
     Attributes:
         mean: ``(batch, 3)``; in training ``(iterations, batch, 3)``, the last iteration last.
@@ -23,18 +23,21 @@ class GaussianHead(NamedTuple):
 
 
 SCALE = (1e-3, 1e-3, 2.5e-4)
-"""Units in which the likelihood is computed [m, m, rad]: those of errors, so that float32 suffices."""
+"""Units of the likelihood [m, m, rad]. They are about as large as errors, so that float32 suffices."""
 
 
-def likelihood(law: GaussianHead, target: Tensor, *, fading: float = 0.6) -> Tensor:
-    """Negative logarithm of the Gaussian law's density at the target, in units of mm, mm, 0.25 mrad, mean over the batch.
+def likelihood(head: GaussianHead, target: Tensor, *, fading: float = 0.6) -> Tensor:
+    """Compute the negative log-likelihood of the target, in units of mm, mm, 0.25 mrad, mean over the batch.
 
     Args:
-        law: of the motion.
+        head: distribution of the motion.
         target: ``(batch, 3)`` [m, m, rad].
-        fading: weight of an iteration relative to the next.
+        fading: weight of an iteration relative to the next one.
+
+    Returns:
+        A scalar, summed over the iterations.
     """
-    mean, covariance = law
+    mean, covariance = head
     if mean.dim() == 2:
         mean, covariance = mean[None], covariance[None]
     scale = torch.tensor(SCALE, dtype=mean.dtype, device=mean.device)
@@ -43,4 +46,5 @@ def likelihood(law: GaussianHead, target: Tensor, *, fading: float = 0.6) -> Ten
     white = torch.linalg.solve_triangular(factor, error[..., None], upper=False)[..., 0]
     each = 0.5 * white.square().sum(-1) + factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     weight = fading ** torch.arange(len(mean) - 1, -1, -1, dtype=mean.dtype, device=mean.device)
-    return (weight * each.mean(dim=1)).sum()
+    total: Tensor = (weight * each.mean(dim=1)).sum()
+    return total

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError
 from mitsonar.networks.blocks import Network, SameAverage, Size, column_convolutions, glorot, scaled
 
 __all__ = ["CHANNELS", "KERNELS", "LAYERS", "ImpulsePoseNet"]
 
 KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
-"""Along the delay; 4 columns across all of them (Table 5.1)."""
+"""Rows of the kernels, along the delay (Table 5.1)."""
 
 CHANNELS = (32, 64, 128, 256, 512, 512, 512, 512, 512)
 
@@ -21,14 +22,14 @@ ACROSS = 4
 """Columns of a kernel."""
 
 LAYERS = (6, 9)
-"""Fewest and most convolutions of table 5.2."""
+"""Fewest and most convolutions of Table 5.2."""
 
 
 class ImpulsePoseNet(Network):
     """A PoseNet for each receiver's block of columns, all joined in one fully connected layer to the estimates.
 
-    Convolutions of stride 2 along the delay and 1 across, batch normalisation and ReLU but for the last, a mean over 4 x 4
-    cells; dropout after the first ReLU and after the mean. The columns of a block stay as many as they are, 2 Q: "4 x 8" of
+    Convolutions have stride 2 along the delay and 1 across. All but the last have batch normalisation and ReLU. A mean over
+    4 x 4 cells follows. Dropout lies after the first ReLU and after the mean. A block keeps its 2 Q columns: "4 x 8" of
     Conv8 in Table 5.1 is a slip.
 
     Args:
@@ -40,10 +41,10 @@ class ImpulsePoseNet(Network):
         size: taps and columns of the input, 2 M Q.
 
     Raises:
-        MitsonarError: a value out of its range, columns that receivers cannot share.
+        MitsonarError: a value out of its range, a number of columns that cannot be divided among the receivers.
     """
 
-    needs: ClassVar[dict[str, Any]] = {"kind": "response"}
+    needs: ClassVar[Fields] = {"kind": "response"}
 
     def __init__(
         self,
@@ -61,7 +62,7 @@ class ImpulsePoseNet(Network):
         if not isinstance(receivers, int) or receivers < 1 or size[1] % (2 * receivers):
             raise MitsonarError(
                 f"size {list(size)} must have real and imaginary columns for each receiver: got receivers {receivers!r}; "
-                "leave out receivers and size, the data settle them"
+                "leave out receivers and size, which the data define"
             )
         self.options |= {"layers": layers, "receivers": receivers}
         self.nets = nn.ModuleList(_pose_net(layers, width, dropout) for _ in range(receivers))
@@ -73,7 +74,7 @@ class ImpulsePoseNet(Network):
         glorot(self)
 
     def forward(self, matrix: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of packed matrices ``(batch, 1, taps, 2 M Q)``.
+        """Estimate labels ``(batch, outputs)`` of packed matrices ``(batch, 1, taps, 2 M Q)``.
 
         Raises:
             MitsonarError: matrices of another size.
@@ -85,7 +86,7 @@ class ImpulsePoseNet(Network):
 
 
 def _pose_net(layers: int, width: float, dropout: float) -> nn.Sequential:
-    """Convolutions of Table 5.1, the mean, and dropout, also after the first ReLU."""
+    """Build the convolutions of Table 5.1, the mean, and dropout, also after the first ReLU."""
     parts = column_convolutions(KERNELS[:layers], CHANNELS[:layers], ACROSS, width)
     parts.insert(3, nn.Dropout(dropout))
     return nn.Sequential(*parts, SameAverage(), nn.Dropout(dropout))

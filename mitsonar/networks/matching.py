@@ -1,8 +1,8 @@
-"""Cells matched by correlation: how far each is displaced, how sure that is, and the step of the motion that they tell."""
+"""Cells matched by correlation: the displacement of each, its information, and the step of the motion that follows."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -13,14 +13,17 @@ from mitsonar.networks.warp_grid import WarpGrid
 __all__ = ["Matching", "Pair", "channels_last", "quiet"]
 
 Pair = tuple[Tensor, ...]
-"""Cells of the first and of the second frame, and what else is known of them."""
+"""Cells of the first and of the second frame, and further tensors of them."""
+
+Context: TypeAlias = Any
+"""What torch keeps between a function and its derivative; torch gives it no type."""
 
 FAINT = 1e-2
-"""Mean square of a description below which it counts as nothing."""
+"""Mean square of a description below which it is treated as empty."""
 
 
 class Matching(nn.Module):
-    """Displacement of each cell and its information, from the correlation with the cells around its place.
+    """Displacement of each cell and its information, from the correlation with the cells around its predicted position.
 
     Args:
         reach: cells searched each way, along range and beams.
@@ -45,17 +48,20 @@ class Matching(nn.Module):
             nn.ReLU(),
             quiet(nn.Conv2d(hidden, count + 3, 1)),
         )
-        with torch.no_grad():  # at first correlations are averaged over 3 x 3 cells, and nothing is judged
+        with torch.no_grad():  # at first correlations are averaged over 3 x 3 cells, and the judge has no effect
             self.smooth.weight.zero_()
             self.smooth.weight[range(count), range(count)] = 1 / 9
 
     def forward(self, cells: Pair, warp_grid: WarpGrid, motion: Tensor) -> tuple[Tensor, Tensor]:
-        """A better motion ``(batch, 3)`` in units, and the normal matrix ``(batch, 3, 3)`` behind it.
+        """Refine a motion by one step.
 
         Args:
             cells: descriptions of both frames ``(batch, channels, rows, columns)``.
-            look: where these cells are.
-            motion: found so far.
+            warp_grid: of these cells.
+            motion: the estimate so far ``(batch, 3)``, in units.
+
+        Returns:
+            The motion ``(batch, 3)`` in units, and its normal matrix ``(batch, 3, 3)``.
         """
         second, inside = warp_grid.draw(cells[1], motion)
         displaced, sure = self.displaced(cells[0], second)
@@ -67,8 +73,12 @@ class Matching(nn.Module):
         return motion + step, normal
 
     def displaced(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """Displacements ``(batch, 2, rows, columns)`` [cells], and the factor L of their information L L'
-        ``(batch, 3, rows, columns)``: its 11, 22 and 21."""
+        """Estimate the displacement of each cell.
+
+        Returns:
+            Displacements ``(batch, 2, rows, columns)`` [cells], and the elements 11, 22 and 21 of the factor L of their
+            information L L' ``(batch, 3, rows, columns)``.
+        """
         one, one_size = _unit_descriptions(first)
         other, other_size = _unit_descriptions(second)
         volume = self._volume(one, other)
@@ -80,7 +90,7 @@ class Matching(nn.Module):
         return moved_by, torch.cat([sure, 0.3 * judged[:, count + 2 :]], dim=1)
 
     def _volume(self, one: Tensor, other: Tensor) -> Tensor:
-        """Correlations ``(batch, places, rows, columns)`` of each cell with the cells around its place."""
+        """Correlate each cell with the cells around its predicted position ``(batch, places, rows, columns)``."""
         down, across = self.reach
         wide = functional.pad(other, (across, across, down, down))
         if torch.is_grad_enabled() and (one.requires_grad or other.requires_grad):
@@ -89,32 +99,32 @@ class Matching(nn.Module):
 
 
 def quiet(layer: nn.Conv2d) -> nn.Conv2d:
-    """A layer that says nothing before it has learnt."""
+    """Set a layer's parameters to 0, so that it has no effect before training."""
     for values in layer.parameters():
         nn.init.zeros_(values)
     return layer
 
 
 def channels_last(*layers: nn.Module) -> nn.Sequential:
-    """Layers whose weights lie so that a CPU convolves few channels 1.5 times faster."""
+    """Join layers in torch's channels-last format, with which a CPU convolves few channels 1.5 times faster."""
     return nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
 
 def _unit_descriptions(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """Descriptions of mean square 1, and the logarithm of what it was."""
+    """Scale descriptions to mean square 1. Return them and the logarithm of their mean square."""
     power = (cells * cells).mean(dim=1, keepdim=True) + FAINT
     return cells * torch.rsqrt(power), torch.log(power)
 
 
 def _shifted(one: Tensor, wide: Tensor) -> list[Tensor]:
-    """Views of the wide frame, each as large as the other one, along range first."""
+    """List the views of the wide frame that have the size of the other one, along range first."""
     rows, columns = one.shape[-2:]
     down, across = (large - small + 1 for large, small in zip(wide.shape[-2:], (rows, columns), strict=True))
     return [wide[:, :, r : r + rows, c : c + columns] for r in range(down) for c in range(across)]
 
 
 def _correlations(one: Tensor, wide: Tensor) -> Tensor:
-    """Of each cell with all shifts of the other frame, mean over the channels."""
+    """Correlate each cell with all shifts of the other frame, mean over the channels."""
     rows, columns = one.shape[-2:]
     shifted = wide.unfold(2, rows, 1).unfold(3, columns, 1)
     return (one[:, :, None, None] * shifted).mean(dim=1).flatten(1, 2)
@@ -124,12 +134,12 @@ class _Correlations(torch.autograd.Function):
     """:func:`_correlations` with a derivative that touches memory a third as often as torch's own."""
 
     @staticmethod
-    def forward(context: Any, one: Tensor, wide: Tensor) -> Tensor:
+    def forward(context: Context, one: Tensor, wide: Tensor) -> Tensor:
         context.save_for_backward(one, wide)
         return _correlations(one, wide)
 
     @staticmethod
-    def backward(context: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(context: Context, *gradients: Tensor) -> tuple[Tensor, Tensor]:
         one, wide = context.saved_tensors
         by_volume = gradients[0] / one.shape[1]
         by_one, by_wide = torch.zeros_like(one), torch.zeros_like(wide)

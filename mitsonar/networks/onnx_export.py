@@ -1,4 +1,4 @@
-"""A checkpoint as ONNX, for programs without torch; what its numbers mean stands in the file's metadata."""
+"""A checkpoint as ONNX, for programs without torch. The file's metadata describe inputs and outputs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,17 +24,18 @@ __all__ = ["onnx_of"]
 
 
 def onnx_of(checkpoint: Checkpoint, batch: int | None = 1) -> bytes:
-    """The file's content. Inputs: ``image`` as the arrangement says, grey values 0..1 (of ``both`` coordinates ``image`` and
-    ``cartesian``); for networks that know the geometry also the tables of
-    :func:`~mitsonar.datasets.ground_nodes.ground_at`, by
-    name. Outputs: ``labels``, or ``motion`` and its ``covariance``.
+    """Write a checkpoint as ONNX, and return the file's content.
+
+    Inputs: ``image`` in the checkpoint's arrangement, grey values 0..1, and ``cartesian`` for ``both`` coordinates;
+    for networks that know the geometry also the tables of :func:`~mitsonar.datasets.ground_nodes.ground_at`, by name.
+    Outputs: ``labels``, or ``motion`` and its ``covariance``.
 
     Args:
         checkpoint: of the network.
-        batch: samples at a time; None: any number.
+        batch: number of samples of a batch; None: any number.
 
     Raises:
-        MitsonarError: ``onnx`` or ``onnxscript`` is missing, or the network cannot be written so.
+        MitsonarError: ``onnx`` or ``onnxscript`` is missing, or torch cannot write the network.
     """
     missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
     if missing:
@@ -50,11 +50,17 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = 1) -> bytes:
     outputs = ["motion", "covariance"] if NETWORKS[checkpoint.network].has_covariance else ["labels"]
     try:
         with _quiet(), torch.no_grad():
-            network(inputs)  # what networks keep must be kept before the tracer comes, with its empty tensors
+            network(inputs)  # fills the networks' caches before the tracer passes empty tensors
             traced = torch.export.export(network, (), {"inputs": inputs}, dynamic_shapes=shapes)
             traced = traced.run_decompositions({**torch.export.default_decompositions(), **WITHOUT})
-            words: dict[str, Any] = {"input_names": list(inputs), "output_names": outputs, "external_data": False}
-            program = torch.onnx.export(traced, dynamo=True, verbose=False, **words)
+            program = torch.onnx.export(
+                traced,
+                dynamo=True,
+                verbose=False,
+                input_names=list(inputs),
+                output_names=outputs,
+                external_data=False,
+            )
     except (RuntimeError, torch.onnx.errors.OnnxExporterError) as error:
         cause = str(error.__cause__ or error).splitlines() or [type(error).__name__]
         how = "of any number of samples at a time; give a number" if batch is None else f"of {batch} samples at a time"
@@ -66,13 +72,14 @@ def onnx_of(checkpoint: Checkpoint, batch: int | None = 1) -> bytes:
 
 
 class _Named(nn.Module):
-    """A network whose inputs come by name."""
+    """A network whose inputs are passed by name."""
 
     def __init__(self, network: nn.Module, ground: bool) -> None:
         super().__init__()
         self.network, self.ground = network, ground
 
     def forward(self, inputs: dict[str, Tensor]) -> Tensor | tuple[Tensor, Tensor]:
+        """Return labels, or a motion and its covariance."""
         rest = dict(inputs)
         image = rest.pop("image")
         answer = self.network(image, rest) if self.ground else self.network(image, *rest.values())
@@ -80,7 +87,7 @@ class _Named(nn.Module):
 
 
 def _inputs(checkpoint: Checkpoint, batch: int) -> dict[str, Tensor]:
-    """A batch of the network's inputs, with noise in place of frames."""
+    """Make a batch of the network's inputs by name, with noise in place of frames."""
     made = torch.Generator().manual_seed(0)
     if not checkpoint.arrangement["ground"]:
         options = checkpoint.options
@@ -98,16 +105,16 @@ def _inputs(checkpoint: Checkpoint, batch: int) -> dict[str, Tensor]:
 
 
 def _about(checkpoint: Checkpoint) -> dict[str, str]:
-    """What the file says of itself; tables as JSON."""
+    """Return the metadata of the file; tables as JSON."""
     texts = ("network", "model", "noise", "data", "digest")
     tables = ("options", "arrangement", "labels", "sonar", "trained_at", "metrics", "trained")
-    about: dict[str, Any] = {name: getattr(checkpoint, name) for name in texts}
+    about: dict[str, str] = {name: getattr(checkpoint, name) for name in texts}
     about |= {name: json.dumps(getattr(checkpoint, name)) for name in tables}
     return about | {"mitsonar_version": checkpoint.version}
 
 
-def _solved(matrix: Tensor, wanted: Tensor, **words: Any) -> Tensor:
-    """Solutions of systems with positive definite matrices ``(..., 3, 3)``, by elimination."""
+def _solved(matrix: Tensor, wanted: Tensor, **options: object) -> Tensor:
+    """Solve systems with positive definite matrices ``(..., 3, 3)`` by elimination."""
     size = matrix.shape[-1]
     rows = [torch.cat([matrix[..., k, :], wanted[..., k, :]], dim=-1) for k in range(size)]
     for k in range(size):
@@ -117,17 +124,17 @@ def _solved(matrix: Tensor, wanted: Tensor, **words: Any) -> Tensor:
 
 
 def _inverted(matrix: Tensor) -> Tensor:
-    """The inverse likewise."""
+    """Invert positive definite matrices ``(..., 3, 3)`` by elimination."""
     return _solved(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand(matrix.shape))
 
 
 WITHOUT = {torch.ops.aten.linalg_solve.default: _solved, torch.ops.aten.linalg_inv.default: _inverted}
-"""What ONNX has no word for."""
+"""Operations that ONNX lacks, and what replaces them."""
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without torch's remarks on packages that are not needed, and on its own deprecations."""
+    """Suppress torch's remarks on packages that are not needed, and on its own deprecations."""
     logs = [logging.getLogger(name) for name in ("torch.onnx", "onnx_ir", "onnxscript")]
     had = [log.level for log in logs]
     for log in logs:

@@ -1,4 +1,4 @@
-"""PoseNet, the thesis's best network on images (Almanza-Medina, 3.3.2 and Table 4.1), after GeoNet (Yin and Shi, 2018)."""
+"""PoseNet, the best network on images of Almanza-Medina (3.3.2 and Table 4.1), after GeoNet (Yin and Shi, 2018)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class PoseNet(ConvolutionNetwork):
     """Nine convolutions of stride 2, a mean over 4 x 4 cells, and a fully connected layer to the estimates.
 
     It reads any size: two frames side by side (512 x 192), three (512 x 288), two sensors (512 x 384), wide frames side by
-    side (512 x 1024) or stacked (1024 x 512). The text's 3 (Q - 1) outputs are 3 for three frames too, whose motion is
-    constant. Options and errors: :class:`~mitsonar.networks.blocks.ConvolutionNetwork`.
+    side (512 x 1024) or stacked (1024 x 512). The text has 3 (Q - 1) outputs. Here three frames have 3, too, since their
+    motion is constant. Options and errors: :class:`~mitsonar.networks.blocks.ConvolutionNetwork`.
     """
 
     table: ClassVar[Table] = LAYERS

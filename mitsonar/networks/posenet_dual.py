@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from mitsonar.datasets.modality import Fields
 from mitsonar.networks.blocks import Network, SameAverage, Size, convolutions, fully_connected, glorot, scaled, values_after
 from mitsonar.networks.posenet import LAYERS
 
 __all__ = ["PoseNetDual"]
 
 VALUES = 1024
-"""Of the fully connected layer that reads both branches (ours: as many as a branch gives it)."""
+"""Values of the fully connected layer that reads both branches (ours: as many as a branch has)."""
 
 
 class PoseNetDual(Network):
-    """Two PoseNets, whose averages a fully connected layer with a ReLU (ours) brings together before the estimates.
+    """Two PoseNets whose averages are joined by a fully connected layer with a ReLU (ours) before the estimates.
 
-    Dropout stands before that layer (ours).
+    Dropout lies before that layer (ours).
 
     Args:
         outputs: estimates.
@@ -27,13 +28,13 @@ class PoseNetDual(Network):
         dropout: rate in training.
         size: rows and columns of the polar input.
         cartesian_size: rows and columns of the Cartesian input.
-        channels: of each input; the thesis's 1 has the frames side by side.
+        channels: of each input; with Almanza-Medina's 1 the frames are side by side.
 
     Raises:
         MitsonarError: a value out of its range.
     """
 
-    needs: ClassVar[dict[str, Any]] = {"coordinates": "both"}
+    needs: ClassVar[Fields] = {"coordinates": "both"}
 
     def __init__(
         self,
@@ -56,7 +57,7 @@ class PoseNetDual(Network):
         glorot(self)
 
     def forward(self, polar: Tensor, cartesian: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of the same frames as polar and as Cartesian images, grey values 0..1.
+        """Estimate labels ``(batch, outputs)`` of the same frames as polar and as Cartesian images, grey values 0..1.
 
         Args:
             polar: ``(batch, channels, rows, columns)`` of ``size``.
@@ -67,5 +68,5 @@ class PoseNetDual(Network):
         """
         self.expect(polar)
         self.expect(cartesian, "cartesian_size")
-        seen = torch.cat((self.polar(polar).flatten(1), self.cartesian(cartesian).flatten(1)), dim=1)
-        return self.regression(self.layers(self.dropout(seen)))  # type: ignore[no-any-return]
+        features = torch.cat((self.polar(polar).flatten(1), self.cartesian(cartesian).flatten(1)), dim=1)
+        return self.regression(self.layers(self.dropout(features)))  # type: ignore[no-any-return]

@@ -1,17 +1,18 @@
-"""PoseNetVec, the thesis's PoseNet for vectors, columns that stay as many as they are (Almanza-Medina, 4.3.1, Table 4.2)."""
+"""PoseNetVec: a PoseNet for vectors that keeps the number of columns (Almanza-Medina, 4.3.1 and Table 4.2)."""
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from torch import Tensor, nn
 
+from mitsonar.datasets.modality import Fields
 from mitsonar.networks.blocks import Network, SameAverage, Size, column_convolutions, glorot, scaled
 
 __all__ = ["CHANNELS", "KERNELS", "PoseNetVec"]
 
 KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3)
-"""Along the range; 2 columns across all of them."""
+"""Rows of the kernels, along the range."""
 
 CHANNELS = (32, 64, 128, 256, 512, 512, 512, 1024, 1024)
 
@@ -22,9 +23,9 @@ ACROSS = 2
 class PoseNetVec(Network):
     """Nine convolutions of stride 2 along the range and 1 across, a mean over 4 x 4 cells, a fully connected layer.
 
-    It reads vectors side by side, two of each portion of the field of view: 512 x 2 of the whole, 512 x 8 of four quadrants;
-    or one vector, whose height it says (Table 4.4). Dropout stands before the fully connected layer (where, the text does
-    not say: ours, as in PoseNet).
+    It reads vectors side by side, two of each portion of the field of view: 512 x 2 of the whole, 512 x 8 of four quadrants.
+    From one vector it estimates the height (Table 4.4). Dropout lies before the fully connected layer (ours, as in PoseNet;
+    the text gives no position).
 
     Args:
         outputs: estimates.
@@ -37,7 +38,7 @@ class PoseNetVec(Network):
         MitsonarError: a value out of its range.
     """
 
-    needs: ClassVar[dict[str, Any]] = {"kind": "vector"}
+    needs: ClassVar[Fields] = {"kind": "vector"}
 
     def __init__(
         self, *, outputs: int = 3, width: float = 1.0, dropout: float = 0.5, size: Size = (512, 8), channels: int = 1
@@ -53,7 +54,7 @@ class PoseNetVec(Network):
         glorot(self)
 
     def forward(self, vectors: Tensor) -> Tensor:
-        """Labels ``(batch, outputs)`` of vectors ``(batch, channels, levels, columns)``.
+        """Estimate labels ``(batch, outputs)`` of vectors ``(batch, channels, levels, columns)``.
 
         Raises:
             MitsonarError: vectors of another size.

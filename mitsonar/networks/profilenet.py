@@ -1,32 +1,33 @@
-"""ProfileNet, ours for vectors: what moves between the range profiles of a few portions of the field of view.
+"""ProfileNet (ours): motion from the shifts between range profiles of a few portions of the field of view.
 
-A vector is the range profile of a portion. Ground that comes nearer by a part of a range level hands so much of each
-level's echo to the one before it, so that products of both profiles at neighbouring lags tell the shift, which grows with
-the sine of incidence along the profile. The network takes such products of filtered profiles, averages them over windows of
-range, and a few layers weigh what all portions say.
+A vector is the range profile of a portion. If the ground comes nearer by a part of a range level, that part of each level's
+echo moves to the level before it. So products of both profiles at neighbouring lags measure the shift, which grows with the
+sine of incidence along the profile. The network computes such products of filtered profiles and averages them over windows
+of range. A few layers combine those of all portions.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError
 from mitsonar.networks.blocks import Network, Size
 
 __all__ = ["ProfileNet"]
 
 FAINT = 1e-4
-"""Variance of a level below which it does not count, in squares of the mean of all levels."""
+"""Variance of a level below which it is ignored, in squares of the mean of all levels."""
 
 QUIET = 1e-2
-"""Power of filtered profiles below which products do not count, in variances of a level."""
+"""Power of filtered profiles below which products are ignored, in variances of a level."""
 
 SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] = {
-    # quadrants from fore-starboard clockwise: as they are, mirrored sideways, fore and aft, both
+    # quadrants from fore-starboard clockwise: unchanged, mirrored sideways, fore and aft, both
     4: [
         ((0, 1, 2, 3), (1, 1, 1)),
         ((3, 2, 1, 0), (-1, 1, -1)),
@@ -37,16 +38,16 @@ SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] 
     2: [((0, 1), (1, 1, 1)), ((1, 0), (-1, 1, -1))],
     1: [((0,), (1, 1, 1))],
 }
-"""By number of portions: their order in a mirrored world, and what becomes of sideways, forward, yaw."""
+"""By number of portions: their order in a mirrored world, and the signs of sideways, forward and yaw there."""
 
 
 class ProfileNet(Network):
     """Products of filtered profiles at a few lags, averaged over windows of range, through a small perceptron.
 
-    The answer turns with the world by construction: it is the mean over mirrored portions and over both directions of time,
-    each with its motion turned back (along the heading between both pings, which differs from the last heading by half the
-    yaw: 0.1 mm at most). Portions are four (quadrants or circular segments, from fore-starboard clockwise), two halves (port
-    first), or one.
+    The estimate has the symmetries of the world by construction. It is the mean over mirrored portions and over both
+    directions of time, each with its motion mirrored back. This holds along the heading between both pings, which differs
+    from the last heading by half the yaw, or 0.1 mm at most. There are four portions (quadrants or
+    circular segments, from fore-starboard clockwise), two (halves, port first), or one.
 
     Args:
         outputs: estimates: sideways, forward, yaw.
@@ -62,7 +63,7 @@ class ProfileNet(Network):
         MitsonarError: a value out of its range.
     """
 
-    needs: ClassVar[dict[str, Any]] = {"kind": "vector", "frames": 2, "layout": "side"}
+    needs: ClassVar[Fields] = {"kind": "vector", "frames": 2, "layout": "side"}
     order: Tensor
     turned: Tensor
 
@@ -82,7 +83,7 @@ class ProfileNet(Network):
         levels, columns = self.options["size"]
         if columns % 2 or columns // 2 not in SYMMETRIES or outputs != 3:
             raise MitsonarError(
-                "profilenet says sideways, forward and yaw of two vectors of each of one, two or four portions: got "
+                "profilenet estimates sideways, forward and yaw from two vectors of each of one, two or four portions: got "
                 f"{columns} columns and {outputs} outputs; choose views, or posenetvec"
             )
         for name, value, least in (("filters", filters, 1), ("taps", taps, 1), ("lags", lags, 1), ("windows", windows, 1)):
@@ -92,12 +93,12 @@ class ProfileNet(Network):
             raise MitsonarError(f"windows must be at most the {levels} levels: got {windows}")
         self.options |= {"filters": filters, "taps": taps, "lags": lags, "windows": windows}
         self.portions, self.lags, self.windows = columns // 2, lags, windows
-        made, said, hidden = (max(1, round(n * width)) for n in (filters, 48, 128))
+        made, shifts, hidden = (max(1, round(n * width)) for n in (filters, 48, 128))
         self.level = nn.BatchNorm1d(levels, eps=FAINT, affine=False)
         self.filter = nn.Conv1d(1, made, taps, padding=taps // 2, bias=False)
-        self.shift = nn.Linear(made * (2 * lags + 1) * windows, said)
-        self.change = nn.Linear(made * windows, max(1, said // 3))
-        values = self.portions * (said + max(1, said // 3))
+        self.shift = nn.Linear(made * (2 * lags + 1) * windows, shifts)
+        self.change = nn.Linear(made * windows, max(1, shifts // 3))
+        values = self.portions * (shifts + max(1, shifts // 3))
         self.layers = nn.Sequential(
             *(nn.Dropout(dropout), nn.Linear(values, hidden), nn.GELU()),
             *(nn.Dropout(dropout), nn.Linear(hidden, hidden), nn.GELU()),
@@ -108,7 +109,7 @@ class ProfileNet(Network):
         self.register_buffer("turned", torch.tensor([signs for _, signs in symmetries]), persistent=False)
 
     def forward(self, vectors: Tensor) -> Tensor:
-        """Labels ``(batch, 3)``, symmetric about no motion, of vectors ``(batch, 1, levels, 2 portions)``.
+        """Estimate labels ``(batch, 3)``, symmetric about no motion, of vectors ``(batch, 1, levels, 2 portions)``.
 
         Raises:
             MitsonarError: vectors of another size.
@@ -119,18 +120,20 @@ class ProfileNet(Network):
         mean = (power[0] + power[1]) / 2 + QUIET
         shared = self._products(first, second) / mean[..., None]
         gained = (power[0] - power[1]) / mean
-        # backwards in time lags change their sign, and so does what was gained
+        # backwards in time lags and gains change their sign
         both = [
             torch.cat([self.shift(s.flatten(2)), self.change(g.flatten(2))], dim=-1)
             for s, g in ((shared, gained), (shared.flip(-1), -gained))
         ]
-        told = torch.stack(both, dim=1)[:, :, self.order].flatten(3)  # batch, time, mirror, portions and values
-        answers = self.layers(told) * self.turned
+        features = torch.stack(both, dim=1)[:, :, self.order].flatten(3)  # batch, time, mirror, portions and values
+        answers = self.layers(features) * self.turned
         return (answers[:, 0] - answers[:, 1]).mean(dim=1) / 2  # type: ignore[no-any-return]
 
     def _filtered(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations. All are
-        divided by their mean before: a sonar's gain says nothing."""
+        """Filter the profiles of both pings ``(batch, portions, filters, levels)``, each level in its standard deviations.
+
+        They are first divided by their mean, which removes the sonar's gain.
+        """
         batch, _, levels, columns = vectors.shape
         vectors = vectors / vectors.mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-12)
         profiles = vectors[:, 0].transpose(1, 2).reshape(batch * columns, levels)
@@ -140,10 +143,10 @@ class ProfileNet(Network):
         return parts[:, :, 0], parts[:, :, 1]
 
     def _products(self, first: Tensor, second: Tensor) -> Tensor:
-        """Products at all lags, averaged over windows ``(batch, portions, filters, windows, lags)``.
+        """Compute products at all lags, averaged over windows ``(batch, portions, filters, windows, lags)``.
 
-        Of two lags that differ in sign the farther of both levels is once the second's, once the first's: backwards in time
-        they change places.
+        At a positive lag the farther level is that of the second profile, at a negative lag that of the first. Backwards in
+        time both are exchanged.
         """
         levels = first.shape[-1]
         early, late = (functional.pad(one, (0, self.lags)) for one in (first, second))
@@ -152,5 +155,5 @@ class ProfileNet(Network):
         return torch.stack([self._windowed(product) for product in products], dim=-1)
 
     def _windowed(self, values: Tensor) -> Tensor:
-        """Means over windows ``(..., windows)``."""
+        """Average over windows ``(..., windows)``."""
         return values.reshape(*values.shape[:-1], self.windows, -1).mean(dim=-1)

@@ -1,4 +1,4 @@
-"""SfMNet: the part of SfM-Net that sees the camera's motion (Almanza-Medina, 3.3.1; Vijayanarasimhan et al., 2017)."""
+"""SfMNet: the part of SfM-Net that estimates the camera's motion (Almanza-Medina, 3.3.1; Vijayanarasimhan et al., 2017)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KERNELS = (7, 5, 3, 3, 3, 3, 3, 3, 3, 3)
 CHANNELS = (32, 64, 128, 128, 256, 256, 512, 512, 1024, 1024)
 STRIDES = (4, 3, 3, 2, 1, 2, 1, 2, 1, 2)
 LAYERS: Table = tuple(zip(KERNELS, CHANNELS, STRIDES, strict=True))
-"""The channels are SfM-Net's, 32 and then twice 64 to 1024, less its second layer of 64, as the text says."""
+"""The channels are those of SfM-Net without its second layer of 64: 32, then twice 64 to 1024, as in the text."""
 
 
 class SfMNet(ConvolutionNetwork):

@@ -1,4 +1,4 @@
-"""Trained networks that come with mitsonar; torch is not needed to know their names."""
+"""Trained networks that come with mitsonar. Their names can be read without torch."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 __all__ = ["SHIPPED", "shipped_path"]
 
 SHIPPED = ("corrnet",)
-"""Their names; the recipe of the same name says how each was trained."""
+"""Their names. The recipe of the same name defines how each was trained."""
 
 
 def shipped_path(name: str) -> Path:
-    """The checkpoint of that name."""
+    """Return the path of the checkpoint of that name."""
     return Path(str(files("mitsonar.networks"))) / "weights" / f"{name}.ckpt"

@@ -1,11 +1,11 @@
-"""What is left of a motion, from the differences of two frames along their slopes, as `direct` takes it, but with filters
-and weights that were learnt.
+"""The rest of a motion, from the differences of two frames along their slopes, as `direct` does, but with learnt filters.
 
-What tells most is as fine as a beam, in both directions: neither slopes nor the second frame, when it is drawn between its
-cells, may be smoothed. So slopes are differences of fourth order, and the second frame is made twice as fine before.
+The most informative detail is as fine as a beam, in both directions. So neither the slopes nor the second frame may be
+smoothed when it is sampled between its cells. Slopes are differences of fourth order, and the second frame is first
+interpolated to twice its resolution.
 
-Noise lengthens slopes and makes steps too short: slopes of one frame times those of the other tell by how much, since their
-noise is not the same.
+Noise lengthens slopes and makes steps too short. Products of the slopes of both frames measure by how much, since their
+noise is independent.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from mitsonar.networks.warp_grid import WarpGrid
 __all__ = ["STEP", "SlopeStep", "Slopes"]
 
 STEP = 2
-"""Bins of a cell; a cell is one beam wide."""
+"""Bins of a cell. A cell is one beam wide."""
 
 TOGETHER = (4, 2)
-"""Cells along range and beams that are judged together."""
+"""Cells along range and beams that share their weights."""
 
 HALFWAY = (0.0243, -0.1351, 0.6079, 0.6079, -0.1351, 0.0243)
-"""Lanczos' weights of six cells for what lies in their middle (three lobes); training changes them."""
+"""Lanczos weights (three lobes) of six cells for the value in their middle. Training changes them."""
 
 LONGEST = 8.0
-"""Units that a step may be long; it begins near the end."""
+"""Longest step, in units. It starts close to the result."""
 
 LEAST_TRUE = 0.2
-"""Of the square of slopes that is not noise: a step is lengthened by five times at most."""
+"""Smallest part of the slopes' square that is not noise: a step is lengthened by a factor of at most five."""
 
 
 class SlopeStep(NamedTuple):
-    """What a look has found out that the next one may keep.
+    """Slopes and weights of an iteration, which the next one may keep.
 
     Attributes:
         down: slopes along range times their weight ``(batch, filters, rows, columns)``.
@@ -55,17 +55,17 @@ class SlopeStep(NamedTuple):
 
 
 class Slopes(nn.Module):
-    """Gauss-Newton on filtered frames.
+    """Gauss-Newton steps on filtered frames.
 
     Args:
         filters: number of filtered frames.
-        hidden: channels of the layers that judge.
+        hidden: channels of the layers that compute weights.
     """
 
     def __init__(self, filters: int, hidden: int) -> None:
         super().__init__()
         levels = max(2, round(filters * 2 / 3))
-        self.filter = channels_last(  # levels first: noise that only adds tells most by what is faint
+        self.filter = channels_last(  # levels first: additive noise leaves most information in faint levels
             nn.Conv2d(1, levels, 1),
             nn.ReLU(),
             nn.Conv2d(levels, filters, (6, 5), stride=(STEP, 1), padding=(2, 2), bias=False),
@@ -83,8 +83,11 @@ class Slopes(nn.Module):
         self.scale = nn.Parameter(torch.tensor(0.0))
 
     def prepared(self, first: Tensor, second: Tensor) -> Pair:
-        """The first filtered frame, the second one twice as fine, and the slopes of the first
-        ``(batch, filters, rows, columns)``."""
+        """Prepare filtered frames ``(batch, filters, rows, columns)``.
+
+        Returns:
+            The first frame, the second one at twice the resolution, and both slopes of the first.
+        """
         first = first.contiguous()
         finer = _doubled(_doubled(second.contiguous(), self.across, 3), self.along, 2)
         return first, finer, _slope(first, 2), _slope(first, 3)
@@ -92,13 +95,16 @@ class Slopes(nn.Module):
     def forward(
         self, frames: Pair, warp_grid: WarpGrid, motion: Tensor, judged: SlopeStep | None = None
     ) -> tuple[Tensor, Tensor, SlopeStep]:
-        """A better motion ``(batch, 3)`` in units, the normal matrix ``(batch, 3, 3)`` behind it, and what was judged.
+        """Refine a motion by one step.
 
         Args:
             frames: of :meth:`prepared`.
-            look: where these cells are.
-            motion: found so far.
-            judged: of a look nearby, to be kept.
+            warp_grid: of these cells.
+            motion: the estimate so far ``(batch, 3)``, in units.
+            judged: slopes and weights of an earlier iteration, to be kept; default: they are computed.
+
+        Returns:
+            The motion ``(batch, 3)`` in units, its normal matrix ``(batch, 3, 3)``, and the slopes and weights.
         """
         first = frames[0]
         second, inside = warp_grid.draw(frames[1], motion)
@@ -111,7 +117,7 @@ class Slopes(nn.Module):
         return motion + step, normal * judged.true[..., None] * torch.exp(self.scale), judged
 
     def _judged(self, frames: Pair, second: Tensor, residual: Tensor, inside: Tensor) -> SlopeStep:
-        """Slopes and weights, from what both frames show where they are now."""
+        """Compute slopes and weights from both frames at the present motion."""
         first, own = frames[0], frames[2:]
         others = _slope(second, 2), _slope(second, 3)
         weight = self._weight(first, second, residual) * inside[:, None]
@@ -124,7 +130,7 @@ class Slopes(nn.Module):
         return SlopeStep(by_down, by_aside, information, true.clamp(LEAST_TRUE, 1.0)[:, None])
 
     def _weight(self, first: Tensor, second: Tensor, residual: Tensor) -> Tensor:
-        """Of each cell and filter, from what both frames have in common there."""
+        """Compute the weight of each cell and filter from what both frames have in common there."""
         apart, mean = _together(residual.square()), _together((first + second).square()) / 4
         powers = torch.cat([apart, mean, (mean - apart / 4).abs()], dim=1)  # the last: of first times second
         weight = functional.softplus(self.judge(torch.log(powers + 1e-3)))
@@ -132,7 +138,7 @@ class Slopes(nn.Module):
 
 
 def _doubled(frame: Tensor, weights: Tensor, axis: int) -> Tensor:
-    """With what lies between the cells along an axis, 2 (range) or 3 (beams): ``2 n - 1`` of them."""
+    """Interpolate between the cells along an axis, 2 (range) or 3 (beams): ``n`` cells become ``2 n - 1``."""
     last = frame.shape[axis] - 1
     between = functional.conv2d(_wide(frame, axis), weights, groups=frame.shape[1])
     pairs = torch.stack([frame.narrow(axis, 0, last), between], dim=axis + 1).flatten(axis, axis + 1)
@@ -140,20 +146,20 @@ def _doubled(frame: Tensor, weights: Tensor, axis: int) -> Tensor:
 
 
 def _slope(frame: Tensor, axis: int) -> Tensor:
-    """By cell along an axis, to fourth order."""
+    """Compute the slope by cell along an axis, to fourth order."""
     count, wide = frame.shape[axis], _wide(frame, axis)
     near, far = (wide.narrow(axis, 2 + k, count) - wide.narrow(axis, 2 - k, count) for k in (1, 2))
     return (2 / 3) * near - (1 / 12) * far
 
 
 def _wide(frame: Tensor, axis: int) -> Tensor:
-    """With two more cells at both ends of an axis."""
+    """Pad two cells at both ends of an axis."""
     return functional.pad(frame, (2, 2, 0, 0) if axis == 3 else (0, 0, 2, 2), mode="replicate")
 
 
 def _together(values: Tensor) -> Tensor:
-    """Means of the cells that are judged together."""
+    """Average the cells that share their weights."""
     rows, columns = (length // count for length, count in zip(values.shape[-2:], TOGETHER, strict=True))
     values = values[:, :, : rows * TOGETHER[0], : columns * TOGETHER[1]]
-    by_row = values.unflatten(2, (rows, TOGETHER[0])).sum(dim=3)
+    by_row = values.unflatten(2, (rows, TOGETHER[0])).sum(dim=3)  # type: ignore[no-untyped-call]  # torch gives no types
     return sum(by_row[..., k :: TOGETHER[1]] for k in range(TOGETHER[1])) / math.prod(TOGETHER)  # type: ignore[no-any-return]

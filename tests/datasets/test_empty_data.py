@@ -1,16 +1,15 @@
-"""Data sets whose sonar looks past the scene: refused where that can be known, else warned of and found by the check."""
+"""Data sets whose sonar points past the scene: refused where that can be known, else warned of and found by the check."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from helpers import HEARD, TINY, Command, refused, tiny_recipe
 
-from mitsonar.config.data_recipe import load_recipe, recipe_from
+from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import Scene
@@ -34,11 +33,12 @@ def scene_file(folder: Path, half: float, *far: float) -> Path:
     return path
 
 
-def own_scene(path: Path, size_m: float, **changes: Any) -> Any:
+def own_scene(path: Path, size_m: float, **changes: object) -> Recipe:
     """The tiny recipe in a scene of one's own, twelve frames in two sequences."""
     world = {"family": "scene", "file": str(path), "size_m": size_m}
     flight = {**TINY.get("flight", {}), "pings": 6, "jump_m": None}
-    return tiny_recipe(world=world, scenes=[{"count": 1, "sequences": 4}], flight=flight, **changes)
+    recipe: Recipe = tiny_recipe(world=world, scenes=[{"count": 1, "sequences": 4}], flight=flight, **changes)
+    return recipe
 
 
 @pytest.mark.parametrize("gain", [None, 3.0])

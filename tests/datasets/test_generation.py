@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import uuid
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -383,12 +384,14 @@ def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
 def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(made: Path, tmp_path: Path) -> None:
     """A scheduler by its address; one of its workers is killed while it renders, and nothing is lost."""
     environment = {**os.environ, "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "spawn"}
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment, "cwd": tmp_path}
+
+    def started(command: list[str]) -> subprocess.Popen[bytes]:
+        quiet = subprocess.DEVNULL
+        return subprocess.Popen(command, stdout=quiet, stderr=quiet, env=environment, cwd=tmp_path)
+
     dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     place = tmp_path / "scheduler.json"
-    scheduler = subprocess.Popen(
-        [*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)], **quiet
-    )
+    scheduler = started([*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(place)])
     workers: list[subprocess.Popen[bytes]] = []
     try:
         address = _written(place, 90)["address"]
@@ -402,7 +405,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
             "--no-dashboard",
             "--no-nanny",
         ]
-        workers = [subprocess.Popen(worker, **quiet) for _ in range(2)]
+        workers = [started(worker) for _ in range(2)]
         making = subprocess.Popen(
             [*PROGRAM, *command(tmp_path, "--scheduler", address)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -417,7 +420,7 @@ def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(m
     assert files_of(tmp_path / "tiny.zarr") == files_of(made)
 
 
-def _written(path: Path, seconds: float) -> dict[str, Any]:
+def _written(path: Path, seconds: float) -> dict[str, str]:
     """What another process writes as JSON, once it has written all of it: the file is there before its content."""
     deadline = time.monotonic() + seconds
     while True:
@@ -444,7 +447,7 @@ def test_a_file_that_is_still_being_written_is_waited_for(tmp_path: Path) -> Non
         _written(tmp_path / "never.json", 0.1)
 
 
-def _wait(until: Any, seconds: float) -> None:
+def _wait(until: Callable[[], bool], seconds: float) -> None:
     deadline = time.monotonic() + seconds
     while not until():
         assert time.monotonic() < deadline, "nothing came in time"
@@ -460,7 +463,7 @@ def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pyte
 @pytest.mark.thorough
 @pytest.mark.e2e
 def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: Path, tmp_path: Path) -> None:
-    """kill -9, whatever it is doing; then the same command again, until it gets through."""
+    """kill -9, whatever it is doing; then the same command is repeated until it finishes."""
     rng = np.random.default_rng(int(os.environ.get("MITSONAR_KILL_SEED", "1")))
     arguments, url = command(tmp_path, "--workers", 1), tmp_path / "tiny.zarr"
     kept: list[dict[str, float]] = []
@@ -480,7 +483,7 @@ def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: 
 
 
 def test_stopped_between_the_last_file_and_its_seal(made: Path, tmp_path: Path) -> None:
-    """What is whole is kept and sealed, not made again; what is half there is made again, and its remains are gone."""
+    """Whole shards are kept and sealed, and not remade. Partial shards are remade, and their remains are removed."""
     url = copy_of(made, tmp_path)
     store = DataStore.open(url)
     (url / store.group["seal"].metadata.encode_chunk_key((0, 0, 0))).with_name("x")  # type: ignore[union-attr]
@@ -747,7 +750,7 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
 
 
 def test_object_storage_holds_the_bytes_of_a_folder(made: Path, bucket: str) -> None:
-    """Made there; a shard that is cut short is found and made again; read from there."""
+    """Made there; a shard that is cut short is found and remade; read from there."""
     url = f"{bucket}/data/tiny.zarr"
     make_dataset(tiny_recipe(), url)
     store, place = DataStore.open(url), Storage(url)

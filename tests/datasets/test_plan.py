@@ -82,7 +82,7 @@ def test_no_footprint_leaves_its_scene(name: str, sequences: int) -> None:
 
 
 def test_footprint_of_a_level_floor() -> None:
-    """Its corners in closed form; SPEC.md, section 2: edge beams meet the floor at up to 5.54 m."""
+    """Its corners in closed form; edge beams meet the floor at up to 5.54 m."""
     sonar, height, pitch = load_recipe("rocky-field").instrument, 2.5, np.radians(35)
     reach = footprint(sonar, Pose(0, 0, 0, pitch), height)
     slant = np.sort(np.hypot(np.hypot(*reach.T), height))
@@ -142,7 +142,8 @@ def test_runs_over_the_pattern() -> None:
     legs, diagonal, turn = (run_poses(name, 2.5) for name in ("legs", "diagonal", "turn"))
     assert (len(legs), len(diagonal), len(turn)) == (950, 300, 300)
     ends = legs[[0, 249, 349, 599, 699, 949], :2]
-    np.testing.assert_allclose(np.diff(ends, axis=0), [[5, 0], [0, 1.2], [-5, 0], [0, 1.1], [5, 0]], atol=1e-9)
+    wanted = np.array([[5, 0], [0, 1.2], [-5, 0], [0, 1.1], [5, 0]])
+    np.testing.assert_allclose(np.diff(ends, axis=0), wanted, atol=1e-9)
     steps = np.linalg.norm(np.diff(legs[:, :2], axis=0), axis=1)
     assert steps.max() < 0.0202
     np.testing.assert_allclose(diagonal[-1] - diagonal[0], [5, 2.3, 0, 0, 0, 0], atol=1e-9)
@@ -151,7 +152,7 @@ def test_runs_over_the_pattern() -> None:
 
 
 def test_mounted_sonars_keep_the_vehicle_s_motion() -> None:
-    """Two sensors look to starboard: the sonar's pose turns by 90 deg, the label stays the vehicle's."""
+    """Two sensors point to starboard: the sonar's pose turns by 90 deg, the label stays the vehicle's."""
     recipe = load_recipe("rocky-field-two-sensors")
     plan = Plan.of(recipe, 10)
     np.testing.assert_allclose(plan.poses, mounted(plan.vehicle, recipe.mount.pose), atol=1e-12)

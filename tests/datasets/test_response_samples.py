@@ -1,4 +1,4 @@
-"""Data sets of impulse responses: what is stored is what is heard, what is read is 5.2.5, and both can be learnt from."""
+"""Data sets of impulse responses: they hold what is simulated, and samples are those of Almanza-Medina, 5.2.5."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def straight(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
 
 
 def test_responses_are_what_the_simulator_hears(made: Path, tmp_path: Path) -> None:
-    """Two routes: each scene built, loaded and heard here, ping by ping."""
+    """Two routes: each scene is built, loaded and simulated here, ping by ping."""
     from mitsonar.simulation.channel import ChannelSimulator
 
     store, recipe = DataStore.open(made), impulse_recipe()
@@ -119,7 +119,7 @@ def test_receivers_that_hear_nothing_and_echoes_from_too_far_are_told(tmp_path: 
         split={"by": "sequence"},
     )
     said = " ".join(make_dataset(recipe, str(tmp_path / "data.zarr")).warnings)
-    assert "receiver up hears nothing in 3 of 3 pings" in said
+    assert "receiver up records no echo in 3 of 3 pings" in said
     assert re.search(r"came from beyond range_max 4\.5 m", said)
 
 
@@ -247,9 +247,9 @@ def test_recipes_are_the_rows_of_the_table() -> None:
     ],
 )
 def test_mistakes_in_recipes_are_one_sentence(changes: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(MitsonarError, match=re.escape(sentence)) as told:
+    with pytest.raises(MitsonarError, match=re.escape(sentence)) as error:
         impulse_recipe(**changes)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
 
 
 # ---------------------------------------------------------------- reading
@@ -278,6 +278,7 @@ def test_samples_are_the_stored_pings(made: Path) -> None:
         received = samples.responses(index)
         np.testing.assert_array_equal(received.response, stored)
         np.testing.assert_array_equal(samples.matrix(index), packed(stored))
+        assert received.poses is not None
         np.testing.assert_allclose(samples.target(index), motions(received.poses[[0, -1]])[0])
         np.testing.assert_allclose(received.time_s, [0, 0.025, 0.05])
         assert received.velocity is not None
@@ -306,7 +307,7 @@ def test_no_world_is_in_two_parts(made: Path) -> None:
 
 
 def test_noise_has_the_ratio_that_is_said() -> None:
-    """White, complex, as strong in every ping, receiver and tap; the signal is where sound is heard."""
+    """White, complex, as strong in every ping, receiver and tap; the signal lies between 1 % and 99 % of the energy."""
     rng = np.random.default_rng(3)
     response = np.zeros((2, 3, 4000), np.complex64)
     response[..., 1000:2000] = (rng.normal(size=(2, 3, 1000)) + 1j * rng.normal(size=(2, 3, 1000))) * 3
@@ -400,7 +401,7 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
 
 
 def test_regressors_are_those_of_the_table() -> None:
-    """Table 5.4; a linear law is found by the linear ones, and by all better than by no answer."""
+    """Table 5.4; a linear relation is found by the linear ones, and by all better than by no answer."""
     assert len(REGRESSORS) == 10
     rng = np.random.default_rng(5)
     features = rng.normal(size=(260, 6)).astype(np.float32)

@@ -64,7 +64,7 @@ def test_a_sample_is_consecutive_frames_and_the_motion_between_them(made: Path) 
         east, north = there.x - here.x, there.y - here.y
         sin, cos = np.sin(there.heading), np.cos(there.heading)
         wanted = [east * cos - north * sin, east * sin + north * cos, there.heading - here.heading]
-        np.testing.assert_allclose(label, np.float32(wanted), atol=1e-8)
+        np.testing.assert_allclose(label, np.array(wanted, dtype=np.float32), atol=1e-8)
 
 
 def test_three_frames_have_the_mean_motion_and_one_its_height(made: Path) -> None:
@@ -92,7 +92,7 @@ def test_samples_never_cross_from_one_sequence_to_the_next(made: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["numpy", "torch"])
 @pytest.mark.parametrize("frames", [2, 3])
-def test_shapes_of_the_thesis(frames: int, kind: str) -> None:
+def test_shapes_of_almanza_medina(frames: int, kind: str) -> None:
     """Two frames side by side are 512 x 192."""
     recipe = load_recipe("rocky-field")
     pixels = np.random.default_rng(0).integers(0, 256, (4, frames, 512, 96), dtype=np.uint8)
@@ -100,7 +100,7 @@ def test_shapes_of_the_thesis(frames: int, kind: str) -> None:
     batch, order = (pixels, numbers) if kind == "numpy" else (torch.as_tensor(pixels), torch.as_tensor(numbers))
     (view,) = recipe.views
 
-    def shape(**words: Any) -> Any:
+    def shape(**words: Any) -> tuple[Any, ...]:
         made = arrangement_of(recipe, **words)({view.name: batch}, order, 0)
         return tuple(part.shape for part in made) if isinstance(made, tuple) else tuple(made.shape)
 
@@ -163,7 +163,7 @@ def test_noise_on_stored_images_is_that_of_the_model(made: Path) -> None:
 
 
 def test_vectors_of_a_store_are_its_images_summed(portions: Path) -> None:
-    """Stored as sums, or summed when read; noise of both has the same law."""
+    """Stored as sums, or summed when read; noise of both has the same distribution."""
     stored = SonarPairs(portions, part="all", kind="vector", layout="channels")
     images = SonarPairs(portions, part="all", kind="image", layout="channels")
     for index in (0, 13):

@@ -19,6 +19,7 @@ from mitsonar.errors import MitsonarError
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = pytest.mark.learn
 
+
 from mitsonar.datasets.torch_pairs import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import FILE, Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
@@ -35,8 +36,8 @@ def test_what_is_saved_comes_back(checkpoint: Checkpoint, tmp_path: Path) -> Non
     checkpoint.save(tmp_path / FILE)
     state = torch.get_rng_state()
     for found in (Checkpoint.load(tmp_path), Checkpoint.load(tmp_path / FILE)):
-        told = {one.name: getattr(found, one.name) for one in dataclasses.fields(found) if one.name != "weights"}
-        assert told == {name: getattr(checkpoint, name) for name in told}
+        kept = {one.name: getattr(found, one.name) for one in dataclasses.fields(found) if one.name != "weights"}
+        assert kept == {name: getattr(checkpoint, name) for name in kept}
         image = torch.rand(2, 1, 40, 24, generator=torch.Generator().manual_seed(1))
         assert torch.equal(found.build()(image), network(image))
         assert found.digest == checkpoint.digest
@@ -83,18 +84,20 @@ def test_it_says_what_it_was_trained_on(checkpoint: Checkpoint) -> None:
 
 
 def test_answers_become_motions(checkpoint: Checkpoint) -> None:
-    """Labels of +-10 are the limits of the flight; laws are in SI already; errors in validation stand for a covariance."""
-    motions, law = checkpoint.decode(torch.tensor([[10.0, -10.0, 5.0]]))
+    """Labels of +-10 are the limits of the flight; distributions are in SI; errors in validation give a covariance."""
+    motions, spread = checkpoint.decode(torch.tensor([[10.0, -10.0, 5.0]]))
     assert np.allclose(motions, [[0.02, -0.02, np.radians(0.225)]])
-    assert law is None
+    assert spread is None
     said = GaussianHead(torch.full((2, 3), 0.25), torch.eye(3).expand(2, 3, 3))
-    motions, law = checkpoint.decode(said)
+    motions, spread = checkpoint.decode(said)
     assert motions.shape == (2, 3)
-    assert law is not None
-    assert (law == np.eye(3)).all()
+    assert spread is not None
+    assert (spread == np.eye(3)).all()
     # the noise of training was not validated: the mean over the levels that were
     wanted = np.diag([(3e-3**2 + 6e-3**2) / 2, 2e-3**2, np.radians(1) ** 2 * (0.1**2 + 0.2**2) / 2])
-    assert np.allclose(checkpoint.covariance, wanted, rtol=1e-12, atol=0)
+    covariance = checkpoint.covariance
+    assert covariance is not None
+    assert np.allclose(covariance, wanted, rtol=1e-12, atol=0)
     at_home = dataclasses.replace(checkpoint, noise="high").covariance
     assert at_home is not None
     assert np.allclose(np.sqrt(np.diag(at_home)), [6e-3, 2e-3, np.radians(0.2)])
@@ -115,7 +118,7 @@ def test_only_our_networks_and_plain_values(checkpoint: Checkpoint) -> None:
 # ---------------------------------------------------------------- hostile files
 
 
-def packed(table: Any) -> bytes:
+def packed(table: object) -> bytes:
     buffer = io.BytesIO()
     torch.save(table, buffer)
     return buffer.getvalue()
@@ -137,7 +140,7 @@ class Evil:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, (str(self.path),)
 
 
@@ -185,13 +188,13 @@ def test_a_later_format_is_named(checkpoint: Checkpoint) -> None:
     ("change", "words"),
     [
         ({"trained_at": None}, "trained_at is not a table"),
-        ({"trained_at": {"height_m": [1.0], "pitch_deg": 0, "roll_deg": 0}}, "stands must hold height_m"),
+        ({"trained_at": {"height_m": [1.0], "pitch_deg": 0, "roll_deg": 0}}, "trained_at must hold height_m"),
         ({"network": 3}, "network is not a text"),
         ({"more": 1}, "'more' is unknown"),
         ({"weights": {"a": [1, 2]}}, "weights a are not numbers"),
         ({"weights": {"a": torch.tensor([1.0, float("nan")])}}, "nan or inf"),
         ({"options": {1: 2}}, "options is not a table"),
-        ({"arrangement": {"frames": 2}}, "arrangement views is not said"),
+        ({"arrangement": {"frames": 2}}, "arrangement views is missing or of another type"),
         ({"labels": {"kind": "octal"}}, "'octal', not one of raw, quantised, normx10"),
         ({"labels": {"kind": "raw", "low": [0], "high": [1], "names": []}}, "no names"),
         ({"labels": {"kind": "raw", "low": [0], "high": [float("inf")], "names": ["a"]}}, "limits of the labels"),
@@ -226,5 +229,5 @@ def test_files_of_before_vectors_had_words_are_read(checkpoint: Checkpoint) -> N
     older = Checkpoint.from_bytes(dataclasses.replace(checkpoint, arrangement=words).to_bytes())
     assert older.arrangement == words
     wrong = dataclasses.replace(checkpoint, arrangement={**words, "halves": 3})
-    with pytest.raises(MitsonarError, match="arrangement halves is not said"):
+    with pytest.raises(MitsonarError, match="arrangement halves is missing or of another type"):
         Checkpoint.from_bytes(wrong.to_bytes())

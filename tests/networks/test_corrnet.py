@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mitsonar.datasets.ground_nodes import NODES, ground_at
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.instruments.imaging_sonar import Bearing
 from mitsonar.motion.composition import Motion, compose, inverse
 from mitsonar.motion.pose import Pose
 from mitsonar.networks import create_network
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 torch = pytest.importorskip("torch")
 corrnet = pytest.importorskip("mitsonar.networks.corrnet")
 warp_grid = pytest.importorskip("mitsonar.networks.warp_grid")
 matching = pytest.importorskip("mitsonar.networks.matching")
 slopes = pytest.importorskip("mitsonar.networks.slopes")
-law = pytest.importorskip("mitsonar.networks.gaussian_head")
+head = pytest.importorskip("mitsonar.networks.gaussian_head")
 augment = pytest.importorskip("mitsonar.training.augment")
 
 pytestmark = pytest.mark.learn
@@ -28,42 +35,43 @@ STAND = {"height_m": 2.5, "pitch_rad": np.radians(35), "roll_rad": 0.02}
 MOTION = np.array([0.02, -0.012, np.radians(0.45)])
 
 
-def batch(bearing: str = "azimuth", scale: float = 1.0, count: int = 1) -> dict[str, torch.Tensor]:
+def batch(bearing: Bearing = "azimuth", scale: float = 1.0, count: int = 1) -> dict[str, Tensor]:
     """Geometry of the sonar of these tests, the whole scene scaled."""
     stand = STAND | {"height_m": scale * STAND["height_m"]}
     table = ground_at(scale * RANGE, BEARING, bearing, **stand)
     return {name: torch.from_numpy(np.stack([values] * count)) for name, values in table.items()}
 
 
-def texture(points: np.ndarray, seed: int = 3) -> np.ndarray:
+def texture(points: NDArray[np.float64], seed: int = 3) -> NDArray[np.float64]:
     """A floor of waves of 6 to 60 cm; smooth, so that frames hold no aliases."""
     rng = np.random.default_rng(seed)
     waves, phases = rng.normal(size=(60, 2)), rng.uniform(0, 2 * np.pi, 60)
     waves *= (2 * np.pi / rng.uniform(0.06, 0.6, 60) / np.linalg.norm(waves, axis=1))[:, None]
-    return 0.5 + 0.05 * np.cos(points @ waves.T + phases).sum(axis=-1)
+    return np.asarray(0.5 + 0.05 * np.cos(points @ waves.T + phases).sum(axis=-1))
 
 
-def seen_pair(motion: np.ndarray, noise: float = 0.0, bearing: str = "azimuth") -> torch.Tensor:
+def seen_pair(motion: NDArray[np.float64], noise: float = 0.0, bearing: Bearing = "azimuth") -> Tensor:
     """Two frames of that floor, before and after a motion ``(1, 2, bins, beams)``."""
     ground = GroundGeometry(RANGE, BEARING, bearing, STAND["height_m"], STAND["pitch_rad"], STAND["roll_rad"])
     # what lies at a place for the moved sonar lay elsewhere for the first
     there = moved(ground.points, inverse(motion))
     images = np.stack([texture(ground.points), texture(there)])
     images += noise * np.random.default_rng(1).normal(size=images.shape)
-    return torch.from_numpy(np.clip(images, 0, 1)[None].astype(np.float32))
+    pair: Tensor = torch.from_numpy(np.clip(images, 0, 1)[None].astype(np.float32))
+    return pair
 
 
 # ---------------------------------------------------------------- geometry
 
 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
-def test_displacements_are_those_of_the_exact_geometry(bearing: str) -> None:
+def test_displacements_are_those_of_the_exact_geometry(bearing: Bearing) -> None:
     ground = batch(bearing)
     found = warp_grid.displacement(ground, torch.tensor(MOTION[None], dtype=torch.float32))[0].numpy()
     nodes = [
         np.interp(np.linspace(0, len(a) - 1, n), np.arange(len(a)), a) for a, n in zip((RANGE, BEARING), NODES, strict=True)
     ]
-    exact = GroundGeometry(*nodes, bearing, STAND["height_m"], STAND["pitch_rad"], STAND["roll_rad"])
+    exact = GroundGeometry(nodes[0], nodes[1], bearing, STAND["height_m"], STAND["pitch_rad"], STAND["roll_rad"])
     radius, angle = exact.to_polar(moved(exact.points, MOTION))
     bins = (radius - nodes[0][:, None]) / (RANGE[1] - RANGE[0])
     beams = (angle - nodes[1]) / (BEARING[1] - BEARING[0])
@@ -133,7 +141,7 @@ def test_what_lies_between_cells_keeps_its_fineness() -> None:
     layers, rows, columns = slopes.Slopes(1, 4), 40, 40
     row, column = np.mgrid[:rows, :columns]
 
-    def wave(r: np.ndarray, c: np.ndarray) -> np.ndarray:
+    def wave(r: NDArray[np.float64], c: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.cos(2 * np.pi * r / 3) + np.sin(2 * np.pi * c / 3)
 
     frame = torch.tensor(wave(row, column), dtype=torch.float32)[None, None]
@@ -152,12 +160,12 @@ def test_what_lies_between_cells_keeps_its_fineness() -> None:
 
 
 def test_later_iterations_count_more() -> None:
-    said = law.GaussianHead(torch.zeros(2, 1, 3), torch.eye(3).expand(2, 1, 3, 3) * 1e-6)
+    said = head.GaussianHead(torch.zeros(2, 1, 3), torch.eye(3).expand(2, 1, 3, 3) * 1e-6)
     wrong = said.mean.clone()
     wrong[0] = 1e-3
-    early = law.likelihood(law.GaussianHead(wrong, said.covariance), torch.zeros(1, 3))
-    late = law.likelihood(law.GaussianHead(wrong.flip(0), said.covariance), torch.zeros(1, 3))
-    assert float(late) > float(early) > float(law.likelihood(said, torch.zeros(1, 3)))
+    early = head.likelihood(head.GaussianHead(wrong, said.covariance), torch.zeros(1, 3))
+    late = head.likelihood(head.GaussianHead(wrong.flip(0), said.covariance), torch.zeros(1, 3))
+    assert float(late) > float(early) > float(head.likelihood(said, torch.zeros(1, 3)))
 
 
 # ---------------------------------------------------------------- the network
@@ -192,7 +200,7 @@ def test_it_learns() -> None:
     optimiser = torch.optim.AdamW(network.parameters(), lr=5e-4)
     losses = []
     for _ in range(14):
-        loss = law.likelihood(network(images, ground), target)
+        loss = head.likelihood(network(images, ground), target)
         optimiser.zero_grad()
         loss.backward()
         assert all(weight.grad is not None and torch.isfinite(weight.grad).all() for weight in network.parameters())
@@ -210,7 +218,7 @@ def test_it_learns_after_it_was_asked() -> None:
     network, image, ground = create_network("corrnet", finer=1), seen_pair(np.array([0.01, 0.0, 0.0])), batch()
     with torch.inference_mode():
         network(image, ground)
-    law.likelihood(network(image, ground), torch.zeros(1, 3)).backward()
+    head.likelihood(network(image, ground), torch.zeros(1, 3)).backward()
 
 
 def test_it_stays_below_a_million_parameters() -> None:
@@ -242,7 +250,7 @@ def test_a_motion_and_its_inverse_lead_back() -> None:
 def test_mirrored_samples_are_those_of_a_mirrored_floor() -> None:
     ground = GroundGeometry(RANGE, BEARING, "azimuth", STAND["height_m"], STAND["pitch_rad"])
 
-    def drawn(motion: np.ndarray, port: float) -> np.ndarray:
+    def drawn(motion: NDArray[np.float64], port: float) -> NDArray[np.float64]:
         places = (ground.points, moved(ground.points, inverse(motion)))
         return np.stack([texture(points * [port, 1.0]) for points in places])
 

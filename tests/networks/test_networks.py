@@ -1,4 +1,4 @@
-"""The thesis's networks: layers as in tables and text, counted by hand; what is cut, padded, averaged; that they learn."""
+"""Almanza-Medina's networks: layers as in tables and text, counted by hand; what is cut, padded, averaged; they learn."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def inputs_of(network: Any, batch: int, device: str = "cpu") -> tuple[Tensor, ..
     )
 
 
-def shapes(network: Any, among: nn.Module, batch: int = 1) -> dict[str, tuple[int, ...]]:
+def shapes(network: nn.Module, among: nn.Module, batch: int = 1) -> dict[str, tuple[int, ...]]:
     """Channels, rows and columns that leave each child of a module, without computing (on the meta device)."""
     found = {}
     for name, child in among.named_children():
@@ -81,10 +81,11 @@ Average 4×4 1024 1×1 1×4 No
 def table_4_1() -> dict[str, tuple[int, int, int, int, bool]]:
     """Kernel, channels, rows, columns, and whether ReLU and normalisation follow, of each layer."""
     rows = [line.split() for line in TABLE_4_1.strip().splitlines()]
-    return {
-        name.lower(): (int(kernel[0]), int(channels), *map(int, size.split("×")), after == "Yes")
-        for name, kernel, channels, _, size, after in rows
-    }
+    table = {}
+    for name, kernel, channels, _, size, after in rows:
+        height, width = map(int, size.split("×"))
+        table[name.lower()] = (int(kernel[0]), int(channels), height, width, after == "Yes")
+    return table
 
 
 def test_posenet_is_table_4_1() -> None:
@@ -219,6 +220,7 @@ def test_same_padding_against_sums_by_hand(length: int, kernel: int, stride: int
     image, weight = rng.normal(size=(length, length + 1)), rng.normal(size=(kernel, kernel))
     with torch.no_grad():
         convolution.weight[:] = torch.tensor(weight)
+        assert convolution.bias is not None
         convolution.bias[:] = 0.25
         seen = convolution(torch.tensor(image, dtype=torch.float32)[None, None])[0, 0].numpy()
     cells = [math.ceil(one / stride) for one in image.shape]
@@ -258,7 +260,9 @@ def test_weights_are_drawn_as_glorot_says() -> None:
     weight = create_network("posenet", width=0.25).layers.get_submodule("conv6.0").weight
     limit = math.sqrt(6 / (3 * 3 * (128 + 128)))
     assert 0.999 * limit < weight.abs().max() <= limit
-    spread = limit / math.sqrt(3)  # of a uniform law; the variance of n draws has a relative error of sqrt(4 / 5 / n)
+    spread = limit / math.sqrt(
+        3
+    )  # of a uniform distribution; the variance of n draws has a relative error of sqrt(4 / 5 / n)
     assert abs(weight.var().item() / spread**2 - 1) < 4 * math.sqrt(0.8 / weight.numel())
 
 
