@@ -44,8 +44,11 @@ from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.io.whole_files import write_whole
-from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
-from mitsonar.mapping.trajectory_smoothing import MotionSeries, kalman_smoothed, path_of, pose_covariances, spline_smoothed
+from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
+from mitsonar.mapping.mosaic import Mosaic, build_mosaic
+from mitsonar.mapping.motion_series import MotionSeries, path_of
+from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import motion_errors
 from mitsonar.motion.pose import Pose, mounted

@@ -7,36 +7,18 @@ height or pitch was not known (3.5.2, 3.5.3), and leaves splines and Kalman filt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_smoothing_spline
-from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.mapping.motion_series import MotionSeries
 from mitsonar.motion.motion_errors import AXES
-from mitsonar.motion.pose import Pose
-from mitsonar.motion.trajectory import Trajectory
 
-__all__ = [
-    "Ellipse",
-    "MotionSeries",
-    "ellipse",
-    "fit_noise",
-    "fit_scale",
-    "fit_wander",
-    "kalman_smoothed",
-    "path_of",
-    "pose_covariances",
-    "scaled",
-    "spline_period",
-    "spline_smoothed",
-]
+__all__ = ["fit_noise", "fit_wander", "kalman_smoothed", "spline_period", "spline_smoothed"]
 
 Array = NDArray[np.float64]
 
@@ -45,153 +27,6 @@ FEWEST_FOR_SPLINE = 5
 
 LONGEST_PERIOD = 2000.0
 """In motions: beyond, the spline is a straight line, and SciPy's equations lose their digits (from 6000 on)."""
-
-
-@dataclass(frozen=True)
-class MotionSeries:
-    """Motions between consecutive frames, and what is known of their errors.
-
-    Attributes:
-        motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)`` (eq. 3.4).
-        time_s: of the frames ``(frames,)``, increasing, not necessarily evenly.
-        covariances: of the motions' errors ``(frames - 1, 3, 3)`` [m, m, rad], where known.
-        believe: False where a motion, and its covariance, is not to be used ``(frames - 1,)``; not given, all are believed.
-        with_next: covariance of each motion's error (rows) with that of the next (columns) ``(frames - 2, 3, 3)``. Errors
-            further apart depend on each other only through those between (Markov). Not given, they are independent.
-    """
-
-    motions: Array
-    time_s: Array
-    covariances: Array | None = None
-    valid: NDArray[np.bool_] | None = None
-    with_next: Array | None = None
-
-    def __post_init__(self) -> None:
-        count = len(self.time_s) - 1
-        if count < 1:
-            raise MitsonarError(f"a path needs two frames or more: got {count + 1}; give a longer run")
-        if self.motions.shape != (count, 3):
-            raise MitsonarError(f"motions must be ({count}, 3) for {count + 1} frame times: got {self.motions.shape}")
-        if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
-            raise MitsonarError("frame times must be finite and increase: sort the frames, or give their times")
-        if self.believed.shape != (count,):
-            raise MitsonarError(f"believe must be ({count},), one for each motion: got {self.believed.shape}")
-        if not self.believed.any():
-            raise MitsonarError(f"none of {count} motions is believed: nothing tells the path; try another estimator")
-        self._refuse(~np.isfinite(self.motions).all(axis=1), "is not finite")
-        if self.covariances is not None:
-            self._check_covariances(self.covariances)
-        if self.with_next is not None and self.with_next.shape != (count - 1, 3, 3):
-            raise MitsonarError(f"with_next must be ({count - 1}, 3, 3): got {self.with_next.shape}")
-
-    def _check_covariances(self, covariances: Array) -> None:
-        if covariances.shape != (len(self), 3, 3):
-            raise MitsonarError(f"covariances must be ({len(self)}, 3, 3), one a motion: got {covariances.shape}")
-        self._refuse(~np.isfinite(covariances).all(axis=(1, 2)), "has a covariance that is not finite")
-        known = np.where(self.believed[:, None, None], covariances, np.eye(3))
-        crooked = np.abs(known - known.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(known).max(axis=(1, 2))
-        least = np.linalg.eigvalsh(known)
-        self._refuse(crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or lopsided")
-
-    def _refuse(self, bad: ArrayLike, what: str) -> None:
-        where = np.flatnonzero(np.asarray(bad) & self.believed)
-        if where.size:
-            raise MitsonarError(
-                f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} are so): "
-                "mark it as not believed, or leave it out"
-            )
-
-    def __len__(self) -> int:
-        """How many motions: one less than frames."""
-        return len(self.time_s) - 1
-
-    @classmethod
-    def from_estimates(cls, estimates: Sequence[Estimate], time_s: ArrayLike) -> Self:
-        """What an estimator said of consecutive frames at ``time_s`` ``(frames,)``; covariances only if every believed
-        estimate has one."""
-        valid = np.array([estimate.valid for estimate in estimates], dtype=bool)
-        unknown = np.full((3, 3), np.nan)
-        covariances = [unknown if one.covariance is None else one.covariance for one in estimates]
-        known = all(one.covariance is not None for one in estimates if one.valid)
-        motions = np.array([one.motion for one in estimates], dtype=float).reshape(-1, 3)
-        return cls(motions, np.asarray(time_s, dtype=float), np.array(covariances) if known else None, valid)
-
-    @cached_property
-    def believed(self) -> NDArray[np.bool_]:
-        """Which motions are to be used ``(frames - 1,)``."""
-        return np.ones(len(self), dtype=bool) if self.valid is None else self.valid
-
-    @cached_property
-    def step_s(self) -> Array:
-        """Time from frame to frame ``(frames - 1,)`` [s]."""
-        return np.diff(self.time_s)
-
-    @cached_property
-    def middle_s(self) -> Array:
-        """Time half-way through each motion ``(frames - 1,)`` [s]: its mean velocity is taken as the velocity then."""
-        return (self.time_s[1:] + self.time_s[:-1]) / 2
-
-    @cached_property
-    def velocity(self) -> Array:
-        """Mean velocity of each motion in the vehicle's frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
-        return self.motions / self.step_s[:, None]
-
-
-# ---------------------------------------------------------------- composition
-
-
-def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
-    """The path that motions drive from ``start``: :func:`mitsonar.motion.composition.compose` from frame to frame
-    (Almanza-Medina,
-    eq.
-    3.4), the inverse of :func:`mitsonar.motion.composition.motions`. Height, pitch and roll stay those of ``start``.
-
-    Args:
-        motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)``.
-        start: the first pose.
-        time_s: of the frames ``(frames,)`` [s].
-
-    Raises:
-        MitsonarError: shapes that do not fit, a motion that is not finite, times that do not increase.
-    """
-    series = MotionSeries(np.asarray(motions, dtype=float), np.asarray(time_s, dtype=float))
-    sideways, forward, yaw = series.motions.T
-    heading = start.heading + np.cumsum(yaw)
-    sin, cos = np.sin(heading), np.cos(heading)
-    poses = np.tile(np.asarray(start, dtype=float), (len(series) + 1, 1))
-    poses[1:, 0] += np.cumsum(forward * sin + sideways * cos)
-    poses[1:, 1] += np.cumsum(forward * cos - sideways * sin)
-    poses[1:, 5] = heading
-    return Trajectory(poses, series.time_s)
-
-
-# ---------------------------------------------------------------- scale
-
-
-def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
-    """Motions times one factor for each of sideways, forward, yaw ``(3,)``; their covariances with them. The thesis takes
-    2.3 for sideways (3.5.2), 9.0 for sideways and 4.0 for forward (3.5.3)."""
-    factor = np.asarray(factors, dtype=float)
-    if factor.shape != (3,) or not np.isfinite(factor).all():
-        raise MitsonarError(f"scale factors are three finite numbers, for sideways, forward, yaw: got {factors!r}")
-    both = np.outer(factor, factor)
-    covariances, with_next = (None if c is None else c * both for c in (measured.covariances, measured.with_next))
-    return replace(measured, motions=measured.motions * factor, covariances=covariances, with_next=with_next)
-
-
-def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
-    """Factors ``(3,)`` that bring estimated motions ``(frames - 1, 3)`` nearest to the true ones, of the same shape: least
-    squares through the origin for each axis. An axis that is estimated as zero throughout keeps the factor 1.
-
-    Noise in the estimates makes the factor smaller than their true scale by signal / (signal + noise) power.
-    """
-    e, t = np.asarray(estimated, dtype=float), np.asarray(true, dtype=float)
-    if e.shape != t.shape or e.ndim != 2 or e.shape[1] != 3 or not (np.isfinite(e).all() and np.isfinite(t).all()):
-        raise MitsonarError(
-            f"scale factors need as many true as estimated motions (motions, 3): got {e.shape} and {t.shape}"
-        )
-    power = (e * e).sum(axis=0)
-    return np.where(power > 0, (e * t).sum(axis=0) / np.where(power > 0, power, 1), 1.0)
 
 
 # ---------------------------------------------------------------- splines
@@ -474,66 +309,3 @@ def _least(score: Callable[[Array], Array], low: Array, high: Array, points: int
 
 def _symmetric(matrix: Array) -> Array:
     return (matrix + matrix.T) / 2
-
-
-# ---------------------------------------------------------------- covariance of the pose
-
-
-def pose_covariances(series: MotionSeries, start: Pose, at_start: ArrayLike | None = None) -> Array:
-    """Covariances of x, y [m] and heading [rad] of every frame ``(frames, 3, 3)`` along the path, to first order.
-
-    Args:
-        series: the motions with their covariances, all believed: smooth a series with gaps first.
-        start: the first pose.
-        at_start: its covariance ``(3, 3)``; not given: known exactly.
-
-    Raises:
-        MitsonarError: no covariances, or a motion that is not believed, whose error nobody knows.
-    """
-    if series.covariances is None:
-        raise MitsonarError("the pose's covariance needs those of the motions: give them, or use kalman_smoothed")
-    if not series.believed.all():
-        gaps = int((~series.believed).sum())
-        raise MitsonarError(
-            f"{gaps} motions are not believed, so that their errors are not known: use kalman_smoothed first"
-        )
-    poses = path_of(series.motions, start, series.time_s).poses
-    along, fresh = _dependence(series.covariances, series.with_next)
-    found = np.zeros((len(poses), 3, 3))
-    joint = np.zeros((6, 6))  # of the pose and of the last motion
-    joint[:3, :3] = found[0] = 0.0 if at_start is None else np.asarray(at_start, dtype=float)
-    for k, (x, y) in enumerate(np.diff(poses[:, :2], axis=0)):
-        sin, cos = np.sin(poses[k + 1, 5]), np.cos(poses[k + 1, 5])
-        pose = np.array([[1, 0, y], [0, 1, -x], [0, 0, 1]])  # derivatives of eq. 3.4: by the pose,
-        motion = np.array([[cos, sin, y], [-sin, cos, -x], [0, 0, 1]])  # and by the motion
-        onward = np.block([[pose, motion @ along[k]], [np.zeros((3, 3)), along[k]]])
-        news = np.vstack([motion, np.eye(3)])
-        joint = _symmetric(onward @ joint @ onward.T + news @ fresh[k] @ news.T)
-        found[k + 1] = joint[:3, :3]
-    return found
-
-
-def _dependence(covariances: Array, with_next: Array | None) -> tuple[Array, Array]:
-    """How each motion's error follows from the one before ``(n, 3, 3)``, and the covariance of what is new in it."""
-    along, fresh = np.zeros_like(covariances), covariances.copy()
-    if with_next is not None and len(with_next):
-        along[1:] = np.linalg.solve(covariances[:-1], with_next).swapaxes(1, 2)
-        fresh[1:] -= along[1:] @ with_next
-    return along, fresh
-
-
-class Ellipse(NamedTuple):
-    """Where a position lies: half axes [m], and the bearing of the longer one [rad], clockwise from +y as a heading."""
-
-    major_m: float
-    minor_m: float
-    heading: float
-
-
-def ellipse(covariance: ArrayLike, probability: float = 0.95) -> Ellipse:
-    """The ellipse that holds the position with a probability, from a covariance that begins with x, y ``(2.., 2..)``."""
-    if not 0 < probability < 1:
-        raise MitsonarError(f"probability must be between 0 and 1: got {probability:g}")
-    variance, axes = np.linalg.eigh(np.asarray(covariance, dtype=float)[:2, :2])
-    minor, major = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 2))
-    return Ellipse(float(major), float(minor), float(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))

@@ -17,7 +17,9 @@ from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
+from mitsonar.mapping.geotiff import save_geotiff
+from mitsonar.mapping.illumination import illumination
+from mitsonar.mapping.mosaic import Mosaic, build_mosaic
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.map_figure import mosaic_figure, path_figure, quality_figure, save_figure

@@ -10,13 +10,10 @@ Cauchy's law: shadow edges and relief are outliers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import (
@@ -30,31 +27,15 @@ from mitsonar.estimation.estimator import (
     spread_of,
     two_frames,
 )
-from mitsonar.geometry.attitude import Attitude, attitude_of
-from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
-from mitsonar.motion.composition import Motion, inverse
+from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
+from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
+from mitsonar.geometry.attitude import attitude_of
+from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Direct"]
 
 Floats = NDArray[np.float32]
-
-
-class DirectLevel(NamedTuple):
-    """One step from coarse to fine.
-
-    Attributes:
-        step: every so many bins are used.
-        smoothing: of the frames, in bins and beams.
-        slopes: further smoothing of their mean, before its slopes are taken.
-        iterations: at most.
-    """
-
-    step: int
-    smoothing: tuple[float, float]
-    slopes: tuple[float, float]
-    iterations: int
-
 
 LEVELS = (
     DirectLevel(8, (16.0, 4.0), (0.0, 0.0), 10),
@@ -67,12 +48,6 @@ STILL = np.array([3e-5, 3e-5, 6e-6])
 
 CAUCHY = 3.0
 """Residuals of so many standard deviations have half the weight."""
-
-FAINTEST = 0.02
-"""Residuals of this size are never outliers: patterns of rays and interpolation reach it without any noise."""
-
-NEIGHBOURS = (3, 7)
-"""Beams and bins within which the slopes' variance is compared with the noise (Wiener's filter)."""
 
 BLOCK = (24, 8)
 """Bins and beams within which residuals belong together: rocks and their shadows."""
@@ -91,15 +66,6 @@ LONGEST = 4.0
 NEAR_M = 0.002
 """Steps that are remembered for the next; metres that a turn is worth; how many times longer a step may get; how short it
 must be before."""
-
-HEIGHT_STEP = 0.05
-"""Part of the height by which it is changed to see what depends on it."""
-
-MOSTLY = 0.5
-"""Part of the window that must show lit ground for the outline of the light to be left in."""
-
-LIT = 0.9
-"""Part of the field of view's elevation that is free of its outline."""
 
 FARTHEST = np.array([0.15, 0.15, np.radians(3)])
 """Motions that are found with certainty are 100 mm and 2 deg; a maximum far beyond is one among noise."""
@@ -165,7 +131,7 @@ class Direct:
             if len(first) < 24 * level.step and number + 1 < len(self.levels):
                 continue  # too few bins for so coarse a step
             pair = _smoothed(first, level), _smoothed(second, level)
-            cells = _Cells(frames, attitude, level, heave=bool(self.heave_std_m))
+            cells = Cells(frames, attitude, level, heave=bool(self.heave_std_m))
             found = self._register(*pair, cells, v, level, last=number + 1 == len(self.levels))
             if found is None:
                 return rejected("nothing in the frames to match")
@@ -179,7 +145,7 @@ class Direct:
         return Estimate(Motion(*(float(x) for x in v[:3])), covariance, not reason, reason, about)
 
     def _register(
-        self, first: Floats, second: Floats, cells: _Cells, start: NDArray[np.float64], level: DirectLevel, *, last: bool
+        self, first: Floats, second: Floats, cells: Cells, start: NDArray[np.float64], level: DirectLevel, *, last: bool
     ) -> tuple[NDArray[np.float64], _Fit | None] | None:
         """Gauss-Newton from a start; None where there is nothing to match."""
         v, hasten, converged = start.copy(), _Hasten(), False
@@ -236,7 +202,7 @@ class _Look(NamedTuple):
 
 
 def _look(
-    first: Floats, second: Floats, cells: _Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
+    first: Floats, second: Floats, cells: Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
 ) -> _Look | None:
     """The second frame drawn at the first's cells, at last also the other way; None where too little remains to compare."""
     pairs = []
@@ -245,7 +211,7 @@ def _look(
         inner = _inner(there, cells.usable)
         if inner is None:
             return None
-        drawn = _drawn(first if back else second, cells.row + there[0], cells.column + there[1])
+        drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
         pairs.append((drawn, second, inner) if back else (first, drawn, inner))
     residuals = [(after - before)[inner].ravel() for before, after, inner in pairs]
     if residuals[0].size < FEWEST_CELLS:
@@ -253,7 +219,7 @@ def _look(
     scale = max(1.4826 * float(np.median(np.abs(residuals[0][::5]))), FAINTEST)
     sides = []
     for (before, after, inner), residual in zip(pairs, residuals, strict=True):
-        slopes = _slopes((before + after) * np.float32(0.5), level, scale)
+        slopes = slopes_of((before + after) * np.float32(0.5), level, scale)
         weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
         if last:
             weight = weight * _block_weight(slopes, residual, weight, inner)
@@ -265,7 +231,7 @@ def _look(
 
 
 def _fit(
-    look: _Look, cells: _Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
+    look: _Look, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
 ) -> _Fit:
     """How good the motion is: from the pulls of blocks, and from slopes of one frame times those of the other."""
     true = np.sum([_cross(side, cells, level) for side in look.sides], axis=0)
@@ -289,169 +255,10 @@ def _fit(
     )
 
 
-class _Cells:
-    """The cells of one level: where they are, and how they move with the sonar, in bins and beams."""
-
-    def __init__(self, frames: SonarFrames, attitude: Attitude, level: DirectLevel, *, heave: bool) -> None:
-        step = level.step
-        reach = tuple(2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing[::-1], (1, step), strict=True))
-        self.bearing, self.attitude, self.heave = frames.sonar.bearing, attitude, heave
-        self.grid = _grid(tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist()), step)
-        self.row, self.column = self.grid.row, self.grid.column
-        self.ground = self._ground(attitude.height_m)
-        known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
-        self.from_node = nearest_known(known)
-        first = int(known.any(axis=1).argmax()) if known.any() else len(known)
-        self.usable = slice(
-            int(np.searchsorted(self.grid.range_m, self.grid.node_range[first])) if known.any() else 10**9, None
-        )
-        self.nodes = self._nodes(attitude.height_m)
-        self.derivative = self._on_all(self.nodes)
-        self.seen = self._seen(known, np.radians(frames.sonar.elevation_fov_deg) / 2, reach)
-
-    def _ground(self, height: float) -> GroundGeometry:
-        """The geometry at the nodes."""
-        grid, attitude = self.grid, self.attitude
-        return GroundGeometry(
-            grid.node_range, grid.node_bearing, self.bearing, height, attitude.pitch_rad, attitude.roll_rad
-        )
-
-    def _nodes(self, height: float) -> Floats:
-        """The derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``."""
-        ground = self._ground(height)
-        nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
-        if self.heave:
-            nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
-        return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]]).astype(np.float32)
-
-    def _seen(self, known: NDArray[np.bool_], half_elevation: float, reach: tuple[int, ...]) -> Floats | None:
-        """1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all do.
-
-        The outline of the lit ground moves with the sonar and holds estimates back. It is kept out where the ground is even,
-        and where a fan shows mostly what it cannot light; rocks blur it, and those that rise from beyond it help.
-        """
-        with np.errstate(invalid="ignore"):
-            lit = np.abs(self.ground.elevation(self.ground.points)) <= LIT * half_elevation
-        mask_lit = self.attitude.even or lit.mean() < MOSTLY
-        shown = known & lit if mask_lit else known
-        if shown[self.from_node[0].min() :].all():
-            return None
-        grid = self.grid
-        row, column = (
-            np.abs(values[:, None] - nodes).argmin(axis=1)
-            for values, nodes in ((grid.range_m, grid.node_range), (grid.bearing_rad, grid.node_bearing))
-        )
-        on_all = shown[row][:, column].astype(np.uint8)
-        return np.asarray(cv2.erode(on_all, np.ones(reach[::-1], np.uint8)) if mask_lit else on_all, dtype=np.float32)
-
-    def _on_all(self, nodes: Floats) -> Floats:
-        """From the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
-        full = self.grid.over_bins @ nodes @ self.grid.over_beams.T
-        full[..., 0, :, :] /= self.grid.bin_m[:, None]
-        full[..., 1, :, :] /= self.grid.beam_rad
-        return np.asarray(full)
-
-    def shift(self, v: NDArray[np.float64], *, back: bool = False) -> Floats:
-        """How far from each cell of the first frame the second shows its ground ``(2, bins, beams)``, in bins and beams; or
-        back: how far from each cell of the second the first shows it."""
-        ground = other = self.ground
-        if self.heave:
-            half = float(v[3]) / (2 if back else -2)
-            ground, other = (self._ground(self.attitude.height_m + change) for change in (half, -half))
-        motion = inverse(v[:3]) if back else v[:3]
-        radius, bearing = other.to_polar(moved(ground.points, motion))
-        grid = self.grid
-        nodes = np.stack([radius - grid.node_range[:, None], bearing - grid.node_bearing])
-        return self._on_all(nodes[:, self.from_node[0], self.from_node[1]].astype(np.float32))
-
-    def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
-        """The change of :meth:`shift` with the height, a metre, to first order in the motion."""
-        change = HEIGHT_STEP * self.attitude.height_m
-        other = self._nodes(self.attitude.height_m + change)
-        return self._on_all(np.tensordot(v.astype(np.float32) / np.float32(change), other - self.nodes, axes=1))
-
-    def along(self, slopes: tuple[Floats, Floats], inner: tuple[slice, slice]) -> Floats:
-        """The image's derivative by each motion ``(3 or 4, cells)``."""
-        by_bin, by_beam = slopes[0][inner], slopes[1][inner]
-        jacobian = np.empty((len(self.derivative), *by_bin.shape), dtype=np.float32)
-        for out, (bins, beams) in zip(jacobian, self.derivative, strict=True):
-            np.multiply(by_bin, bins[inner], out=out)
-            out += by_beam * beams[inner]
-            if self.seen is not None:
-                out *= self.seen[inner]
-        return jacobian.reshape(len(jacobian), -1)
-
-
-class _Grid(NamedTuple):
-    """Cells of every so many bins, and splines from few nodes to all of them: the geometry is smooth."""
-
-    range_m: NDArray[np.float64]
-    bearing_rad: NDArray[np.float64]
-    node_range: NDArray[np.float64]
-    node_bearing: NDArray[np.float64]
-    over_bins: Floats
-    over_beams: Floats
-    bin_m: Floats
-    beam_rad: Floats
-    row: Floats
-    column: Floats
-
-
-@lru_cache(maxsize=16)
-def _grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: int) -> _Grid:
-    ranges, axes = np.array(range_m)[step // 2 :: step], np.array(bearing_rad)
-    nodes = [np.linspace(values[0], values[-1], count) for values, count in ((ranges, 33), (axes, 17))]
-    splines = [
-        np.asarray(make_interp_spline(node, np.eye(len(node)), 3)(values), dtype=np.float32)
-        for node, values in zip(nodes, (ranges, axes), strict=True)
-    ]
-    row = np.arange(len(ranges), dtype=np.float32)[:, None]
-    column = np.arange(len(axes), dtype=np.float32)[None, :]
-    spacing = [np.gradient(values).astype(np.float32) for values in (ranges, axes)]
-    return _Grid(ranges, axes, nodes[0], nodes[1], splines[0], splines[1], spacing[0], spacing[1], row, column)
-
-
-def _blurred(image: Floats, bins: float, beams: float) -> Floats:
-    if not bins and not beams:
-        return image
-    size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
-    return np.asarray(cv2.GaussianBlur(image, size, sigmaX=beams, sigmaY=bins, borderType=cv2.BORDER_REPLICATE))
-
-
 def _smoothed(image: Floats, level: DirectLevel) -> Floats:
     """Every so many bins of the smoothed image."""
-    smooth = _blurred(image, *level.smoothing)
+    smooth = blurred(image, *level.smoothing)
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
-
-
-def _drawn(image: Floats, row: Floats, column: Floats) -> Floats:
-    """Values between pixels, bilinear."""
-    return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-
-def _slopes(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, Floats]:
-    """Central differences over bins and beams of the image as far as it rises over the noise.
-
-    ``scale`` is the standard deviation of a difference of two frames; their mean has half of it.
-    """
-    smooth = _blurred(image, *level.slopes)
-    if scale > FAINTEST:
-        mean = cv2.blur(smooth, NEIGHBOURS)
-        variance = cv2.blur(smooth * smooth, NEIGHBOURS) - mean * mean
-        kept = np.maximum(0, 1 - np.float32(2 * (scale / 2) ** 2) / np.maximum(variance, np.float32(1e-9)))
-        smooth = mean + (smooth - mean) * kept
-    return _differences(smooth)
-
-
-HALVES = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
-ONE = np.ones(1, dtype=np.float32)
-
-
-def _differences(image: Floats) -> tuple[Floats, Floats]:
-    """Central differences over bins and over beams."""
-    by_bin = cv2.sepFilter2D(image, -1, ONE, HALVES, borderType=cv2.BORDER_REPLICATE)
-    by_beam = cv2.sepFilter2D(image, -1, HALVES, ONE, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(by_bin, dtype=np.float32), np.asarray(by_beam, dtype=np.float32)
 
 
 class _Hasten:
@@ -496,10 +303,10 @@ def _singular(normal: NDArray[np.float64]) -> bool:
     return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
 
 
-def _cross(side: _Side, cells: _Cells, level: DirectLevel) -> NDArray[np.float64]:
+def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
     """The normal matrix from slopes of one frame times slopes of the other, whose noise is not the same."""
     frames = (side.before, side.after)
-    one, other = (cells.along(_differences(_blurred(image, *level.slopes)), side.inner) for image in frames)
+    one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
     product = ((one * side.weight) @ other.T).astype(np.float64)
     return (product + product.T) / 2
 

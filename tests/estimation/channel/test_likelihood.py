@@ -10,7 +10,8 @@ import pytest
 from points import PointGround, run
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.channel.likelihood import Likelihood, judged
+from mitsonar.estimation.channel.likelihood import Likelihood
+from mitsonar.estimation.channel.motion_score import judged
 from mitsonar.estimation.channel.motion_search import receiver_bands_of
 from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz, link_response
 from mitsonar.estimation.channel.sub_bands import bands_of

@@ -24,7 +24,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.measured_heights import measured
-from mitsonar.mapping.odometry import estimate_motions
+from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.view_source import open_views
 from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
