@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image_crlb import bounds_at, overall
-from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
@@ -28,6 +27,7 @@ __all__ = [
     "VARIATIONS",
     "Answers",
     "BenchmarkRow",
+    "Samples",
     "answers_of",
     "bounds_of_pairs",
     "chosen",
@@ -37,6 +37,9 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+Samples = SonarPairs | ImpulseSamples
+"""The samples of a data set that estimators are compared on."""
 
 VARIATIONS: dict[str, str] = {
     "as told": "height, pitch, roll and sound speed are right",
@@ -79,7 +82,7 @@ class Answers:
         """Which pairs have been asked for ``(n,)``."""
         return np.isfinite(self.ms)
 
-    def ask(self, place: int, estimator: AnyEstimator, frames: Any) -> None:
+    def ask(self, place: int, estimator: AnyEstimator, frames: Record) -> None:
         """Put an estimate in its place."""
         begun = time.process_time()
         estimate = estimator.estimate(frames)
@@ -88,12 +91,12 @@ class Answers:
         if estimate.covariance is not None:
             self.covariance[place] = estimate.covariance
 
-    def arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
+    def arrays(self, prefix: str) -> dict[str, NDArray[np.generic]]:
         """By name, to store."""
         return {f"{prefix}/{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
-    def from_arrays(cls, table: Mapping[str, NDArray[Any]], prefix: str) -> Answers:
+    def from_arrays(cls, table: Mapping[str, NDArray[np.generic]], prefix: str) -> Answers:
         """What :meth:`arrays` gave."""
         return cls(*(np.array(table[f"{prefix}/{field.name}"]) for field in fields(cls)))
 
@@ -105,7 +108,7 @@ def chosen(count: int, pairs: int | None, seed: int) -> list[int]:
     return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
-def frames_of(pairs: SonarPairs | ImpulseSamples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Any]]:
+def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Record]]:
     """Samples as (number, frames or impulse responses) with a variation of :data:`VARIATIONS`; of responses only as told."""
     if isinstance(pairs, ImpulseSamples):
         for number in numbers:
@@ -133,7 +136,7 @@ def _heaved(number: int, poses: Array) -> Array:
 
 def _told(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
     """Frames that tell something wrong."""
-    change: dict[str, Any] = {}
+    change: dict[str, Array] = {}
     poses = None if frames.poses is None else frames.poses.copy()
     if variation == "height 5 %" and frames.height_m is not None:
         change["height_m"] = frames.height_m * (1 + 0.05 * sign)
@@ -147,7 +150,7 @@ def _told(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
 
 def answers_of(
     estimators: Mapping[str, AnyEstimator],
-    pairs: SonarPairs | ImpulseSamples,
+    pairs: Samples,
     numbers: Sequence[int],
     variation: str = "as told",
     *,
@@ -178,7 +181,7 @@ def answers_of(
 
 def _answers_of(
     estimators: Mapping[str, AnyEstimator],
-    pairs: SonarPairs | ImpulseSamples,
+    pairs: Samples,
     numbers: Sequence[int],
     variation: str,
     known: dict[str, Answers] | None,
@@ -269,10 +272,10 @@ class BenchmarkRow:
     over_reference_low: Array
     over_reference_high: Array
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> PlainTable:
         """Numbers and texts only, for JSON: nan becomes None."""
 
-        def value(one: Any) -> Any:
+        def value(one: object) -> object:
             if isinstance(one, np.ndarray):
                 return [value(float(v)) for v in one]
             if isinstance(one, float | np.floating):

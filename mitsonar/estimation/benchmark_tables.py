@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+
+from mitsonar.estimation.estimator import PlainTable
 
 __all__ = ["FEWEST_SCENES", "markdown", "table_lines"]
 
@@ -11,7 +12,7 @@ FEWEST_SCENES = 10
 """With fewer, clustered intervals hold much less than they say."""
 
 
-def table_lines(table: dict[str, Any]) -> list[str]:
+def table_lines(table: PlainTable) -> list[str]:
     """A table of the report as Markdown."""
     lines = ["", f"noise {table['noise']}, {table['variation']}", "", *markdown(table["rows"], COLUMNS)]
     if table["limits"]:
@@ -27,7 +28,7 @@ def table_lines(table: dict[str, Any]) -> list[str]:
     return lines
 
 
-def markdown(rows: list[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+def markdown(rows: list[PlainTable], columns: Sequence[str]) -> list[str]:
     """Methods as lines of a Markdown table with these columns of :data:`CELLS`."""
     cells = [list(columns), ["---"] * len(columns), *([CELLS[column](row) for column in columns] for row in rows)]
     width = [max(len(row[k]) for row in cells) for k in range(len(columns))]
@@ -49,12 +50,12 @@ def _joined(values: list[float | None], digits: int) -> str:
     return " / ".join("-" if value is None else f"{value:.{digits}f}" for value in values)
 
 
-def _interval(row: dict[str, Any]) -> str:
+def _interval(row: PlainTable) -> str:
     ends = zip(row["rmse_low"], row["rmse_high"], strict=True)
     return " ".join(f"{_number(low, k)}..{_number(high, k)}" for k, (low, high) in enumerate(ends))
 
 
-CELLS: dict[str, Callable[[dict[str, Any]], str]] = {
+CELLS: dict[str, Callable[[PlainTable], str]] = {
     "method": lambda row: str(row["method"]),
     "RMSE": lambda row: _three(row["rmse"]),
     "as in the thesis": lambda row: _joined(row["thesis"], 2),

@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,21 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
+from mitsonar.datasets.response_samples import ImpulseSamples
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, meant
-from mitsonar.estimation.benchmark import VARIATIONS, Answers, answers_of, bounds_of_pairs, chosen, rows_of, with_prior
+from mitsonar.estimation.benchmark import (
+    VARIATIONS,
+    Answers,
+    Samples,
+    answers_of,
+    bounds_of_pairs,
+    chosen,
+    rows_of,
+    with_prior,
+)
 from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
+from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
 from mitsonar.estimation.named_estimators import estimator_from
 from mitsonar.io.provenance import digest, versions
@@ -75,22 +85,22 @@ class Bench:
         scenes: number of each pair's scene ``(n,)``.
     """
 
-    methods: dict[str, Any]
+    methods: dict[str, AnyEstimator]
     levels: dict[str, NoiseModel | None]
-    samples: dict[str, Any]
+    samples: dict[str, Samples]
     numbers: list[int]
     truth: Array
     scenes: NDArray[np.int64]
 
     @property
-    def first(self) -> Any:
+    def first(self) -> Samples:
         """The samples at the first level of noise."""
         return next(iter(self.samples.values()))
 
 
 def compare(
     data: str, asked: Asked, out: str | Path | None = None, begin: Begin = lambda what, pairs: nullcontext(lambda done: None)
-) -> dict[str, Any]:
+) -> PlainTable:
     """Ask all estimators of the same pairs, and tell their errors; failures count as zero motion.
 
     Args:
@@ -172,7 +182,7 @@ def _bench(data: str, asked: Asked) -> Bench:
     return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]])
 
 
-def _settings(bench: Bench, asked: Asked) -> dict[str, Any]:
+def _settings(bench: Bench, asked: Asked) -> PlainTable:
     """What decides the answers; levels of noise may be added later."""
     chosen_of, recipe = bench.first.chosen, bench.first.recipe
     said = json.dumps(recipe.model_dump(), default=str)
@@ -202,21 +212,21 @@ def _key(level: str, model: NoiseModel | None) -> str:
 
 def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
     """The physical limit by law, over some of the pairs; empty where it is not asked for, and of impulse responses."""
-    model = bench.levels[level]
-    if not limit or model is None:
+    model, samples = bench.levels[level], bench.samples[level]
+    if not limit or model is None or isinstance(samples, ImpulseSamples):
         return {}
     found = kept.load_bounds(_key(level, model), limit)
     if found is None:
         places = np.linspace(0, len(bench.numbers) - 1, min(limit, len(bench.numbers))).astype(int)
         with begin("limit", len(places)) as progress:
-            found = bounds_of_pairs(bench.samples[level], [bench.numbers[k] for k in places], model, progress)
+            found = bounds_of_pairs(samples, [bench.numbers[k] for k in places], model, progress)
         kept.keep_bounds(_key(level, model), limit, found)
     return found
 
 
 def _table(
     bench: Bench, asked: Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
-) -> dict[str, Any]:
+) -> PlainTable:
     """Errors of all methods, as JSON can hold them."""
     said = dict(answers)
     if asked.prior:

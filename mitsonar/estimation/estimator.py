@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion
+from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.view_frames import ViewFrames
 
 __all__ = [
     "FEWEST_BLOCKS",
@@ -21,6 +23,8 @@ __all__ = [
     "AnyEstimator",
     "Estimate",
     "Estimator",
+    "PlainTable",
+    "Record",
     "blank",
     "correlation_of",
     "matching_rejection",
@@ -45,6 +49,16 @@ FEWEST_BLOCKS = 8.0
 """Parts of a frame that share what is matched: one object alone tells little, and its height is not known."""
 
 
+PlainTable = dict[str, Any]
+"""What JSON holds, by key: texts, numbers, lists, tables and None."""
+
+Real = NDArray[np.integer | np.floating]
+"""An array of real numbers."""
+
+Record = SonarFrames | ViewFrames | ImpulseResponses
+"""What an estimator may consume."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """What an estimator says of two frames.
@@ -61,7 +75,7 @@ class Estimate:
     covariance: NDArray[np.float64] | None = None
     valid: bool = True
     reason: str = ""
-    about: dict[str, Any] = field(default_factory=dict)
+    about: PlainTable = field(default_factory=dict)
 
 
 def rejected(reason: str) -> Estimate:
@@ -97,7 +111,7 @@ class Estimator(Protocol[Record_contra]):
 
 
 AnyEstimator = Estimator[Any]
-"""An estimator of whatever it consumes."""
+"""An estimator, whatever records it consumes."""
 
 
 def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -131,7 +145,7 @@ def blank(image: NDArray[np.float32]) -> bool:
     return bool(image.size == 0 or image.min() == image.max())
 
 
-def correlation_of(first: NDArray[Any], second: NDArray[Any]) -> float:
+def correlation_of(first: Real, second: Real) -> float:
     """Correlation coefficient of two arrays of one shape; 0 where either is constant."""
     a, b = first - first.mean(), second - second.mean()
     size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
@@ -145,9 +159,7 @@ def spread_of(shares: NDArray[np.floating]) -> float:
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0
 
 
-def matching_rejection(
-    first: NDArray[Any], second: NDArray[Any], inside: NDArray[np.bool_], *, alike: float, block: int = 32
-) -> str:
+def matching_rejection(first: Real, second: Real, inside: NDArray[np.bool_], *, alike: float, block: int = 32) -> str:
     """What speaks against two images ``(rows, columns)`` that should now be alike; empty where nothing does.
 
     Args:

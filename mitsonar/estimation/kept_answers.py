@@ -6,7 +6,6 @@ import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark import Answers
 from mitsonar.estimation.benchmark_tables import table_lines
 from mitsonar.estimation.crlb.image_crlb import LAWS
-from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_json, write_json, write_whole
 
@@ -49,7 +48,7 @@ class AnswerFolder:
     def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:
         """Keep bounds."""
 
-    def finish(self, report: dict[str, Any]) -> None:
+    def finish(self, report: PlainTable) -> None:
         """Write the tables."""
 
 
@@ -87,7 +86,7 @@ class AnswersOnDisk(AnswerFolder):
     def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
         """Keep answers as they come."""
         buffer = io.BytesIO()
-        arrays: dict[str, NDArray[Any]] = {}
+        arrays: dict[str, NDArray[np.generic]] = {}
         for name, one in answers.items():
             arrays |= one.arrays(name)
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
@@ -115,7 +114,7 @@ class AnswersOnDisk(AnswerFolder):
         """Keep bounds."""
         write_json(self._path(f"limit {level} {count}", ".json"), {law: std.tolist() for law, std in bounds.items()})
 
-    def finish(self, report: dict[str, Any]) -> None:
+    def finish(self, report: PlainTable) -> None:
         """Write the tables."""
         lines = [line for table in report["tables"] for line in table_lines(table)]
         write_whole(self.run.path / "table.md", ("\n".join(lines) + "\n").encode())
@@ -123,7 +122,7 @@ class AnswersOnDisk(AnswerFolder):
         self.run.finish()
 
 
-def kept_answers(out: str | Path | None, settings: dict[str, Any]) -> AnswerFolder:
+def kept_answers(out: str | Path | None, settings: PlainTable) -> AnswerFolder:
     """Where a comparison keeps its answers: in a folder, gone on with, or nowhere.
 
     Raises:

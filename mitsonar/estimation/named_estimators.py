@@ -33,7 +33,7 @@ __all__ = [
     "options_from",
 ]
 
-ESTIMATORS: dict[str, type[Any]] = {
+ESTIMATORS: dict[str, type[AnyEstimator]] = {
     "zero": Zero,
     "ecc": Ecc,
     "flow": Flow,
@@ -44,10 +44,13 @@ ESTIMATORS: dict[str, type[Any]] = {
 }
 """Those that nothing was trained for, of sonar frames and of impulse responses: ``consumes`` says which."""
 
+Options = dict[str, Any]
+"""Options of an estimator by name: numbers, or yes and no."""
+
 NAMES = (*ESTIMATORS, *SHIPPED)
 
 
-def create_estimator(name: str, **options: Any) -> AnyEstimator:
+def create_estimator(name: str, **options: object) -> AnyEstimator:
     """The estimator of that name.
 
     Raises:
@@ -133,7 +136,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     return Checkpoint.load(path)
 
 
-def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[str, Any]:
+def options_from(name: str, words: list[str], made: Callable[..., object]) -> Options:
     """Options of what makes an estimator, from words as the command line gives them.
 
     Raises:
@@ -157,7 +160,7 @@ def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[
     return options
 
 
-def _numbers(made: Callable[..., Any]) -> dict[str, tuple[str, str]]:
+def _numbers(made: Callable[..., object]) -> dict[str, tuple[str, str]]:
     """Options that are numbers or yes and no, as the command line names them, with their own name and type."""
     parameters = inspect.signature(made).parameters.values()
     kinds = {one.name: str(one.annotation) for one in parameters}

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from mitsonar.estimation.channel.pings import pings_of
-from mitsonar.estimation.estimator import Estimate, two_frames
+from mitsonar.estimation.estimator import Estimate, Record, two_frames
 from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Zero"]
 
-CHECKS: dict[type, Callable[[Any], object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
+CHECKS: dict[type, Callable[..., object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
 """What other estimators refuse, this one refuses."""
 
 
@@ -24,7 +23,7 @@ class Zero:
     inputs = "nothing"
     digest = ""
 
-    def estimate(self, records: Any, /) -> Estimate:
+    def estimate(self, records: Record, /) -> Estimate:
         """Answer no motion.
 
         Raises:

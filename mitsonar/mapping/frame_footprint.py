@@ -35,27 +35,27 @@ __all__ = [
 Floats = NDArray[np.float32]
 
 RAYS = 33
-"""Over bearing and over elevation, whose ends on the ground bound a footprint."""
+"""Rays over bearing, and over elevation, whose ends on the ground bound a footprint."""
 
 LONGEST_SIDE = 32_766
-"""Of an image or a patch, in cells: what OpenCV's remap takes."""
+"""Longest side of an image or a patch [cells]: the limit of OpenCV's remap."""
 
 
 @dataclass(frozen=True)
 class Fan:
-    """Geometry of one frame over the ground, and half its elevation field of view [rad]."""
+    """The geometry of one frame over the ground, and half of its elevation field of view [rad]."""
 
     ground: GroundGeometry
     half_elevation: float
 
     @property
     def window(self) -> tuple[float, float]:
-        """Near and far end of the range bins [m]."""
+        """Return the near and the far end of the range bins [m]."""
         return _ends(self.ground.range_m)
 
     @property
     def sector(self) -> tuple[float, float]:
-        """Port and starboard end of the beams [rad]."""
+        """Return the port and the starboard end of the beams [rad]."""
         return _ends(self.ground.bearing_rad)
 
 
@@ -63,7 +63,11 @@ class Fan:
 
 
 def levels_of(frames: SonarFrames) -> Floats:
-    """Images ``(frames, bins, beams)`` as float32 in 0..1."""
+    """Return the images ``(frames, bins, beams)`` as float32 in 0..1.
+
+    Raises:
+        MitsonarError: too few or too many bins or beams, axes that do not rise, pixels that are not finite.
+    """
     _, bins, beams = frames.image.shape
     if min(bins, beams) < 2 or max(bins, beams) > LONGEST_SIDE:
         raise MitsonarError(f"a mosaic needs images of 2 to {LONGEST_SIDE:,} bins and beams: got {bins:,} x {beams:,}")
@@ -78,13 +82,15 @@ def levels_of(frames: SonarFrames) -> Floats:
 def poses_and_heights(
     frames: SonarFrames, poses: ArrayLike | None, height_m: ArrayLike | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses ``(frames, 6)`` and heights ``(frames,)``, given or the frames' own."""
+    """Return poses ``(frames, 6)`` and heights ``(frames,)``: as given, or those of the frames.
+
+    Raises:
+        MitsonarError: neither are there, or their number or values do not fit.
+    """
     if poses is None and frames.poses is None:
         raise MitsonarError("the frames have no poses: give poses, such as those of an estimated path")
     if height_m is None and frames.height_m is None:
-        raise MitsonarError(
-            f"the frames do not tell their height: give {argument('height_m')}, the sonar's height over the ground"
-        )
+        raise MitsonarError(f"the frames hold no height: give {argument('height_m')}, the sonar's height over the ground")
     table = checked_poses(frames.poses if poses is None else poses)
     if len(table) != len(frames):
         raise MitsonarError(f"each frame needs a pose: got {len(table)} poses for {len(frames)} frames")
@@ -92,7 +98,11 @@ def poses_and_heights(
 
 
 def checked_heights(height_m: ArrayLike | None, count: int) -> NDArray[np.float64]:
-    """One height a frame ``(count,)``; nan where unknown."""
+    """Return one height a frame ``(count,)`` [m]; nan where unknown.
+
+    Raises:
+        MitsonarError: another number of heights, or a height that is not above 0.
+    """
     heights = np.asarray(height_m, dtype=float)
     if heights.shape not in ((), (count,)):
         raise MitsonarError(
@@ -104,6 +114,11 @@ def checked_heights(height_m: ArrayLike | None, count: int) -> NDArray[np.float6
 
 
 def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
+    """Return poses ``(frames, 6)`` [m, rad].
+
+    Raises:
+        MitsonarError: another shape, or a pose that is not finite.
+    """
     table = np.asarray(poses, dtype=float)
     if table.ndim != 2 or table.shape[1] != 6 or not np.isfinite(table).all():
         raise MitsonarError(f"poses must be (frames, 6), finite: got {table.shape}, x, y, z [m], pitch, roll, heading [rad]")
@@ -114,13 +129,14 @@ def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
 
 
 def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> Fan:
+    """Return the geometry of a frame at a pose and a height [m] over the ground."""
     at = Pose(*pose)
     ground = GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, float(height), at.pitch, at.roll)
     return Fan(ground, math.radians(frames.sonar.elevation_fov_deg) / 2)
 
 
 def middle_beams(fan: Fan, image: Floats, beams: int) -> tuple[Fan, Floats]:
-    """The beams in the middle alone."""
+    """Return the fan and the image ``(bins, beams)`` of the beams in the middle alone."""
     first = max(0, (image.shape[1] - beams) // 2)
     middle = slice(first, first + beams)
     ground = replace(fan.ground, bearing_rad=fan.ground.bearing_rad[middle])
@@ -128,9 +144,9 @@ def middle_beams(fan: Fan, image: Floats, beams: int) -> tuple[Fan, Floats]:
 
 
 def ground_outline(fan: Fan) -> NDArray[np.float64] | None:
-    """Ground points ``(n, 2)`` in heading axes around all that a frame can show; None where the ground is out of reach.
+    """Return ground points ``(n, 2)`` in heading axes around all that a frame can show; None where it shows no ground.
 
-    Rays that meet the ground beyond the window's end, or never, count as far as that end allows.
+    Rays that meet the ground beyond the far end of the window, or never, end where the window ends.
     """
     ground, far = fan.ground, fan.window[1]
     if not ground.height_m < far:  # nan too
@@ -145,17 +161,17 @@ def ground_outline(fan: Fan) -> NDArray[np.float64] | None:
 
 
 def _ends(centres: NDArray[np.float64]) -> tuple[float, float]:
-    """Outer edges of cells with these centres, as wide as their neighbours."""
+    """Return the outer edges of cells with these centres, as wide as their neighbours."""
     return float(1.5 * centres[0] - 0.5 * centres[1]), float(1.5 * centres[-1] - 0.5 * centres[-2])
 
 
 def from_middle(value: NDArray[np.floating], low: float, high: float) -> Floats:
-    """0 half-way between two ends, 1 at them."""
+    """Return the distance from the middle of two ends, as a part of half their distance: 1 at either end."""
     return np.asarray(np.abs(value - np.float32((low + high) / 2)) / np.float32((high - low) / 2), dtype=np.float32)
 
 
 def fractional_index(value: Floats, centres: NDArray[np.float64]) -> Floats:
-    """Fractional index of values among centres that rise."""
+    """Return the fractional index of values among centres that rise."""
     steps = np.diff(centres)
     if np.allclose(steps, steps[0], rtol=1e-6, atol=0):  # ten times as fast
         return np.asarray((value - np.float32(centres[0])) / np.float32(steps.mean()))
@@ -163,7 +179,7 @@ def fractional_index(value: Floats, centres: NDArray[np.float64]) -> Floats:
 
 
 def band_limited(image: Floats, bins2: float, beams2: float) -> Floats:
-    """The image smoothed as far as a cell of the map spans more than a bin or a beam, so that fine texture is averaged.
+    """Smooth an image as far as a cell of the map spans more than a bin or a beam, so that fine texture is averaged.
 
     Variances add up: a square of w bins has w^2 / 12, of which each bin has 1 / 12 already.
 
@@ -180,10 +196,10 @@ def band_limited(image: Floats, bins2: float, beams2: float) -> Floats:
     return np.asarray(cv2.GaussianBlur(image, kernel, across or 1.0, sigmaY=along or 1.0, borderType=cv2.BORDER_REPLICATE))
 
 
-def squared_span(places: Floats, weight: Floats) -> float:
-    """Squared width of a cell of the map in bins or beams, the median over some that are seen."""
-    rows, columns = (slice(1, None, max(1, size // 16)) for size in places.shape)
+def squared_span(indices: Floats, weight: Floats) -> float:
+    """Return the squared width of a cell of the map in bins or beams: the median over some cells that the frame shows."""
+    rows, columns = (slice(1, None, max(1, size // 16)) for size in indices.shape)
     before = slice(0, -1, rows.step), slice(0, -1, columns.step)
-    here, seen = places[rows, columns], weight[rows, columns] > 0
-    squared = np.square(here - places[before[0], columns]) + np.square(here - places[rows, before[1]])
+    here, seen = indices[rows, columns], weight[rows, columns] > 0
+    squared = np.square(here - indices[before[0], columns]) + np.square(here - indices[rows, before[1]])
     return float(np.median(squared[seen])) if seen.any() else 0.0

@@ -22,6 +22,8 @@ from mitsonar.records.columns import check_column, open_group
 from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
 
 if TYPE_CHECKING:
+    import zarr
+
     from mitsonar.datasets.store import DataStore
     from mitsonar.estimation.height.direct_height import HeightEstimator
 
@@ -29,6 +31,12 @@ __all__ = ["FrameSource", "is_data_set", "load_frames", "open_frames", "sequence
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+Pixels = NDArray[np.generic]
+"""Images ``(n, bins, beams)``: uint8 in 0..255, or float32 in 0..1."""
+
+StoredArray = Any
+"""An array of Zarr, whichever form of its metadata; read by indices."""
 
 CHUNK_BYTES = 8 * 2**20
 """Pixels that are read at a time, about."""
@@ -62,7 +70,7 @@ class FrameSource:
     name: str
     like: SonarFrames
     time_s: Array
-    images: Callable[[Index], NDArray[Any]]
+    images: Callable[[Index], Pixels]
     poses: Array | None = None
     height_m: Array | None = None
     pitch_rad: float | None = None
@@ -90,12 +98,15 @@ class FrameSource:
         time_s: Array,
         poses: Array | None,
         height_m: Array | None,
-        images: Callable[[Index], NDArray[Any]],
+        images: Callable[[Index], Pixels],
         name: str,
-        **more: Any,
+        *,
+        first_number: int = 0,
+        note: str = "",
     ) -> Self:
         time = np.asarray(time_s, dtype=float)
-        return cls(name, like, time.mean(axis=1) if time.ndim == 2 else time, images, poses, height_m, **more)
+        time = time.mean(axis=1) if time.ndim == 2 else time
+        return cls(name, like, time, images, poses, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
         """The same frames with noise of a seed, a function of it and each frame's number."""
@@ -290,12 +301,12 @@ def is_data_set(where: str | Path) -> bool:
     if not (path / "zarr.json").is_file():
         return False
     try:
-        return _group(path).attrs.get("kind") == "mitsonar data set"
+        return bool(_group(path).attrs.get("kind") == "mitsonar data set")
     except MitsonarError:
         return False
 
 
-def _group(path: Path) -> Any:
+def _group(path: Path) -> zarr.Group:
     import zarr
 
     try:
@@ -331,7 +342,7 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
         warnings.warn(said, MitsonarWarning, stacklevel=3)
     poses, height = table.get("poses"), table.get("height_m")
 
-    def images(index: Index) -> NDArray[Any]:
+    def images(index: Index) -> Pixels:
         picked = _picked(image, index)
         check_column(picked, "image", COLUMNS["image"], {}, str(path))
         return picked
@@ -389,7 +400,7 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
     return slice(first, first + int(lengths[number])), number, said
 
 
-def _picked(image: Any, index: Index) -> NDArray[Any]:
+def _picked(image: StoredArray, index: Index) -> Pixels:
     """Frames of a Zarr array; those at equal steps in one go."""
     steps = np.unique(np.diff(index))
     if len(index) and len(steps) <= 1 and (not len(steps) or steps[0] > 0):

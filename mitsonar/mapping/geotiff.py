@@ -14,7 +14,7 @@ __all__ = ["save_geotiff"]
 
 
 def save_geotiff(path: str | Path, mosaic: Mosaic) -> None:
-    """Write a GeoTIFF whole: bands mean, std and count as float32, nan where unknown, in metres of the local world.
+    """Write a GeoTIFF: bands mean, std and count as float32, nan where unknown, in metres of the local world.
 
     The reference system is a local engineering one: x east, y north, with no place on Earth (GeoTIFF 1.1: user-defined
     model, linear unit metre).

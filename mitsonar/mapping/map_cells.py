@@ -15,7 +15,7 @@ Floats = NDArray[np.float32]
 
 
 class Box(NamedTuple):
-    """Whole cells of the map, counted from the world's origin: first and one past the last, northwards and eastwards."""
+    """A box of cells, counted from the world's origin: the first and one past the last, northwards and eastwards."""
 
     south: int
     north: int
@@ -24,12 +24,12 @@ class Box(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
+        """Return the number of rows and columns."""
         return self.north - self.south, self.east - self.west
 
 
 class CellSums(NamedTuple):
-    """What each cell keeps ``(rows, columns)``: mean, weighted squares about it, weight, squared weights, frames."""
+    """Sums of each cell ``(rows, columns)``: mean, weighted squares about it, weight, squared weights, frames."""
 
     mean: Floats
     squares: Floats
@@ -39,7 +39,7 @@ class CellSums(NamedTuple):
 
 
 def accumulate(cells: CellSums, value: Floats, weight: Floats) -> None:
-    """Weighted mean and squares about it, updated in place (West 1979): no cancellation in float32."""
+    """Update the weighted mean and the squares about it in place (West 1979): no cancellation in float32."""
     cells.weight[...] += weight
     before = value - cells.mean
     cells.mean[...] += before * (weight / np.maximum(cells.weight, np.float32(1e-30)))
@@ -49,13 +49,13 @@ def accumulate(cells: CellSums, value: Floats, weight: Floats) -> None:
 
 
 def box_around(boxes: Iterable[Box]) -> Box:
-    """The smallest box around boxes."""
+    """Return the smallest box around boxes."""
     south, north, west, east = zip(*boxes, strict=True)
     return Box(min(south), max(north), min(west), max(east))
 
 
 def with_slack(old: Box, new: Box, slack: float) -> Box:
-    """The new box, larger on those sides where the old one had to grow."""
+    """Return the new box, enlarged on those sides where the old one had to grow."""
     if not math.prod(old.shape):
         return new
     rows, columns = (math.ceil(slack * size) for size in old.shape)

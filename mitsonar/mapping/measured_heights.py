@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from mitsonar.estimation.estimator import Record
     from mitsonar.estimation.height.direct_height import HeightEstimate, HeightEstimator
     from mitsonar.records.sonar_frames import SonarFrames
     from mitsonar.records.view_frames import ViewFrames
 
 __all__ = ["measured", "without_height"]
 
+Framed = TypeVar("Framed", "SonarFrames", "ViewFrames")
+
 
 def measured(
-    frames: SonarFrames | ViewFrames, by: HeightEstimator, like: SonarFrames | ViewFrames | None = None
-) -> tuple[Any, list[HeightEstimate]]:
+    frames: Framed, by: HeightEstimator, like: SonarFrames | ViewFrames | None = None
+) -> tuple[Framed, list[HeightEstimate]]:
     """Frames that tell the heights that an estimator finds in them, nan where it is not believed, and nothing else of their
     height; and what it said.
 
@@ -36,7 +39,7 @@ def measured(
     return replace(frames, height_m=heights, poses=_at(frames.poses, heights)), said
 
 
-def without_height(frames: Any) -> bool:
+def without_height(frames: Record) -> bool:
     """Whether heights were measured in these frames, and none was found."""
     told, poses = getattr(frames, "height_m", None), frames.poses
     if told is None or np.isfinite(told).any():

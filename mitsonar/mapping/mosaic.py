@@ -1,5 +1,8 @@
-"""Frames and a path become a mosaic: a map of the level ground with the mean level of each cell, how much the frames that
-saw it differ, and how many did (Almanza-Medina, 2.3.3 and 3.5.1, and a blend of our own)."""
+"""The mosaic: frames and a path become a map of the level ground.
+
+Each cell holds the mean level, its standard deviation over the frames, and the number of frames (Almanza-Medina, 2.3.3 and
+3.5.1; the blend ``weighted`` is our own).
+"""
 
 from __future__ import annotations
 
@@ -33,45 +36,45 @@ from mitsonar.mapping.map_cells import Box, CellSums, accumulate, box_around, wi
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Blend", "Mosaic", "build_mosaic"]
+Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 Blend = Literal["weighted", "centre"]
 
 CENTRE_BEAMS = 24
-"""Beams in the middle of the fan that the thesis draws (Almanza-Medina, 3.5.1)."""
+"""Beams in the middle of the fan that Almanza-Medina draws (3.5.1)."""
 
 MOST_CELLS = 2**25
-"""Cells that a map has at most unless told: 58 x 58 m in cells of 10 mm, and 20 bytes each."""
+"""Largest number of cells by default: 58 x 58 m in cells of 10 mm, 20 bytes each."""
 
 SLACK = 0.25
-"""A map that has to grow grows by this part of its size at least, so that long runs do not copy it at every frame."""
+"""Part of its size by which a map grows at least, so that long runs do not copy it at every frame."""
 
 LEAST_WEIGHT = 1e-3
-"""Below, a tapered weight is none: bins at the outline are half in the dark, and nothing else may see the cell."""
+"""Smaller weights count as 0: bins at the outline are half in the dark, and may be the only ones of their cell."""
 
 ONE_ALONE = 1e-3
-"""Of a cell's weight, what W - sum w^2 / W must exceed for a standard deviation: below, float32 loses it."""
+"""Part of a cell's weight W that W - sum w^2 / W must exceed for a standard deviation: float32 loses smaller ones."""
 
 
 class Mosaic:
-    """A map of the plane below the sonar, to which frames are added; its memory is bounded by the ground they cover.
+    """A map of the level plane below the sonar, to which frames are added. It grows where frames need it.
 
-    Cells are squares; their edges lie on whole multiples of ``cell_m`` in the world, so that maps of one cell size fit
-    together. The map grows where frames need it. Every cell takes from each frame that shows it the value at its own
-    (range, bearing), bilinear between the centres of bins and beams, over level ground with the exact geometry
-    (:class:`mitsonar.geometry.ground_plane.GroundGeometry`). Ground outside the window, the beams or the elevation field of
-    view is not
-    touched. A pixel of 0 within them counts: a shadow is dark. Not modelled: relief; what stands up lies too near.
+    Cells are squares. Their edges lie on whole multiples of ``cell_m`` in the world, so that maps of one cell size fit
+    together. A cell takes the value of each frame at its own (range, bearing), bilinear between the centres of bins and
+    beams, with the exact geometry over level ground (:class:`mitsonar.geometry.ground_plane.GroundGeometry`). Only ground
+    within the window, the beams and the elevation field of view is updated. There a pixel of 0 counts: a shadow is dark.
+    Relief is not modelled: objects that rise from the ground are mapped too near.
 
     Args:
         cell_m: edge of a cell [m].
         blend: ``weighted``: all beams, with weights cos^2 that fall to 0 at the edges of the fan in bearing and in range;
             ``centre``: the plain mean of the ``centre_beams`` in the middle (Almanza-Medina, 3.5.1).
         centre_beams: for ``centre``.
-        most_cells: what the map may grow to.
-        illumination: what :func:`illumination` found ``(bins, beams)``: images are divided by it, so that the fall-off of
-            the level with range, which moves with the sonar, neither shades the map nor adds to the standard deviation.
-            Levels may then exceed 1.
+        most_cells: largest number of cells.
+        illumination: of :func:`mitsonar.mapping.illumination.illumination` ``(bins, beams)``. Images are divided by it, so
+            that the fall-off of the level with range neither shades the map nor adds to the standard deviation. Levels may
+            then exceed 1.
 
     Raises:
         MitsonarError: an argument outside its limits.
@@ -102,14 +105,14 @@ class Mosaic:
         self.frames = 0
         """Frames added."""
         self.frames_without_ground = 0
-        """Of these, how many showed no ground at all: height unknown (nan), or beyond the window or the field of view."""
+        """How many of them showed no ground: height unknown (nan), or ground beyond the window or the field of view."""
         self._box = Box(0, 0, 0, 0)
         self._sums = np.zeros((len(CellSums._fields), 0, 0), np.float32)
 
     # ------------------------------------------------------------ frames in
 
     def reserve(self, frames: SonarFrames, poses: ArrayLike, height_m: ArrayLike) -> None:
-        """Make room for all frames of a run before the first is read; ``frames`` only tells the sonar.
+        """Allocate the map for all frames of a run before the first is read; of ``frames`` only the sonar is used.
 
         Args:
             frames: any frames of the run, one or more.
@@ -134,13 +137,13 @@ class Mosaic:
         *,
         whole: ArrayLike = False,
     ) -> None:
-        """Lay frames on the map.
+        """Add frames to the map.
 
         Args:
             frames: some frames of the run.
-            poses: of the sonar, one a frame ``(frames, 6)`` [m, rad]; default: what the frames say.
-            height_m: over the ground ``(frames,)`` or one for all [m]; default: what the frames say.
-            whole: frames that are laid with all beams whatever the blend ``(frames,)``, or one for all.
+            poses: of the sonar, one a frame ``(frames, 6)`` [m, rad]; default: those of the frames.
+            height_m: over the ground ``(frames,)`` or one for all [m]; default: those of the frames.
+            whole: frames that are added with all beams, whatever the blend ``(frames,)``, or one for all.
 
         Raises:
             MitsonarError: no poses or heights, numbers that do not fit, or a map beyond ``most_cells``.
@@ -159,7 +162,7 @@ class Mosaic:
                 self.frames_without_ground += 1
 
     def _flat(self, images: Floats) -> Floats:
-        """Images ``(frames, bins, beams)`` without what the illumination did to them."""
+        """Divide images ``(frames, bins, beams)`` by the illumination."""
         if self.illumination is None:
             return images
         if self.illumination.shape != images.shape[1:]:
@@ -168,8 +171,8 @@ class Mosaic:
             )
         return np.asarray(images / self.illumination.astype(np.float32))
 
-    def _lay(self, image: Floats, fan: Fan, pose: NDArray[np.float64]) -> bool:
-        """Add one image ``(bins, beams)``; whether it showed any ground."""
+    def _lay(self, image: Floats, fan: Fan, pose: Array) -> bool:
+        """Add one image ``(bins, beams)``; return whether it showed any ground."""
         box = self._footprint(fan, pose)
         if box is None:
             return False
@@ -185,15 +188,15 @@ class Mosaic:
         accumulate(self._patch(box), np.asarray(value), weight)
         return True
 
-    def _points(self, box: Box, pose: NDArray[np.float64]) -> Floats:
-        """Centres of cells ``(rows, columns, 2)`` in the sonar's heading axes; float32, since they are near it."""
+    def _points(self, box: Box, pose: Array) -> Floats:
+        """Return the centres of cells ``(rows, columns, 2)`` in the sonar's heading axes [m], as float32."""
         x = (np.arange(box.west, box.east) + 0.5) * self.cell_m - pose[0]
         y = (np.arange(box.south, box.north) + 0.5) * self.cell_m - pose[1]
         about = np.stack(np.meshgrid(x.astype(np.float32), y.astype(np.float32)), axis=-1)
         return np.asarray(moved(about, (0.0, 0.0, pose[5])))
 
     def _weights(self, fan: Fan, points: Floats, radius: Floats, bearing: Floats) -> Floats:
-        """Weight of each cell ``(rows, columns)``; 0 where the frame does not show it."""
+        """Return the weight of each cell ``(rows, columns)``; 0 where the frame does not show it."""
         across = from_middle(bearing, *fan.sector)
         elevation = from_middle(fan.ground.elevation(points), -fan.half_elevation, fan.half_elevation)
         along = np.maximum(elevation, from_middle(radius, *fan.window))
@@ -204,8 +207,8 @@ class Mosaic:
         taper = np.square(np.cos(quarter * across) * np.cos(quarter * along))
         return np.asarray(np.where(inside & (taper > LEAST_WEIGHT), taper, np.float32(0)))
 
-    def _footprint(self, fan: Fan, pose: NDArray[np.float64]) -> Box | None:
-        """Cells around the ground that a frame can show; None where there is none."""
+    def _footprint(self, fan: Fan, pose: Array) -> Box | None:
+        """Return the box around the ground that a frame can show; None where there is none."""
         reach = ground_outline(fan)
         if reach is None:
             return None
@@ -218,7 +221,7 @@ class Mosaic:
     # ------------------------------------------------------------ the map
 
     def _patch(self, box: Box) -> CellSums:
-        """A view of some cells."""
+        """Return the sums of some cells, not copied."""
         south, west = box.south - self._box.south, box.west - self._box.west
         rows, columns = box.shape
         return CellSums(*self._sums[:, south : south + rows, west : west + columns])
@@ -252,15 +255,15 @@ class Mosaic:
 
     @property
     def state_bytes(self) -> int:
-        """Memory that the map holds."""
+        """Return the memory of the map [bytes]."""
         return self._sums.nbytes
 
     @property
     def covered(self) -> Box:
-        """The smallest box of cells around all that was seen.
+        """Return the smallest box around all cells that frames show.
 
         Raises:
-            MitsonarError: nothing was seen.
+            MitsonarError: no frame shows ground.
         """
         seen = self._sums[CellSums._fields.index("seen")] > 0
         if not seen.any():
@@ -277,22 +280,23 @@ class Mosaic:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """West, east, south, north edge of the arrays below [m] (as matplotlib's ``extent``)."""
+        """Return the west, east, south and north edge of the arrays below [m] (matplotlib's ``extent``)."""
         south, north, west, east = self.covered
         return west * self.cell_m, east * self.cell_m, south * self.cell_m, north * self.cell_m
 
     @property
     def mean(self) -> Floats:
-        """Mean level ``(rows, columns)`` in 0..1; row 0 northernmost, column 0 westernmost; nan where nothing was seen."""
+        """Return the mean level ``(rows, columns)`` in 0..1; row 0 northernmost, column 0 westernmost; nan where unknown."""
         found = self._north_up()
         return np.where(found.seen > 0, found.mean, np.float32(np.nan))
 
     @property
     def std(self) -> Floats:
-        """Standard deviation of the frames' levels in each cell, like ``mean``; nan where fewer than two saw it, or
-        one of them has nearly all the weight (:data:`ONE_ALONE`).
+        """Return the standard deviation of the frames' levels in each cell, shaped as ``mean``.
 
-        Without bias: sum w (x - mean)^2 / (W - sum w^2 / W), W = sum w; with equal weights that is over n - 1.
+        It is nan where fewer than two frames show the cell, or where one has nearly all the weight (:data:`ONE_ALONE`).
+        The variance is unbiased: sum w (x - mean)^2 / (W - sum w^2 / W) with W = sum w. With equal weights that is over
+        n - 1.
         """
         found = self._north_up()
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -302,12 +306,12 @@ class Mosaic:
 
     @property
     def weight(self) -> Floats:
-        """Sum of weights, like ``mean``; 0 where nothing was seen."""
+        """Return the sum of weights, shaped as ``mean``; 0 where unknown."""
         return self._north_up().weight
 
     @property
     def count(self) -> NDArray[np.int64]:
-        """Frames that saw each cell, like ``mean``."""
+        """Return the number of frames that show each cell, shaped as ``mean``."""
         return self._north_up().seen.astype(np.int64)
 
     def _north_up(self) -> CellSums:
@@ -325,15 +329,15 @@ def build_mosaic(
     most_cells: int = MOST_CELLS,
     illumination: Floats | None = None,
 ) -> Mosaic:
-    """The mosaic of a run, whose frames are read once, a chunk at a time.
+    """Build the mosaic of a run, whose frames are read once, a chunk at a time.
 
-    With ``centre``, the first and the last frame are laid whole (Almanza-Medina, 3.5.1).
+    With ``centre``, the first and the last frame are added whole (Almanza-Medina, 3.5.1).
 
     Args:
-        frames: of one sonar, all at once or in chunks that follow each other.
-        poses: of the sonar in the whole run ``(n, 6)`` [m, rad]: an estimated path; default: what the frames say.
-        height_m: over the ground ``(n,)`` or one for all [m]; default: what the frames say.
-        cell_m: as the rest, see :class:`Mosaic`.
+        frames: of one sonar, all at once or in consecutive chunks.
+        poses: of the sonar in the whole run ``(n, 6)`` [m, rad]: an estimated path; default: those of the frames.
+        height_m: over the ground ``(n,)`` or one for all [m]; default: those of the frames.
+        cell_m: see :class:`Mosaic`.
         blend: see :class:`Mosaic`.
         centre_beams: see :class:`Mosaic`.
         most_cells: see :class:`Mosaic`.
@@ -345,19 +349,15 @@ def build_mosaic(
     mosaic = Mosaic(cell_m, blend, centre_beams=centre_beams, most_cells=most_cells, illumination=illumination)
     table = None if poses is None else checked_poses(poses)
     heights = None if height_m is None else np.asarray(height_m, dtype=float)
-    done = 0
-    for chunk, last in _and_whether_last([frames] if isinstance(frames, SonarFrames) else frames):
+    done, chunks = 0, [frames] if isinstance(frames, SonarFrames) else frames
+    for chunk, last in _and_whether_last(chunks):
         part = slice(done, done + len(chunk))
-        if table is not None and part.stop > len(table):
-            raise MitsonarError(f"there are more frames than poses: got {len(table):,} poses; give a pose for each frame")
-        if heights is not None and heights.ndim and part.stop > len(heights):
-            raise MitsonarError(f"there are more frames than heights: got {len(heights):,}; give a height for each frame")
+        _check_enough(part.stop, table, heights)
         if not done and table is not None and heights is not None:
             mosaic.reserve(chunk, table, heights)
         whole = np.zeros(len(chunk), dtype=bool)
-        if len(chunk):
-            whole[0] |= not done
-            whole[-1] |= last
+        whole[:1] |= not done
+        whole[-1:] |= last
         mosaic.add(
             chunk,
             None if table is None else table[part],
@@ -365,16 +365,29 @@ def build_mosaic(
             whole=whole,
         )
         done = part.stop
-    for name, given in (("poses", table), ("heights", heights)):
-        if given is not None and given.ndim and done != len(given):
-            raise MitsonarError(f"there are more {name} than frames: got {len(given):,} for {done:,} frames")
+    _check_all_used(done, table, heights)
     if mosaic.frames == mosaic.frames_without_ground:
         raise MitsonarError(mosaic._empty())
     return mosaic
 
 
+def _check_enough(frames: int, poses: Array | None, heights: Array | None) -> None:
+    """Raise where there are more frames than poses or heights."""
+    if poses is not None and frames > len(poses):
+        raise MitsonarError(f"there are more frames than poses: got {len(poses):,} poses; give a pose for each frame")
+    if heights is not None and heights.ndim and frames > len(heights):
+        raise MitsonarError(f"there are more frames than heights: got {len(heights):,}; give a height for each frame")
+
+
+def _check_all_used(frames: int, poses: Array | None, heights: Array | None) -> None:
+    """Raise where there are more poses or heights than frames."""
+    for name, given in (("poses", poses), ("heights", heights)):
+        if given is not None and given.ndim and frames != len(given):
+            raise MitsonarError(f"there are more {name} than frames: got {len(given):,} for {frames:,} frames")
+
+
 def _and_whether_last(chunks: Iterable[SonarFrames]) -> Iterator[tuple[SonarFrames, bool]]:
-    """Each chunk, and whether it is the last one: one is read ahead."""
+    """Yield each chunk, and whether it is the last one; one is read ahead."""
     held = None
     for chunk in chunks:
         if held is not None:

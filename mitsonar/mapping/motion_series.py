@@ -27,10 +27,14 @@ class MotionSeries:
     Attributes:
         motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)`` (eq. 3.4).
         time_s: of the frames ``(frames,)``, increasing, not necessarily evenly.
-        covariances: of the motions' errors ``(frames - 1, 3, 3)`` [m, m, rad], where known.
-        believe: False where a motion, and its covariance, is not to be used ``(frames - 1,)``; not given, all are believed.
+        covariances: of the errors of the motions ``(frames - 1, 3, 3)`` [m, m, rad], where known.
+        valid: False where a motion and its covariance must not be used ``(frames - 1,)``; None: all are valid.
         with_next: covariance of each motion's error (rows) with that of the next (columns) ``(frames - 2, 3, 3)``. Errors
-            further apart depend on each other only through those between (Markov). Not given, they are independent.
+            further apart depend on each other only through those between (Markov). None: errors are independent.
+
+    Raises:
+        MitsonarError: shapes that do not fit, times that do not increase, no valid motion, or a valid motion that is not
+            finite or has no valid covariance.
     """
 
     motions: Array
@@ -48,9 +52,9 @@ class MotionSeries:
         if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
             raise MitsonarError("frame times must be finite and increase: sort the frames, or give their times")
         if self.believed.shape != (count,):
-            raise MitsonarError(f"believe must be ({count},), one for each motion: got {self.believed.shape}")
+            raise MitsonarError(f"valid must be ({count},), one for each motion: got {self.believed.shape}")
         if not self.believed.any():
-            raise MitsonarError(f"none of {count} motions is believed: nothing tells the path; try another estimator")
+            raise MitsonarError(f"none of {count} motions is valid, so that there is no path: try another estimator")
         self._refuse(~np.isfinite(self.motions).all(axis=1), "is not finite")
         if self.covariances is not None:
             self._check_covariances(self.covariances)
@@ -71,17 +75,19 @@ class MotionSeries:
         if where.size:
             raise MitsonarError(
                 f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} are so): "
-                "mark it as not believed, or leave it out"
+                "mark it as not valid, or leave it out"
             )
 
     def __len__(self) -> int:
-        """How many motions: one less than frames."""
+        """Return the number of motions: one less than frames."""
         return len(self.time_s) - 1
 
     @classmethod
     def from_estimates(cls, estimates: Sequence[Estimate], time_s: ArrayLike) -> Self:
-        """What an estimator said of consecutive frames at ``time_s`` ``(frames,)``; covariances only if every believed
-        estimate has one."""
+        """Collect the estimates of consecutive frames at ``time_s`` ``(frames,)`` [s].
+
+        The series has covariances only if every valid estimate has one.
+        """
         valid = np.array([estimate.valid for estimate in estimates], dtype=bool)
         unknown = np.full((3, 3), np.nan)
         covariances = [unknown if one.covariance is None else one.covariance for one in estimates]
@@ -91,22 +97,22 @@ class MotionSeries:
 
     @cached_property
     def believed(self) -> NDArray[np.bool_]:
-        """Which motions are to be used ``(frames - 1,)``."""
+        """Return which motions are valid ``(frames - 1,)``."""
         return np.ones(len(self), dtype=bool) if self.valid is None else self.valid
 
     @cached_property
     def step_s(self) -> Array:
-        """Time from frame to frame ``(frames - 1,)`` [s]."""
+        """Return the time from frame to frame ``(frames - 1,)`` [s]."""
         return np.diff(self.time_s)
 
     @cached_property
     def middle_s(self) -> Array:
-        """Time half-way through each motion ``(frames - 1,)`` [s]: its mean velocity is taken as the velocity then."""
+        """Return the time half-way through each motion ``(frames - 1,)`` [s], at which it has its mean velocity."""
         return (self.time_s[1:] + self.time_s[:-1]) / 2
 
     @cached_property
     def velocity(self) -> Array:
-        """Mean velocity of each motion in the vehicle's frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
+        """Return the mean velocity of each motion in the vehicle's frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
         return self.motions / self.step_s[:, None]
 
 
@@ -114,10 +120,10 @@ class MotionSeries:
 
 
 def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
-    """The path that motions drive from ``start``: :func:`mitsonar.motion.composition.compose` from frame to frame
-    (Almanza-Medina,
-    eq.
-    3.4), the inverse of :func:`mitsonar.motion.composition.motions`. Height, pitch and roll stay those of ``start``.
+    """Compose motions to a path from ``start`` (Almanza-Medina, eq. 3.4).
+
+    Each step is :func:`mitsonar.motion.composition.compose`; :func:`mitsonar.motion.composition.motions` is the inverse.
+    Height, pitch and roll stay those of ``start``.
 
     Args:
         motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)``.
@@ -142,8 +148,13 @@ def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
 
 
 def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
-    """Motions times one factor for each of sideways, forward, yaw ``(3,)``; their covariances with them. The thesis takes
-    2.3 for sideways (3.5.2), 9.0 for sideways and 4.0 for forward (3.5.3)."""
+    """Multiply motions and their covariances by a factor for each of sideways, forward, yaw ``(3,)``.
+
+    Almanza-Medina takes 2.3 for sideways (3.5.2), and 9.0 for sideways with 4.0 for forward (3.5.3).
+
+    Raises:
+        MitsonarError: not three finite factors.
+    """
     factor = np.asarray(factors, dtype=float)
     if factor.shape != (3,) or not np.isfinite(factor).all():
         raise MitsonarError(f"scale factors are three finite numbers, for sideways, forward, yaw: got {factors!r}")
@@ -153,10 +164,13 @@ def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
 
 
 def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
-    """Factors ``(3,)`` that bring estimated motions ``(frames - 1, 3)`` nearest to the true ones, of the same shape: least
-    squares through the origin for each axis. An axis that is estimated as zero throughout keeps the factor 1.
+    """Fit the factors ``(3,)`` from estimated to true motions, both ``(frames - 1, 3)``.
 
-    Noise in the estimates makes the factor smaller than their true scale by signal / (signal + noise) power.
+    Each axis is fitted by least squares through the origin. An axis whose estimates are all zero keeps the factor 1. Noise
+    in the estimates lowers a factor by signal / (signal + noise) power.
+
+    Raises:
+        MitsonarError: motions of different shapes, or not finite.
     """
     e, t = np.asarray(estimated, dtype=float), np.asarray(true, dtype=float)
     if e.shape != t.shape or e.ndim != 2 or e.shape[1] != 3 or not (np.isfinite(e).all() and np.isfinite(t).all()):

@@ -1,4 +1,8 @@
-"""Frames and an estimator become a path: motions between consecutive frames, bridged or smoothed, driven by eq. 3.4."""
+"""The odometry: frames and an estimator become a path.
+
+The stages are: select the frames, estimate the motion of each pair of consecutive frames, resolve ambiguous motions, scale,
+bridge or smooth the motions, and compose them to a path (Almanza-Medina, eq. 3.4).
+"""
 
 from __future__ import annotations
 
@@ -38,21 +42,21 @@ Row = tuple[str, float, str]
 Smoothing = Literal["none", "spline", "kalman"]
 
 MANY = 0.1
-"""Of the motions: when more are not believed, the path is rather a guess."""
+"""Fraction of invalid motions above which the user is warned: the path is then mostly interpolated."""
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """A path, and all that it was made of.
+    """A path, with all that it was computed from.
 
     Attributes:
         frames: numbers of the frames used, in their source ``(frames,)``.
-        estimates: what the estimator said of each pair.
-        series: the motions that the path is made of: scaled, bridged or smoothed; their covariances, where known.
-        path: poses at the frames' times.
-        true: where the sonar was, all frames of the source, where known.
+        estimates: of each pair of consecutive frames.
+        series: the motions of the path: scaled, bridged or smoothed; their covariances, where known.
+        path: poses at the times of the frames.
+        true: poses of the sonar at all frames of the source, where known.
         smooth: how the motions were smoothed.
-        factors: that the estimates were multiplied by, for sideways, forward, yaw ``(3,)``.
+        factors: by which the estimates were multiplied, for sideways, forward, yaw ``(3,)``.
         fitted: whether these factors come from the true path.
     """
 
@@ -67,32 +71,35 @@ class Odometry:
 
     @property
     def believed(self) -> NDArray[np.bool_]:
-        """Which motions the estimator stands for ``(frames - 1,)``; the others were bridged."""
+        """Return which motions are valid ``(frames - 1,)``; the others were bridged."""
         return np.array([estimate.valid for estimate in self.estimates], dtype=bool)
 
     @property
     def true_at_frames(self) -> Trajectory | None:
-        """The true path at the frames used."""
+        """Return the true path at the frames used; None where it is not known."""
         return None if self.true is None else Trajectory(self.true.poses[self.frames], self.true.time_s[self.frames])
 
     @cached_property
     def pose_covariances(self) -> Array | None:
-        """Of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``, as if motions erred independently; what they err
-        in common, such as a scale by a wrong height, is not in it. None where the motions' covariances are not known."""
+        """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
+
+        Errors of different motions count as independent. Common errors, such as a wrong scale by a wrong height, are not
+        included. None where the covariances of the motions are not known.
+        """
         if self.series.covariances is None:
             return None
         return pose_covariances(self.series, Pose(*self.path.poses[0]))
 
     def rows(self) -> list[Row]:
-        """Name, value and unit of all that is told about the path: the one table for console, file and README."""
+        """Return name, value and unit of all results: the one table for console, file and README."""
         count = len(self.estimates)
         rows: list[Row] = [("motions", count, ""), ("motions not believed, bridged", count - int(self.believed.sum()), "")]
         how = "fitted to the true path" if self.fitted else "as given"
         if self.fitted or (self.factors != 1).any():
             rows += [(f"scale of {axis.name}, {how}", float(f), "") for axis, f in zip(AXES, self.factors, strict=True)]
         if self.series.covariances is not None:
-            told = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
-            rows += _by_axis("standard deviation of a motion as told", in_units(told))
+            std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
+            rows += _by_axis("standard deviation of a motion as told", in_units(std))
         true = self.true_at_frames
         if self.true is None or true is None:
             return [*rows, ("estimated path length", path_length(self.path), "m")]
@@ -105,7 +112,7 @@ class Odometry:
         return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
 
     def warnings(self) -> list[str]:
-        """What the user should know: how many motions are not believed, and why."""
+        """Return what the user should know: how many motions are invalid, and why."""
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         if len(lost) <= MANY * len(self.estimates):
             return []
@@ -128,52 +135,41 @@ def odometry(
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> Odometry:
-    """The path that a sonar took, from its frames.
+    """Estimate the path of a sonar from its frames.
 
-    Motions that are not believed are bridged: from those around them. ``smooth`` says what else is assumed of the vehicle:
-
-    - ``none``: nothing. The path's end hardly depends on smoothing, since errors that average out in a smoothed motion
-      average out in the sum as well, and corners stay corners.
-    - ``spline``: the velocity changes slowly; how slowly is found by cross validation.
-    - ``kalman``: the velocity walks at random; how far is found by maximum likelihood. Covariances are smoothed with it.
+    Invalid motions are bridged from their neighbours. ``smooth`` says what else is assumed of the velocity: ``none``
+    assumes nothing and keeps corners; ``spline`` assumes slow changes, their period chosen by cross validation; ``kalman``
+    assumes a random walk, its size chosen by maximum likelihood, and smooths the covariances too.
 
     Args:
         frames: of one run.
-        estimator: what tells the motion between two frames.
+        estimator: estimates the motion between two frames.
         smooth: see above.
-        scale: factors for sideways, forward, yaw ``(3,)``, or ``fit``: those that bring the believed motions nearest to the
-            true ones.
+        scale: factors for sideways, forward, yaw ``(3,)``; ``fit``: by least squares of valid against true motions.
         start: the first pose; default: the true one, or the origin with the height, pitch and roll of the first frame.
         every: use every so many frames only.
-        workers: 1, this process; more, so many beside it. The result is the same, to the bit.
-        known: estimates by the number of their pair, from an earlier try.
-        keep: called with each new estimate.
+        workers: processes beside this one; 1: none. The result is the same, to the bit.
+        known: estimates of an earlier run, by the number of their pair.
+        keep: called with the number and the estimate of each new pair.
         progress: called with the number of pairs that were added.
 
     Raises:
-        MitsonarError: fewer than two frames, times that do not increase, frames without what the estimator needs, no motion
-            that is believed, ``fit`` without true poses.
+        MitsonarError: fewer than two frames, times that do not increase, frames without what the estimator needs, no valid
+            motion, ``fit`` without true poses.
     """
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     numbers = _frames_used(source, smooth, scale, every)
     estimates = estimate_motions(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
     estimates = continued(estimates)
     measured = series_of(estimates, source.time_s[numbers])
-    true = source.true
-    factors = np.ones(3)
-    if isinstance(scale, str):
-        assert true is not None
-        fit_on = measured.believed
-        factors = fit_scale(measured.motions[fit_on], motions(true.poses[numbers])[fit_on])
-    elif scale is not None:
-        factors = np.asarray(scale, dtype=float)
+    factors = _scale_factors(measured, source.true, numbers, scale)
     series = _SMOOTHED[smooth](scaled(measured, factors))
     path = path_of(series.motions, start or _start(source, int(numbers[0])), series.time_s)
-    return Odometry(numbers, estimates, series, path, true, smooth, factors, isinstance(scale, str))
+    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str))
 
 
 def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int) -> Index:
-    """Numbers of the frames; what cannot work is refused before hours of estimating."""
+    """Return the numbers of the frames. Reject arguments that cannot work before hours of estimating."""
     if every < 1:
         raise MitsonarError(f"{argument('every')} must be at least 1: got {every}")
     numbers = np.arange(0, len(source), every)
@@ -187,13 +183,24 @@ def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, eve
         raise MitsonarError(
             f"scale is three factors or fit: got {scale!r}"
             if scale != "fit"
-            else f"{source.name} does not tell the true poses, which scale fit needs: give three factors"
+            else f"{source.name} holds no true poses, which scale fit needs: give three factors"
         )
     return numbers
 
 
+def _scale_factors(
+    measured: MotionSeries, true: Trajectory | None, numbers: Index, scale: ArrayLike | Literal["fit"] | None
+) -> Array:
+    """Return the factors for sideways, forward, yaw ``(3,)``: ones, as given, or fitted to the true path."""
+    if isinstance(scale, str):
+        assert true is not None
+        valid = measured.believed
+        return fit_scale(measured.motions[valid], motions(true.poses[numbers])[valid])
+    return np.ones(3) if scale is None else np.asarray(scale, dtype=float)
+
+
 def _start(source: Source, first: int) -> Pose:
-    """The true first pose, or what is known of it."""
+    """Return the true first pose, or what is known of it."""
     if source.poses is not None:
         return Pose(*(float(value) for value in source.poses[first]))
     height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
@@ -208,23 +215,26 @@ def _by_axis(what: str, values: Array) -> list[Row]:
 
 
 def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
-    """Estimates as a series.
+    """Return the motions of estimates at ``time_s`` ``(frames,)`` [s] as a series.
 
     Raises:
-        MitsonarError: none is believed; why is said.
+        MitsonarError: no estimate is valid; the message gives the most frequent reasons.
     """
     if estimates and not any(estimate.valid for estimate in estimates):
         reasons = _usual([estimate.reason for estimate in estimates])
         raise MitsonarError(
-            f"none of {len(estimates)} motions is believed, so that nothing tells the path ({reasons}): check what the "
-            "estimator is told (height, attitude, window or receivers), or try another one"
+            f"none of {len(estimates)} motions is believed, so that there is no path ({reasons}): check what the estimator "
+            "is given (height, attitude, window or receivers), or try another one"
         )
     return MotionSeries.from_estimates(estimates, time_s)
 
 
 def bridged(measured: MotionSeries) -> MotionSeries:
-    """Motions as measured; those that are not believed are filled in from the others: by the Kalman smoother, which tells
-    how far to trust it, where covariances are known, else by straight lines between the velocities around them."""
+    """Fill in invalid motions from the others; valid motions stay as measured.
+
+    Where covariances are known, the Kalman smoother fills the gaps and gives them a covariance. Otherwise the velocity is
+    interpolated linearly between its neighbours.
+    """
     known = np.flatnonzero(measured.believed)
     if known.size == len(measured):
         return measured
@@ -250,7 +260,7 @@ _SMOOTHED: dict[str, Callable[[MotionSeries], MotionSeries]] = {
 
 
 def _usual(reasons: list[str]) -> str:
-    """The most frequent reasons, whatever the numbers in them."""
+    """Return the most frequent reasons; reasons that differ in their numbers only count as one."""
     kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
     example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
     return "; ".join(f"{count} times such as {example[kind]!r}" for kind, count in kinds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Protocol, TypeVar, cast
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.errors import MitsonarError
@@ -22,6 +22,16 @@ __all__ = ["Reading", "Source", "frames_for", "open_source", "record_at", "views
 Source = FrameSource | ResponseSource | ViewSource
 
 Framed = TypeVar("Framed", FrameSource, ViewSource)
+
+
+class ViewReader(Protocol):
+    """An estimator that reads views of a data set: their names, and ``image`` or ``vector``."""
+
+    @property
+    def views(self) -> tuple[str, ...]: ...
+    @property
+    def kind(self) -> str: ...
+
 
 FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad")
 """Options that impulse responses lack."""
@@ -66,7 +76,7 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
         _check_consumed(where, there, wanted)
         return _responses_for(where, reading)
     if wanted is ViewFrames:
-        return _with_heights(_views_of(where, estimator, reading), reading)
+        return _with_heights(_views_of(where, cast(ViewReader, estimator), reading), reading)
     if reading.height_m is not None and reading.height_by is not None:
         raise MitsonarError("--height gives the height and --height-by measures it: give one of them")
     source = frames_for(where, reading)
@@ -96,7 +106,7 @@ def views_for(where: str, views: tuple[str, ...], kind: str, reading: Reading) -
     return open_views(where, views, kind, sequence=reading.sequence).with_noise(load_noise(reading.noise), reading.seed)
 
 
-def _views_of(where: str, estimator: Any, reading: Reading) -> ViewSource:
+def _views_of(where: str, estimator: ViewReader, reading: Reading) -> ViewSource:
     """The views that a network was trained on."""
     if any(option is not None for option in (reading.view, reading.height_m, reading.pitch_rad)):
         raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")

@@ -11,14 +11,13 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import AnyEstimator, Estimate, rejected
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record, rejected
 from mitsonar.mapping.measured_heights import without_height
 from mitsonar.mapping.open_source import Source
 
@@ -27,7 +26,7 @@ __all__ = ["estimate_motions"]
 Index = NDArray[np.intp]
 
 PAIRS_A_BATCH = 8
-"""What a worker is given at a time, and what a kill may cost."""
+"""Pairs that a worker gets at a time, and that a kill may cost."""
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -42,15 +41,15 @@ def estimate_motions(
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> list[Estimate]:
-    """What an estimator says of each pair of consecutive frames; some are in memory at a time.
+    """Estimate the motion of each pair of consecutive frames; only a few frames are in memory at a time.
 
     Args:
-        source: where the frames are.
-        estimator: what tells the motion.
-        frames: numbers of the frames ``(n,)``; pair k is of the k-th and the next of them.
-        workers: 1, this process; more, so many beside it, with one thread each.
-        known: estimates by the number of their pair, from an earlier try.
-        keep: called with each new estimate, in order.
+        source: of the frames.
+        estimator: estimates the motion between two frames.
+        frames: numbers of the frames ``(n,)``; pair k holds the k-th and the next of them.
+        workers: processes beside this one, with one thread each; 1: none.
+        known: estimates of an earlier run, by the number of their pair.
+        keep: called with the number and the estimate of each new pair, in order.
         progress: called with the number of pairs that were added.
 
     Raises:
@@ -72,7 +71,7 @@ def estimate_motions(
 
 
 def _batches(pairs: list[int]) -> list[range]:
-    """Pairs that follow each other, a few at a time."""
+    """Group consecutive pairs, a few at a time."""
     batches: list[range] = []
     for pair in pairs:
         if batches and batches[-1].stop == pair and len(batches[-1]) < PAIRS_A_BATCH:
@@ -85,7 +84,7 @@ def _batches(pairs: list[int]) -> list[range]:
 def _made_here(
     source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
-    """Estimates of this process."""
+    """Estimate in this process."""
     with _one_opencv_thread():
         for batch in batches:
             yield batch, _estimates(estimator, source.read(numbers[batch.start : batch.stop + 1]))
@@ -94,7 +93,7 @@ def _made_here(
 def _made_beside(
     source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
-    """Estimates of processes that are started anew; this one reads the frames."""
+    """Estimate in new processes; this one reads the frames."""
     with _one_thread_each():
         pool = ProcessPoolExecutor(
             min(workers, max(1, len(batches))), multiprocessing.get_context("spawn"), _begin_worker, (estimator,)
@@ -117,8 +116,8 @@ def _made_beside(
             pool.shutdown(cancel_futures=True)
 
 
-def _estimates(estimator: Any, frames: Any) -> list[Estimate]:
-    """Of consecutive frames or pings."""
+def _estimates(estimator: AnyEstimator, frames: Record) -> list[Estimate]:
+    """Estimate each pair of consecutive frames or pings."""
     pairs = [frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)]
     return [rejected("no height was found in the frames") if without_height(p) else estimator.estimate(p) for p in pairs]
 
@@ -135,7 +134,7 @@ def _one_opencv_thread() -> Iterator[None]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Processes that are started meanwhile compute with one thread: libraries read this when they are loaded."""
+    """Make new processes compute with one thread: libraries read these variables when they are loaded."""
     had = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
@@ -149,26 +148,25 @@ def _one_thread_each() -> Iterator[None]:
 
 
 _worker: AnyEstimator
-"""Of this process, where it is a worker."""
+"""The estimator of this process, where it is a worker."""
 
 
 def _begin_worker(estimator: AnyEstimator) -> None:
     global _worker
     _worker = estimator
     cv2.setNumThreads(1)
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches all processes of a terminal: the first one stops the others
+    # Ctrl-C reaches all processes of a terminal: the first one stops the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """A worker whose parent was killed would wait for ever."""
+    """End this worker when its parent was killed; it would wait forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-def _in_worker(frames: Any) -> list[Estimate]:
+def _in_worker(frames: Record) -> list[Estimate]:
     return _estimates(_worker, frames)

@@ -97,8 +97,7 @@ class ViewSource:
             return frames
         views, kind = self.altimeter.views or self.views, self.altimeter.kind if self.altimeter.views else self.kind
         same = (views, kind) == (self.views, self.kind)
-        found: ViewFrames = measured(frames, self.altimeter, frames if same else self._read(chosen, views, kind))[0]
-        return found
+        return measured(frames, self.altimeter, frames if same else self._read(chosen, views, kind))[0]
 
     def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
         """Pings as they are stored, with noise."""

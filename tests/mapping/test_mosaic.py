@@ -435,7 +435,7 @@ def wrong(change: str) -> SonarFrames:
     ("change", "options", "message"),
     [
         ("no poses", {}, "no poses"),
-        ("no height", {}, "do not tell their height"),
+        ("no height", {}, "hold no height"),
         ("nan", {}, "finite"),
         ("unsorted", {}, "rise"),
         ("below", {}, "above 0"),

@@ -129,8 +129,8 @@ def test_a_series_of_estimates() -> None:
         ({"covariances": np.full((9, 3, 3), np.nan)}, "frame 0 to 1 has a covariance that is not finite .9 of 9"),
         ({"covariances": np.tile(np.diag([1, 1, -1e-6]), (9, 1, 1))}, "negative variance"),
         ({"covariances": np.tile([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]], (9, 1, 1))}, "lopsided"),
-        ({"valid": np.zeros(9, dtype=bool)}, "none of 9 motions is believed"),
-        ({"valid": np.ones(8, dtype=bool)}, r"believe must be \(9,\)"),
+        ({"valid": np.zeros(9, dtype=bool)}, "none of 9 motions is valid"),
+        ({"valid": np.ones(8, dtype=bool)}, r"valid must be \(9,\)"),
         ({"with_next": np.zeros((9, 3, 3))}, r"with_next must be \(8, 3, 3\)"),
     ],
 )
@@ -248,7 +248,7 @@ def test_few_motions_are_joined_by_straight_lines() -> None:
     # velocities 1 at 0.5 s and 3 at 6 s
     wanted = np.interp(series.middle_s, [0.5, 6], [1, 3])[:, None] * [1, 0, 2] * series.step_s[:, None]
     np.testing.assert_allclose(spline_smoothed(series).motions, wanted, atol=1e-14)
-    with pytest.raises(MitsonarError, match="needs 5 believed motions: got 2"):
+    with pytest.raises(MitsonarError, match="needs 5 valid motions: got 2"):
         spline_period(series)
 
 
@@ -413,7 +413,7 @@ def test_constant_velocity_is_told_from_noise() -> None:
 def test_what_the_filter_cannot_work_with() -> None:
     _, measured = swaying(10)
     lonely = replace(measured, valid=np.arange(9) == 4)
-    with pytest.raises(MitsonarError, match="tells no change of velocity: give wander"):
+    with pytest.raises(MitsonarError, match="shows no change of velocity: give wander"):
         kalman_smoothed(lonely)
     np.testing.assert_allclose(kalman_smoothed(lonely, WANDER).velocity, np.tile(measured.velocity[4], (9, 1)), rtol=1e-9)
     with pytest.raises(MitsonarError, match="wander must be three positive numbers"):
@@ -503,5 +503,5 @@ def test_what_has_no_pose_covariance() -> None:
     _, measured = swaying(10)
     with pytest.raises(MitsonarError, match="needs those of the motions"):
         pose_covariances(replace(measured, covariances=None), START)
-    with pytest.raises(MitsonarError, match="2 motions are not believed"):
+    with pytest.raises(MitsonarError, match="2 motions are not valid"):
         pose_covariances(replace(measured, valid=np.arange(9) > 1), START)

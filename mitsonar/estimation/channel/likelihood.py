@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from mitsonar.estimation.channel.motion_score import MotionScore, judged
 from mitsonar.estimation.channel.motion_search import ReceiverBand, Search, receiver_bands_of
 from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.sub_bands import bands_of
-from mitsonar.estimation.estimator import Estimate, rejected
+from mitsonar.estimation.estimator import Estimate, PlainTable, rejected
 from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 
@@ -194,7 +194,7 @@ class Likelihood:
             spread += part * np.outer(one.motion - mean, one.motion - mean)
         gain = found[0].likelihood - alone
         listed = list(zip(share, found, strict=True)) if gain >= LEAST_GAIN else []
-        about: dict[str, Any] = {
+        about: PlainTable = {
             "modes": [(float(part), *(float(v) for v in _whole(one.motion, intervals))) for part, one in listed],
             "spreads": [_spread_of(one, free, intervals) for _, one in listed],
             "noise": [float(v) for v in found[0].noise],
@@ -219,7 +219,7 @@ def _spread_of(mode: Mode, free: list[int], intervals: int) -> list[list[float]]
     """Covariance of sideways, forward [m], yaw [rad] over all intervals, of one mode."""
     spread = np.zeros((4, 4))
     spread[np.ix_(free, free)] = mode.covariance
-    return np.asarray(intervals**2 * spread[:3, :3]).tolist()
+    return [[float(value) for value in row] for row in intervals**2 * spread[:3, :3]]
 
 
 def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search: Search, mode: Mode) -> Array:

@@ -100,7 +100,7 @@ class _PingRuns:
     @property
     def count(self) -> int:
         """How many runs."""
-        return self.inside.shape[1]
+        return int(self.inside.shape[1])
 
     @property
     def power(self) -> Array:

@@ -17,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -207,7 +207,7 @@ class ResponseCovariance:
         square metre. ``lag`` 0: of a ping with itself."""
         first, second = self.link_responses(motion, lag)
         weight = self.nodes.area * first.amplitude * second.amplitude
-        return self._taps_of(self._spectra(first, second, weight[None]))[0]
+        return np.asarray(self._taps_of(self._spectra(first, second, weight[None]))[0])
 
     def slopes(self, motion: ArrayLike, lag: float, free: Sequence[int]) -> Complex:
         """:meth:`covariance`, and how it changes with some of the motion's four numbers ``(1 + free, taps, taps)``.
@@ -226,7 +226,7 @@ class ResponseCovariance:
             weights.append((amplitude - 2j * np.pi * self.sonar.carrier_hz * weight * way) / (2 * STEP))
         return self._taps_of(self._spectra(first, second, self.nodes.area * np.array(weights)))
 
-    def _spectra(self, first: LinkResponse, second: LinkResponse, weight: NDArray[Any]) -> Complex:
+    def _spectra(self, first: LinkResponse, second: LinkResponse, weight: NDArray[np.inexact]) -> Complex:
         """Integrals over the ground at the frequencies of both pings ``(n, frequencies, frequencies)``, of n weights."""
         import finufft
 
@@ -236,7 +236,7 @@ class ResponseCovariance:
         turned = weight * np.exp(-2j * np.pi * self.sonar.carrier_hz * (first.delay - second.delay))
         count = made.shape[1]
         found = finufft.nufft2d1(x, y, turned, (count, count), eps=PRECISION, isign=-1, nthreads=1)
-        return np.asarray(found).reshape(len(weight), count, count)
+        return np.asarray(found, dtype=np.complex128).reshape(len(weight), count, count)
 
     def _taps_of(self, spectra: Complex) -> Complex:
         """Taps of both pings ``(n, taps, taps)`` of spectra ``(n, frequencies, frequencies)``."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_subject import Subject
 from mitsonar.estimation.crlb.image_crlb import LAWS, Bound, bounds_at, overall, varied
+from mitsonar.estimation.estimator import PlainTable
 from mitsonar.simulation.imaging import CALIBRATION_FRAMES, RenderedPings, Simulator, constant_gain
 
 __all__ = ["Table", "Value", "bounds_of_subject", "report_lines", "report_of"]
@@ -60,7 +60,7 @@ def bounds_of_subject(
     return table
 
 
-def _gain(simulator: Any, poses: NDArray[np.float64]) -> float:
+def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
     """The constant gain of all views of the first frames, as that of a run."""
     batches = []
     for looks in simulator.render_views(poses[:CALIBRATION_FRAMES]):
@@ -71,12 +71,12 @@ def _gain(simulator: Any, poses: NDArray[np.float64]) -> float:
     return constant_gain(batches)[0]
 
 
-def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> dict[str, Any]:
+def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
     """As JSON can hold it: numbers in mm and deg, null where there is no bound or the motion is not observable."""
     found = []
     for value, table in rows:
         for (portion, kind, law), bounds in table.items():
-            row: dict[str, Any] = {} if name is None else {name: value}
+            row: PlainTable = {} if name is None else {name: value}
             row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
             known = [one for one in bounds if one is not None]
             for frames, words in ((1, "one_frame"), (2, "two_frames")):
@@ -100,7 +100,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
 
 
-def report_lines(report: dict[str, Any]) -> list[str]:
+def report_lines(report: PlainTable) -> list[str]:
     """The table: least standard deviations."""
     name = report["vary"]
     titles = [name] if name else []

@@ -81,4 +81,4 @@ class FloorProfile:
         """Levels of the bins between edges ``(..., bins)``, at heights ``(...)``; their sum is 1 where all is within."""
         away, total = self._along
         ends = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
-        return np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1]
+        return np.asarray(np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1])

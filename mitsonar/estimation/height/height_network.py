@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.height.direct_height import Above, HeightEstimate, profile_of, rejection_of_profile
-from mitsonar.estimation.learned.trained_network import Trained, TrainedInstrument, answer_of, one_thread
+from mitsonar.estimation.learned.trained_network import NetworkInput, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.instruments.views import Whole
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.view_frames import ViewFrames
@@ -74,7 +74,7 @@ class HeightNetwork(Trained):
             )
         return HeightEstimate(height, std)
 
-    def _input(self, frame: Above) -> Any:
+    def _input(self, frame: Above) -> NetworkInput:
         """What the network reads, a batch of one."""
         if isinstance(frame, ViewFrames):
             return self._input_of_views(frame)
@@ -85,4 +85,6 @@ class HeightNetwork(Trained):
             )
         self._check_instrument(names[0], TrainedInstrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
         values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
-        return self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})(values, torch.arange(1)[None], 0)
+        arranged = self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})
+        inputs: NetworkInput = arranged(values, torch.arange(1)[None], 0)
+        return inputs

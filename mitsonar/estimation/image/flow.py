@@ -23,7 +23,7 @@ The thesis says no more than this. Unsaid there, and chosen here:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -212,7 +212,7 @@ def _slopes(image: Floats, inside: Floats) -> tuple[Floats, Floats]:
     return by_row * inside, by_column * inside
 
 
-def _in_windows(values: NDArray[Any], grid: WindowGrid) -> Doubles:
+def _in_windows(values: NDArray[np.floating], grid: WindowGrid) -> Doubles:
     """Sums over the windows ``(n, m)``."""
     sums = cv2.boxFilter(values, -1, grid.window[::-1], normalize=False, borderType=cv2.BORDER_CONSTANT)
     return sums[grid.centres].astype(np.float64)
@@ -237,7 +237,7 @@ def _correlation(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid
 
 def _structure(flow: WindowFlow, grid: WindowGrid) -> Doubles:
     """How much each window says of displacements, in cells, where both frames agree ``(n, m)``."""
-    return np.maximum((np.diagonal(flow.shared, axis1=2, axis2=3) * grid.spacing**2).sum(axis=-1), 0)
+    return np.asarray(np.maximum((np.diagonal(flow.shared, axis1=2, axis2=3) * grid.spacing**2).sum(axis=-1), 0))
 
 
 def _blocks(structure: Doubles) -> float:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.datasets.ground_nodes import ground_of
@@ -19,6 +19,7 @@ from mitsonar.estimation.learned.trained_network import BEYOND, Trained, Trained
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.warp_grid import Ground, WarpGrid
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -120,7 +121,7 @@ class ImageNetwork(Trained):
             return None
         return attitude_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
 
-    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Any:
+    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Tensor | GaussianHead:
         """What the network says of the frames, as a batch of one."""
         (view,) = self._checkpoint.arrangement["views"]
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)

@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ NORMAL_IQR = 1.349
 class Regression(Protocol):
     """What scikit-learn's regressors do."""
 
-    def fit(self, X: Array, y: Array) -> Any:
+    def fit(self, X: Array, y: Array) -> object:
         """Learn from features ``(n, features)`` and targets ``(n,)``."""
 
     def predict(self, X: Array) -> Array:

@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.datasets.arrangement import Arrangement
@@ -23,13 +23,28 @@ from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_errors import AXES, in_units
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
+from mitsonar.networks.gaussian_head import GaussianHead
+from mitsonar.networks.warp_grid import Ground
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
-__all__ = ["ANGLE_OFF_DEG", "BEYOND", "HEIGHT_OFF", "Trained", "TrainedInstrument", "answer_of", "inputs_of", "one_thread"]
+__all__ = [
+    "ANGLE_OFF_DEG",
+    "BEYOND",
+    "HEIGHT_OFF",
+    "NetworkInput",
+    "Trained",
+    "TrainedInstrument",
+    "answer_of",
+    "inputs_of",
+    "one_thread",
+]
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Ranges of the bins and bearings of the beams."""
+"""Ranges of the bins ``(bins,)`` [m] and bearings of the beams ``(beams,)`` [rad]."""
+
+NetworkInput = Tensor | tuple[Tensor | Ground, ...]
+"""What a network reads: a tensor, or a tuple of tensors and of the geometry of the ground."""
 
 BEYOND = 1.2
 """Answers beyond the motions of training by this factor are not believed."""
@@ -111,12 +126,13 @@ class Trained:
         self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
         self._last: tuple[bytes, Arrangement] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """For other processes: torch would share its tensors through file descriptors."""
         return {**asdict(self), "content": self._checkpoint.to_bytes()}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         content = state.pop("content")
+        assert isinstance(content, bytes)
         vars(self).update(state)
         self._take(Checkpoint.from_bytes(content))
 
@@ -125,7 +141,7 @@ class Trained:
         """``image`` or ``vector``, that it reads."""
         return str(self._checkpoint.arrangement["kind"])
 
-    def _input_of_views(self, frames: ViewFrames) -> Any:
+    def _input_of_views(self, frames: ViewFrames) -> NetworkInput:
         """What the network reads of the pings of its views, a batch of one.
 
         Raises:
@@ -144,7 +160,8 @@ class Trained:
         if frames.kind == "vector":  # noise has been drawn before
             values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
         axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
-        return self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+        inputs: NetworkInput = self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+        return inputs
 
     def _check_instrument(self, view: str, has: TrainedInstrument) -> None:
         """Refuse another sonar than that of training, unless it is forced."""
@@ -212,14 +229,15 @@ def inputs_of(checkpoint: Checkpoint) -> str:
     return INPUTS if checkpoint.arrangement["ground"] else f"nothing; {checkpoint.fixed} fixed by training"
 
 
-def answer_of(network: nn.Module, inputs: Any) -> Any:
+def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead:
     """What a network answers; several inputs come as a tuple.
 
     Raises:
         MitsonarError: inputs of a size that it cannot take.
     """
     try:
-        return called(network, inputs)
+        answer: Tensor | GaussianHead = called(network, inputs)
+        return answer
     except MitsonarError:
         raise
     except (RuntimeError, TypeError, ValueError, IndexError, AttributeError) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, rejected
+from mitsonar.estimation.estimator import Estimate, Record, rejected
 from mitsonar.estimation.learned.trained_network import Trained, answer_of, one_thread
 from mitsonar.instruments.views import SEGMENTS
 from mitsonar.motion.composition import Motion
@@ -71,7 +71,7 @@ class ViewNetwork(Trained):
         """Names of the views that it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
-    def estimate(self, frames: Any) -> Estimate:
+    def estimate(self, frames: ViewFrames) -> Estimate:
         """The motion between two pings, its covariance by validation, and whether to believe it.
 
         Args:
@@ -96,7 +96,7 @@ class ViewNetwork(Trained):
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
         return Estimate(motion, covariance, not reason, reason)
 
-    def _check_views(self, frames: Any) -> None:
+    def _check_views(self, frames: Record) -> None:
         """Two pings of views that it reads."""
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
