@@ -1,4 +1,4 @@
-"""Tables of a comparison or an evaluation as Markdown: what a column says of a row."""
+"""Tables of a comparison or an evaluation as Markdown."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from mitsonar.estimation.estimator import PlainTable
 __all__ = ["FEWEST_SCENES", "markdown", "table_lines"]
 
 FEWEST_SCENES = 10
-"""With fewer, clustered intervals hold much less than they say."""
+"""Fewest scenes for clustered intervals; with fewer they are much too narrow."""
 
 
 def table_lines(table: PlainTable) -> list[str]:
-    """A table of the report as Markdown."""
+    """Return a table of the report as lines of Markdown."""
     lines = ["", f"noise {table['noise']}, {table['variation']}", "", *markdown(table["rows"], COLUMNS)]
     if table["limits"]:
         known = {law: std for law, std in table["limits"].items() if any(value != 0 for value in std)}
@@ -29,7 +29,7 @@ def table_lines(table: PlainTable) -> list[str]:
 
 
 def markdown(rows: list[PlainTable], columns: Sequence[str]) -> list[str]:
-    """Methods as lines of a Markdown table with these columns of :data:`CELLS`."""
+    """Return the methods as lines of a Markdown table with these columns of :data:`CELLS`."""
     cells = [list(columns), ["---"] * len(columns), *([CELLS[column](row) for column in columns] for row in rows)]
     width = [max(len(row[k]) for row in cells) for k in range(len(columns))]
     return ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in cells]
@@ -72,7 +72,7 @@ CELLS: dict[str, Callable[[PlainTable], str]] = {
     "ms": lambda row: f"{row['ms']:.1f}",
     "inputs": lambda row: str(row["inputs"]),
 }
-"""What a column says of a row."""
+"""The text of a column, of a row."""
 
 COLUMNS = (
     *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),

@@ -13,18 +13,18 @@ from mitsonar.records.sonar_frames import SonarFrames
 __all__ = ["Zero"]
 
 CHECKS: dict[type, Callable[..., object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
-"""What other estimators refuse, this one refuses."""
+"""The checks of the other estimators: what they reject, this one rejects."""
 
 
 class Zero:
-    """No motion, whatever the records hold."""
+    """Estimates no motion, whatever the records hold."""
 
     consumes = object
     inputs = "nothing"
     digest = ""
 
     def estimate(self, records: Record, /) -> Estimate:
-        """Answer no motion.
+        """Return no motion.
 
         Raises:
             MitsonarError: records that no other estimator takes.

@@ -272,6 +272,15 @@ class Mosaic:
         south, west = self._box.south, self._box.west
         return Box(south + int(rows[0]), south + int(rows[-1]) + 1, west + int(columns[0]), west + int(columns[-1]) + 1)
 
+    def check_not_empty(self) -> None:
+        """Check that some frame shows ground.
+
+        Raises:
+            MitsonarError: no frame does.
+        """
+        if self.frames == self.frames_without_ground:
+            raise MitsonarError(self._empty())
+
     def _empty(self) -> str:
         return (
             f"the mosaic is empty: {self.frames} frames added, {self.frames_without_ground} of them show no ground; "
@@ -366,8 +375,7 @@ def build_mosaic(
         )
         done = part.stop
     _check_all_used(done, table, heights)
-    if mosaic.frames == mosaic.frames_without_ground:
-        raise MitsonarError(mosaic._empty())
+    mosaic.check_not_empty()
     return mosaic
 
 

@@ -123,7 +123,7 @@ class OdometryFolder:
             try:
                 pair, estimate = _estimate_in(line)
             except Exception:  # a line leads to whatever its bytes do
-                raise MitsonarError(f"{journal}, line {number} is damaged: begin again with --overwrite") from None
+                raise MitsonarError(f"{journal}, line {number} is damaged: start over with --overwrite") from None
             estimates[pair] = estimate
         return estimates
 
@@ -140,7 +140,7 @@ class OdometryFolder:
     # ---------------------------------------------------------------- results
 
     def write(self, found: Odometry, title: str, more: PlainTable) -> None:
-        """Write all results. The last one is ``run.json``, which says that they are complete."""
+        """Write all results. The last one is ``run.json``, which marks them as complete."""
         self.run.start()
         self.run.finished = False
         self.run.note(**more)
@@ -176,8 +176,7 @@ def run_odometry(
 ) -> Odometry:
     """Run :func:`mitsonar.mapping.odometry.odometry`, whose arguments it takes, and write the results to a folder.
 
-    The files are :data:`ODOMETRY`'s. A killed run resumes from ``estimates.jsonl``, also with another ``smooth``, ``scale``,
-    ``start``, ``frame`` or ``workers``.
+    :data:`ODOMETRY` lists the files. A killed run resumes, also with another ``smooth``, ``scale``, ``start`` or ``frame``.
 
     Args:
         source: of the records.
@@ -190,31 +189,34 @@ def run_odometry(
         frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
         every: as above.
         workers: as above.
-        overwrite: replace an odometry that is there.
-        resume: go on with an odometry that was interrupted.
+        overwrite: replace an odometry in the folder.
+        resume: go on with an interrupted one.
         progress: as above.
 
     Raises:
         MitsonarError: as ``odometry`` does; the folder holds something else, or cannot be written.
     """
     convention_named(frame)
-    asked = _asked(source, name, estimator, every)
-    folder = OdometryFolder(RunDirectory.begin(out, ODOMETRY, asked, resume=resume, overwrite=overwrite))
-    kept = folder.kept() if folder.run.resumed else {}
-    begun, named = time.perf_counter(), isinstance(scale, str) or scale is None
+    run = RunDirectory.begin(out, ODOMETRY, _asked(source, name, estimator, every), resume=resume, overwrite=overwrite)
+    folder = OdometryFolder(run)
+    kept, begun = folder.kept() if folder.run.resumed else {}, time.perf_counter()
     pipeline = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, workers=workers, progress=progress)
     found = pipeline(source, estimator, known=kept, keep=folder.keep)
     settings = {
-        **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": scale if named else "given"},
-        **{"frame": frame, **_found(found), "seconds": time.perf_counter() - begun},
+        **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": _named(scale), "frame": frame},
+        **{**_found(found), "seconds": time.perf_counter() - begun},
         **{"pairs_in_these_seconds": len(found.estimates) - len(kept), "workers": workers},
     }
     folder.write(found, f"{Path(source.name).name}, {name}", settings)
     return found
 
 
+def _named(scale: ArrayLike | Literal["fit"] | None) -> str | None:
+    return scale if isinstance(scale, str) or scale is None else "given"
+
+
 def _found(found: Odometry) -> PlainTable:
-    """Return what the record of the run tells of the path."""
+    """Return what the record of the run holds of the path."""
     lost = int((~found.believed).sum())
     return {"factors": found.factors, "from": found.path.poses[0], "not_believed": lost, "warnings": found.warnings()}
 
@@ -236,27 +238,27 @@ def _asked(source: Source, name: str, estimator: AnyEstimator, every: int) -> Pl
 def _line_of(pair: int, estimate: Estimate) -> str:
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
-    said = {"pair": pair, "motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
+    line = {"pair": pair, "motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
     alike = {name: estimate.about[name] for name in ("modes", "spreads") if name in estimate.about}
-    return json.dumps(said | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
+    return json.dumps(line | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
 
 
 def _estimate_in(line: bytes) -> tuple[int, Estimate]:
     """Parse the number of a pair and its estimate; a damaged line raises."""
-    said = parse_json(line, "the line")
-    covariance = None if said["covariance"] is None else np.array(said["covariance"], dtype=float)
-    motion = np.array(said["motion"], dtype=float)
-    if motion.shape != (3,) or not isinstance(said["reason"], str) or type(said["valid"]) is not bool:
+    table = parse_json(line, "the line")
+    covariance = None if table["covariance"] is None else np.array(table["covariance"], dtype=float)
+    motion = np.array(table["motion"], dtype=float)
+    if motion.shape != (3,) or not isinstance(table["reason"], str) or type(table["valid"]) is not bool:
         raise ValueError("motion, reason or valid is of another type")
-    if said["valid"] and not np.isfinite(motion).all():
+    if table["valid"] and not np.isfinite(motion).all():
         raise ValueError("the motion is not finite")
     if covariance is not None and (covariance.shape != (3, 3) or (np.diagonal(covariance) < 0).any()):
         raise ValueError("covariance is not a covariance")
-    about = said.get("about", {})
+    about = table.get("about", {})
     if not isinstance(about, dict):
         raise ValueError("about is no table")
-    pair = whole_number(said["pair"], "pair", 0, 2**40)
-    return pair, Estimate(Motion(*(float(value) for value in motion)), covariance, said["valid"], said["reason"], about)
+    pair = whole_number(table["pair"], "pair", 0, 2**40)
+    return pair, Estimate(Motion(*(float(value) for value in motion)), covariance, table["valid"], table["reason"], about)
 
 
 def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
@@ -275,10 +277,10 @@ def _motions_csv(found: Odometry) -> str:
     moved = in_units(found.series.motions)
     std = _std(found.series.covariances)
     for k, estimate in enumerate(found.estimates):
-        told = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
+        deviations = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
         numbers = [f"{value:.6f}" for value in moved[k]]
         frames = [int(found.frames[k]), int(found.frames[k + 1]), f"{found.series.time_s[k + 1]:.9g}"]
-        table.writerow([*frames, *numbers, *told, int(estimate.valid), estimate.reason])
+        table.writerow([*frames, *numbers, *deviations, int(estimate.valid), estimate.reason])
     return text.getvalue()
 
 

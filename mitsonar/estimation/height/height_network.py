@@ -1,4 +1,4 @@
-"""The height estimator that a checkpoint is: a network of one frame, or one vector (Almanza-Medina, 4.5)."""
+"""The height estimator of a checkpoint: a network of one frame, or of one vector (Almanza-Medina, 4.5)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from mitsonar.records.view_frames import ViewFrames
 __all__ = ["HeightNetwork"]
 
 BEYOND = 0.1
-"""Answers beyond the heights of training by this part of their interval are not believed."""
+"""Part of the interval of the heights of training by which a valid height may exceed it."""
 
 
 @dataclass(init=False, eq=False)
 class HeightNetwork(Trained):
-    """A trained network that tells heights.
+    """A trained network that estimates heights.
 
     Args:
         checkpoint: of it; it must take one frame.
@@ -38,7 +38,7 @@ class HeightNetwork(Trained):
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 1:
             raise MitsonarError(
-                f"this {checkpoint.network} tells motions of {checkpoint.arrangement['frames']} frames, not heights: give "
+                f"this {checkpoint.network} estimates motions of {checkpoint.arrangement['frames']} frames, not heights: give "
                 "one that was trained with input.frames: 1, or direct"
             )
         self.force = force
@@ -46,12 +46,12 @@ class HeightNetwork(Trained):
 
     @property
     def views(self) -> tuple[str, ...] | None:
-        """Names of the views that it reads; None: a single image."""
+        """Return the names of the views that it reads; None: a single image."""
         views = tuple(self._checkpoint.arrangement["views"])
         return None if views == (Whole.name,) else views
 
     def height(self, frame: Above) -> HeightEstimate:
-        """The height that the network says; its standard deviation is that of validation.
+        """Estimate the height; its standard deviation is that of validation.
 
         Raises:
             MitsonarError: not one frame, other views or another sonar than those of training.
@@ -75,7 +75,7 @@ class HeightNetwork(Trained):
         return HeightEstimate(height, std)
 
     def _input(self, frame: Above) -> NetworkInput:
-        """What the network reads, a batch of one."""
+        """Return the input of the network, a batch of one."""
         if isinstance(frame, ViewFrames):
             return self._input_of_views(frame)
         names = self._checkpoint.arrangement["views"]

@@ -282,7 +282,7 @@ class TestNetworks:
         blank = replace(level, values={view: 0 * one for view, one in level.values.items()})
         assert "nothing in the frame" in estimator.height(blank).reason
         motions = self.trained(heights, tmp_path / "motions", input={"kind": "vector", "views": ["c1"]})
-        with pytest.raises(MitsonarError, match="tells motions of 2 frames, not heights"):
+        with pytest.raises(MitsonarError, match="estimates motions of 2 frames, not heights"):
             HeightNetwork(motions)
 
     def test_the_network_trained_nearest_to_the_height_answers(
