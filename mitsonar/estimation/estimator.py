@@ -46,7 +46,7 @@ LEAST_AT_BEST = 0.3
 """Least correlation of registered frames: a maximum among noise reaches 0.1 to 0.2."""
 
 FEWEST_BLOCKS = 8.0
-"""Fewest blocks of a frame that share the matched energy: a single object is too little, and its height is not known."""
+"""Fewest blocks of a frame that share the matched energy: a single object is too little, its height is not known."""
 
 
 PlainTable = dict[str, Any]
@@ -96,11 +96,16 @@ class Estimator(Protocol[Record_contra]):
     """
 
     @property
-    def consumes(self) -> type: ...
+    def consumes(self) -> type:
+        """Return the class of the records that it reads; ``object`` for any."""
+
     @property
-    def inputs(self) -> str: ...
+    def inputs(self) -> str:
+        """Return what it needs beside the records, in words."""
+
     @property
-    def digest(self) -> str: ...
+    def digest(self) -> str:
+        """Return the digest of the weights of a trained one; empty for the others."""
 
     def estimate(self, records: Record_contra, /) -> Estimate:
         """Estimate the motion from the first to the last record.
@@ -153,7 +158,7 @@ def correlation_of(first: Real, second: Real) -> float:
 
 
 def spread_of(shares: NDArray[np.floating]) -> float:
-    """Return the effective number of blocks from the energy of each. Few bright ones do not hide many faint ones."""
+    """Return the effective number of blocks, from the energy of each. Few bright ones do not hide many faint ones."""
     amplitude = np.sqrt(np.maximum(shares, 0))
     energy = float((amplitude**2).sum())
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0

@@ -273,19 +273,13 @@ class Mosaic:
         return Box(south + int(rows[0]), south + int(rows[-1]) + 1, west + int(columns[0]), west + int(columns[-1]) + 1)
 
     def check_not_empty(self) -> None:
-        """Check that some frame shows ground.
-
-        Raises:
-            MitsonarError: no frame does.
-        """
+        """Raise a MitsonarError where no frame shows ground."""
         if self.frames == self.frames_without_ground:
             raise MitsonarError(self._empty())
 
     def _empty(self) -> str:
-        return (
-            f"the mosaic is empty: {self.frames} frames added, {self.frames_without_ground} of them show no ground; "
-            "check height, pitch and window"
-        )
+        added = f"{self.frames} frames added, {self.frames_without_ground} of them show no ground"
+        return f"the mosaic is empty: {added}; check height, pitch and window"
 
     @property
     def extent(self) -> tuple[float, float, float, float]:

@@ -174,13 +174,11 @@ def run_odometry(
     resume: bool = False,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> Odometry:
-    """Run :func:`mitsonar.mapping.odometry.odometry`, whose arguments it takes, and write the results to a folder.
-
-    :data:`ODOMETRY` lists the files. A killed run resumes, also with another ``smooth``, ``scale``, ``start`` or ``frame``.
+    """Run :func:`mitsonar.mapping.odometry.odometry` and write the results, the files of :data:`ODOMETRY`, to a folder.
 
     Args:
         source: of the records.
-        name: of the estimator, as the user gave it.
+        name: of the estimator, as given.
         estimator: estimates the motions.
         out: the folder; it is made.
         smooth: as ``odometry`` takes it.

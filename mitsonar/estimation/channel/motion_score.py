@@ -18,16 +18,16 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 NOISE = np.logspace(-6, 1.5, 46)
-"""Variances of noise that are tried, as parts of the mean power: below lies the error of the law's own integral."""
+"""Variances of noise that are tried, as parts of the mean power; the error of the covariance integral lies below."""
 
 
 class MotionScore(NamedTuple):
-    """What a receiver says of a motion.
+    """The log likelihood of a motion by one receiver.
 
     Attributes:
         likelihood: its logarithm.
-        gradient: by the motion's free numbers ``(k,)``.
-        information: about them ``(k, k)``.
+        gradient: by the free parameters of the motion ``(k,)``.
+        information: Fisher information of them ``(k, k)``.
         noise: its variance, as a part of the mean power.
     """
 
@@ -38,18 +38,18 @@ class MotionScore(NamedTuple):
 
 
 def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: Sequence[int], depth: int) -> MotionScore:
-    """What a receiver's pings ``(pings, taps)`` say of a motion from ping to ping, each judged by ``depth`` before it.
+    """Score a motion from ping to ping by the pings of one receiver ``(pings, taps)``.
 
-    The level of the ground's strength and the variance of noise are those that fit best.
+    Each ping is conditioned on ``depth`` pings before it. Level and variance of noise take their most likely values.
     """
     here, turn = receiver_band.turn @ motion, receiver_band.turn[np.ix_(free, free)]
     blocks = [receiver_band.law.slopes(here, lag, free if lag else ()) for lag in range(depth + 1)]
     taps = blocks[0].shape[1]
     power = float(np.diag(blocks[0][0]).real.mean())
-    told = [
+    runs = [
         _PingRuns.of(response, [block[0] for block in blocks[:pings]], sign) for pings, sign in ((depth + 1, 1), (depth, -1))
     ]
-    parts = [part for part in told if part is not None]
+    parts = [part for part in runs if part is not None]
     noise = NOISE * power
     energy = sum(part.sign * (part.power[:, None] / (part.size[:, None] + noise)).sum(axis=0) for part in parts)
     there = energy > 0  # what is left of ping given ping may be nothing, where a motion fits not at all
@@ -70,14 +70,14 @@ def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: 
 
 @dataclass(frozen=True)
 class _PingRuns:
-    """Runs of neighbouring pings: their covariance in its own directions.
+    """Runs of consecutive pings, with the eigenvectors of their covariance.
 
     Attributes:
-        sign: how it counts: 1, or -1 for what is given before.
-        pings: of a run.
+        sign: 1, or -1 for the pings that are conditioned on.
+        pings: number in a run.
         size: eigenvalues ``(n,)``.
         vectors: eigenvectors ``(n, n)``.
-        inside: the runs in them ``(n, runs)``.
+        inside: the runs as coefficients of the eigenvectors ``(n, runs)``.
     """
 
     sign: int
@@ -88,7 +88,7 @@ class _PingRuns:
 
     @classmethod
     def of(cls, response: Complex, blocks: list[Complex], sign: int) -> _PingRuns | None:
-        """Of all runs as long as there are blocks; those that are given before begin with the second ping."""
+        """Collect all runs as long as there are blocks; those that are conditioned on begin with the second ping."""
         first = 0 if sign > 0 else 1
         last = len(response) - len(blocks) + (0 if sign > 0 else -1)
         if not blocks or last < first:
@@ -99,16 +99,16 @@ class _PingRuns:
 
     @property
     def count(self) -> int:
-        """How many runs."""
+        """Return the number of runs."""
         return int(self.inside.shape[1])
 
     @property
     def power(self) -> Array:
-        """Along each eigenvector, of all runs."""
+        """Return the power along each eigenvector, of all runs."""
         return np.asarray((np.abs(self.inside) ** 2).sum(axis=1))
 
     def score(self, slopes: list[Complex], noise: float, level: float) -> tuple[Array, Array]:
-        """Gradient ``(k,)`` and information ``(k, k)``."""
+        """Return gradient ``(k,)`` and information ``(k, k)``."""
         solved = self.vectors @ (self.inside / (self.size + noise)[:, None])
         inverse = (self.vectors / (self.size + noise)) @ self.vectors.conj().T
         turned = [inverse @ slope for slope in slopes]

@@ -114,7 +114,7 @@ class DirectHeight:
         """Estimate the height over the floor.
 
         Raises:
-            MitsonarError: not one frame; neither a pitch that was given nor poses; a sonar whose field of view holds no ground.
+            MitsonarError: not one frame; neither a given pitch nor poses; a sonar whose field of view holds no ground.
         """
         profile, sonar = profile_of(frame)
         reason = rejection_of_profile(profile)
