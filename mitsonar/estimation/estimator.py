@@ -123,7 +123,7 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
     """Return the two images as float32 in 0..1.
 
     Raises:
-        MitsonarError: not two frames, too few bins or beams, axes that do not rise, levels that are not linear or not finite.
+        MitsonarError: not two frames, too few bins or beams, axes that do not rise, levels not linear or not finite.
     """
     if len(frames) != 2:
         raise MitsonarError(f"an estimator takes two frames: got {len(frames)}")
@@ -158,7 +158,7 @@ def correlation_of(first: Real, second: Real) -> float:
 
 
 def spread_of(shares: NDArray[np.floating]) -> float:
-    """Return the effective number of blocks, from the energy of each. Few bright ones do not hide many faint ones."""
+    """Return the effective number of blocks, from the energy of each. A few bright ones do not hide many faint."""
     amplitude = np.sqrt(np.maximum(shares, 0))
     energy = float((amplitude**2).sum())
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0

@@ -102,7 +102,7 @@ class Correlation:
 
 
 def _products(sonar: ChannelSonar, response: Complex, number: int, height_m: float) -> Products:
-    """Return the products of one receiver's pings ``(pings, taps)``; 0 before the first echo and outside the field of view."""
+    """Return the products of one receiver's pings ``(pings, taps)``; 0 outside the echoes of its field of view."""
     field = sonar.receivers[number].field
     cosine = height_m / np.maximum(sonar.delay_s * sonar.sound_speed / 2, height_m)
     sine = _along(field, cosine)

@@ -148,7 +148,7 @@ class ResponseCovariance:
         count = math.ceil(8 + NODES * cycles)
         if len(u) * count > MOST_POINTS:
             raise MitsonarError(
-                f"receiver {self.receiver.name} covers more ground than its covariance can be computed for: {len(u)} x {count} "
+                f"receiver {self.receiver.name} covers too much ground to compute its covariance: {len(u)} x {count} "
                 f"points; give it a field of view narrower than {wide:.0f} m on the ground"
             )
         w, dw = np.polynomial.legendre.leggauss(count)

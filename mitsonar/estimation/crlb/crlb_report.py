@@ -61,18 +61,21 @@ def bounds_of_subject(
 
 
 def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
-    """The constant gain of all views of the first frames, as that of a run."""
+    """Return the constant gain of all views of the first frames, as for a run."""
     batches = []
-    for looks in simulator.render_views(poses[:CALIBRATION_FRAMES]):
-        flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in looks], axis=1)
-        batches.append(RenderedPings(looks[0].first, flat[:, :, None], looks[0].counts, looks[0].height_m))
+    for views in simulator.render_views(poses[:CALIBRATION_FRAMES]):
+        flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in views], axis=1)
+        batches.append(RenderedPings(views[0].first, flat[:, :, None], views[0].counts, views[0].height_m))
     if not any(pings.levels.any() for pings in batches):
         raise MitsonarError("no ray met anything within the window: check the pose (pitch > 0 looks down) and the window")
     return constant_gain(batches)[0]
 
 
 def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
-    """As JSON can hold it: numbers in mm and deg, null where there is no bound or the motion is not observable."""
+    """Return the bounds as JSON can hold them.
+
+    Numbers are in mm and deg; they are null where there is no bound or the motion is not observable.
+    """
     found = []
     for value, table in rows:
         for (portion, kind, law), bounds in table.items():
@@ -101,7 +104,7 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
 
 
 def report_lines(report: PlainTable) -> list[str]:
-    """The table: least standard deviations."""
+    """Return the table of least standard deviations as lines."""
     name = report["vary"]
     titles = [name] if name else []
     titles += ["portion", "data", "law", "one frame: mm / mm / deg", "two frames: mm / mm / deg", "poses"]

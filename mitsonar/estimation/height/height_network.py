@@ -38,8 +38,8 @@ class HeightNetwork(Trained):
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 1:
             raise MitsonarError(
-                f"this {checkpoint.network} estimates motions of {checkpoint.arrangement['frames']} frames, not heights: give "
-                "one that was trained with input.frames: 1, or direct"
+                f"this {checkpoint.network} estimates motions of {checkpoint.arrangement['frames']} frames, not heights: "
+                "give one that was trained with input.frames: 1, or direct"
             )
         self.force = force
         self._take(checkpoint)

@@ -1,10 +1,10 @@
 """The estimator ``direct``: photometric Gauss-Newton in native polar coordinates, over level ground.
 
-The ground that a cell of one frame shows, the other frame shows where the exact geometry of the motion takes it. Each frame
-is drawn at the cells of the other, and both differences are used: a texture finer than a beam pulls the answer towards
-whole and half beams where both frames are interpolated at once. The slopes of the mean of both, as far as they rise over the
-noise, turn differences into motion. Single differences, and whole blocks that want to move by themselves, are weighed by
-Cauchy's law: shadow edges and relief are outliers.
+The exact geometry of a motion gives, for each cell of one frame, where the other frame shows the same ground. Each frame is
+drawn at the cells of the other, and both differences are used: where both frames are interpolated at once, a texture finer
+than a beam biases the estimate towards whole and half beams. The slopes of the mean of both frames, denoised, turn
+differences into motion. Single differences, and whole blocks that move on their own, have Cauchy weights: shadow edges and
+relief are outliers.
 """
 
 from __future__ import annotations
@@ -56,9 +56,8 @@ BLOCK_CAUCHY = 4.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
 
 MODEL = 4.5
-"""Squared errors over the covariance of the residuals, as found on rocky fields with high noise, thesis and physical model:
-the ground is neither level nor sampled finely enough. Without any noise errors are larger by a factor of 1.2 and 2 (standard
-deviations) than the covariance then says."""
+"""Squared errors over the covariance of the residuals, measured on rocky fields with high noise, thesis and physical model:
+the ground is neither level nor finely sampled. Without noise the standard deviations are too small by 1.2 and 2."""
 
 REMEMBERED = 4
 LEVER_M = 4.0
@@ -68,15 +67,15 @@ NEAR_M = 0.002
 must be before."""
 
 FARTHEST = np.array([0.15, 0.15, np.radians(3)])
-"""Motions that are found with certainty are 100 mm and 2 deg; a maximum far beyond is one among noise."""
+"""Largest valid motion. Motions up to 100 mm and 2 deg are always found; a maximum far beyond is noise."""
 
 FEWEST_CELLS = 500
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
-"""What an estimate that is to be believed must have besides: cells; standard deviations."""
+"""Fewest cells, and largest standard deviations [m, m, rad], of a valid estimate."""
 
 
 class _Fit(NamedTuple):
-    """What tells how good a motion is: covariance of the residuals' making, what a height wrong by 1 m changes, ..."""
+    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes."""
 
     converged: bool
     covariance: NDArray[np.float64]
@@ -91,10 +90,10 @@ class Direct:
     """Photometric registration with the exact geometry of the sonar over level ground.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
-        pitch_rad: default: what the frames say.
-        relief_m: mean height over the ground of what is seen: rocks, growth; default: from the first echoes, where the
-            window shows them, else 0. Motions are scaled wrongly by about its part of the height where it is not known.
+        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        pitch_rad: default: that of the frames.
+        relief_m: mean height of rocks and growth over the ground; default: from the first echoes, where the window shows
+            them, else 0. An unknown relief scales motions wrongly by about its part of the height.
         heave_std_m: how far the sonar may have risen or sunk between the frames; 0: not at all.
         levels: coarse to fine.
 
@@ -120,7 +119,11 @@ class Direct:
             )
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion, its covariance, and whether to believe it; zero motion where there is nothing to match."""
+        """Estimate the motion and its covariance; reject frames without anything to match.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
         first, second = two_frames(frames)
         attitude = attitude_of(frames, "direct", self.height_m, self.pitch_rad, self.relief_m)
         if attitude.reason:
@@ -147,32 +150,32 @@ class Direct:
     def _register(
         self, first: Floats, second: Floats, cells: Cells, start: NDArray[np.float64], level: DirectLevel, *, last: bool
     ) -> tuple[NDArray[np.float64], _Fit | None] | None:
-        """Gauss-Newton from a start; None where there is nothing to match."""
-        v, hasten, converged = start.copy(), _Hasten(), False
-        look = None
+        """Run Gauss-Newton from a start; None where there is nothing to match."""
+        v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
+        at = None
         for _ in range(level.iterations):
-            look = _look(first, second, cells, v, level, last=last)
-            if look is None:
+            at = _linearised(first, second, cells, v, level, last=last)
+            if at is None:
                 return None
-            held = self._held(look.scale, len(v))
-            step = np.asarray(-np.linalg.solve(look.normal + np.diag(held), look.pull + held * v), dtype=np.float64)
-            v = np.add(v, hasten(v, step))
+            held = self._held(at.scale, len(v))
+            step = np.asarray(-np.linalg.solve(at.normal + np.diag(held), at.pull + held * v), dtype=np.float64)
+            v = np.add(v, accelerate(v, step))
             converged = bool((np.abs(step[:3]) < STILL).all())
             if converged:
                 break
-        if not last or look is None:
+        if not last or at is None:
             return v, None
-        return v, _fit(look, cells, v, level, self._held(look.scale, len(v)), converged)
+        return v, _fit(at, cells, v, level, self._held(at.scale, len(v)), converged)
 
     def _held(self, scale: float, unknowns: int) -> NDArray[np.float64]:
-        """How strongly each unknown is held to zero: only heave is, in units of the residuals' noise."""
+        """Return the prior weight of each unknown in units of the residuals' noise: only heave has one."""
         held = np.zeros(unknowns)
         held[3:] = scale**2 / self.heave_std_m**2 if self.heave_std_m else 0.0
         return held
 
 
 class _Side(NamedTuple):
-    """One frame drawn at the cells of the other: what differs, and what a further motion would change."""
+    """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion."""
 
     before: Floats
     after: Floats
@@ -184,7 +187,7 @@ class _Side(NamedTuple):
     weighted: Floats
 
     def sums(self, values: Floats) -> NDArray[np.float64]:
-        """Maps ``(maps, cells)`` summed over blocks of the whole frame ``(maps, blocks)``."""
+        """Sum maps ``(maps, cells)`` over blocks of the whole frame ``(maps, blocks)``."""
         rows, columns = self.before.shape
         whole = np.zeros((len(values), rows, columns), dtype=np.float32)
         inside = whole[:, self.inner[0], self.inner[1]]
@@ -192,8 +195,8 @@ class _Side(NamedTuple):
         return _by_block(whole)
 
 
-class _Look(NamedTuple):
-    """Both sides at one motion, and the noise of their differences."""
+class _Linearisation(NamedTuple):
+    """Both sides at one motion, the noise of their differences, and the normal equations."""
 
     sides: list[_Side]
     scale: float
@@ -201,10 +204,10 @@ class _Look(NamedTuple):
     pull: NDArray[np.float64]
 
 
-def _look(
+def _linearised(
     first: Floats, second: Floats, cells: Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
-) -> _Look | None:
-    """The second frame drawn at the first's cells, at last also the other way; None where too little remains to compare."""
+) -> _Linearisation | None:
+    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains."""
     pairs = []
     for back in (False, True) if last else (False,):
         there = cells.shift(v, back=back)
@@ -227,21 +230,21 @@ def _look(
         sides.append(_Side(before, after, inner, slopes, residual, jacobian, weight, jacobian * weight))
     normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
     pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
-    return None if _singular(normal) else _Look(sides, scale, normal, pull)
+    return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
 
 
 def _fit(
-    look: _Look, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
+    at: _Linearisation, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
 ) -> _Fit:
-    """How good the motion is: from the pulls of blocks, and from slopes of one frame times those of the other."""
-    true = np.sum([_cross(side, cells, level) for side in look.sides], axis=0)
-    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else look.normal) + np.diag(held))
-    pulls = np.sum([side.sums(side.weighted * side.residual) for side in look.sides], axis=0)
-    side = look.sides[0]
+    """Assess the motion from the gradients of blocks, and from slopes of one frame times those of the other."""
+    true = np.sum([_cross(side, cells, level) for side in at.sides], axis=0)
+    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else at.normal) + np.diag(held))
+    pulls = np.sum([side.sums(side.weighted * side.residual) for side in at.sides], axis=0)
+    side = at.sides[0]
     shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
     lifted = cells.lifted_shift(v)
     by_height = np.zeros(len(v))
-    for one in look.sides:
+    for one in at.sides:
         by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
     # smoothed noise is alike in neighbouring cells: as many count once as a smoothing kernel covers
     alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
@@ -261,15 +264,15 @@ def _smoothed(image: Floats, level: DirectLevel) -> Floats:
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
 
 
-class _Hasten:
-    """Anderson's acceleration (1965): noise in the slopes makes steps too short, by what the last ones tell."""
+class _AndersonAcceleration:
+    """Anderson acceleration (1965): noise in the slopes shortens steps; the last steps show by how much."""
 
     def __init__(self) -> None:
         self.places: list[NDArray[np.float64]] = []
         self.steps: list[NDArray[np.float64]] = []
 
     def __call__(self, place: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The step to take instead of one; the same where the last ones tell too little, or too much."""
+        """Return an accelerated step; the given one where the last steps do not suffice."""
         lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
         if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
             return step
@@ -279,13 +282,13 @@ class _Hasten:
             return step
         places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
         past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
-        hastened = np.asarray(step - (places + steps) @ past)
-        lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (hastened, step)]
-        return hastened if lengths[0] < LONGEST * lengths[1] else step
+        accelerated = np.asarray(step - (places + steps) @ past)
+        lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (accelerated, step)]
+        return accelerated if lengths[0] < LONGEST * lengths[1] else step
 
 
 def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
-    """Cells that meet the ground and stay within both images; None where none does."""
+    """Return the cells that meet the ground and stay within both images; None where none does."""
     _, bins, beams = half.shape
     reach = np.abs(half).max(axis=(1, 2))
     if not np.isfinite(reach).all():
@@ -298,13 +301,13 @@ def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
 
 
 def _singular(normal: NDArray[np.float64]) -> bool:
-    """Whether some motion changes nothing."""
+    """Return whether some motion changes nothing."""
     size = np.sqrt(np.diag(normal))
     return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
 
 
 def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
-    """The normal matrix from slopes of one frame times slopes of the other, whose noise is not the same."""
+    """Return the normal matrix from slopes of one frame times slopes of the other, whose noise is independent."""
     frames = (side.before, side.after)
     one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
     product = ((one * side.weight) @ other.T).astype(np.float64)
@@ -312,9 +315,9 @@ def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]
 
 
 def _block_weight(slopes: tuple[Floats, Floats], residual: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
-    """Weights ``(cells,)`` of whole blocks: one that wants to move by itself shows relief, or a shadow.
+    """Return weights ``(cells,)`` of whole blocks: one that moves on its own shows relief, or a shadow.
 
-    How much it wants to is what its own best shift would take off its squared differences (Lucas and Kanade, 1981).
+    The measure is the decrease of its squared differences by its own best shift (Lucas and Kanade, 1981).
     """
     along, across = slopes[0][inner], slopes[1][inner]
     r, w = residual.reshape(along.shape), weight.reshape(along.shape)
@@ -325,27 +328,27 @@ def _block_weight(slopes: tuple[Floats, Floats], residual: Floats, weight: Float
     terms *= w
     aa, ab, bb, pull_a, pull_b = _by_block(terms)
     aa, bb = aa + 1e-3 * aa.mean() + 1e-12, bb + 1e-3 * bb.mean() + 1e-12
-    unrest = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
-    blocks = 1 / (1 + unrest / (BLOCK_CAUCHY**2 * float(np.median(unrest)) + 1e-12))
+    decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
+    blocks = 1 / (1 + decrease / (BLOCK_CAUCHY**2 * float(np.median(decrease)) + 1e-12))
     row, column = (_block_of(r.shape[k], BLOCK[k]) for k in (0, 1))
     table = blocks.reshape(row[-1] + 1, column[-1] + 1).astype(np.float32)
     return np.asarray(table[row][:, column]).ravel()
 
 
 def _block_of(size: int, block: int) -> NDArray[np.intp]:
-    """The block of each cell along an axis; cells beyond the last whole block belong to it."""
+    """Return the block of each cell along an axis; cells beyond the last whole block belong to it."""
     return np.minimum(np.arange(size) // block, max(size // block, 1) - 1)
 
 
 def _by_block(maps: Floats) -> NDArray[np.float64]:
-    """Sums over blocks ``(maps, blocks)``."""
+    """Sum over blocks ``(maps, blocks)``."""
     starts = [np.arange(0, max(size // block, 1) * block, block) for size, block in zip(maps.shape[1:], BLOCK, strict=True)]
     sums = np.add.reduceat(np.add.reduceat(maps, starts[0], axis=1), starts[1], axis=2)
     return np.asarray(sums.reshape(len(maps), -1), dtype=np.float64)
 
 
 def _rejection(fit: _Fit, covariance: NDArray[np.float64], v: NDArray[np.float64]) -> str:
-    """Why not to believe an estimate; empty where nothing speaks against it."""
+    """Return the reason of a rejection; empty for a valid estimate."""
     std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"

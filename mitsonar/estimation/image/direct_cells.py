@@ -37,7 +37,7 @@ class DirectLevel(NamedTuple):
 
 
 HEIGHT_STEP = 0.05
-"""Part of the height by which it is changed to see what depends on it."""
+"""Step of the height for numerical derivatives, as a part of it."""
 
 MOSTLY = 0.5
 """Part of the window that must show lit ground for the outline of the light to be left in."""
@@ -67,14 +67,14 @@ class Cells:
         self.seen = self._seen(known, np.radians(frames.sonar.elevation_fov_deg) / 2, reach)
 
     def _ground(self, height: float) -> GroundGeometry:
-        """The geometry at the nodes."""
+        """Return the geometry at the nodes."""
         grid, attitude = self.grid, self.attitude
         return GroundGeometry(
             grid.node_range, grid.node_bearing, self.bearing, height, attitude.pitch_rad, attitude.roll_rad
         )
 
     def _nodes(self, height: float) -> Floats:
-        """The derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``."""
+        """Return the derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``."""
         ground = self._ground(height)
         nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
         if self.heave:
@@ -82,10 +82,10 @@ class Cells:
         return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]]).astype(np.float32)
 
     def _seen(self, known: NDArray[np.bool_], half_elevation: float, reach: tuple[int, ...]) -> Floats | None:
-        """1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all do.
+        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
 
-        The outline of the lit ground moves with the sonar and holds estimates back. It is kept out where the ground is even,
-        and where a fan shows mostly what it cannot light; rocks blur it, and those that rise from beyond it help.
+        The outline of the lit ground moves with the sonar and biases motions to zero. It is masked where the ground is even,
+        and where most of the fan is not lit. Rocks blur it, and those that rise beyond it help.
         """
         with np.errstate(invalid="ignore"):
             lit = np.abs(self.ground.elevation(self.ground.points)) <= LIT * half_elevation
@@ -102,15 +102,17 @@ class Cells:
         return np.asarray(cv2.erode(on_all, np.ones(reach[::-1], np.uint8)) if mask_lit else on_all, dtype=np.float32)
 
     def _on_all(self, nodes: Floats) -> Floats:
-        """From the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
+        """Interpolate from the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
         full = self.grid.over_bins @ nodes @ self.grid.over_beams.T
         full[..., 0, :, :] /= self.grid.bin_m[:, None]
         full[..., 1, :, :] /= self.grid.beam_rad
         return np.asarray(full)
 
     def shift(self, v: NDArray[np.float64], *, back: bool = False) -> Floats:
-        """How far from each cell of the first frame the second shows its ground ``(2, bins, beams)``, in bins and beams; or
-        back: how far from each cell of the second the first shows it."""
+        """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
+
+        It is in bins and beams; with ``back``, from the second frame to the first.
+        """
         ground = other = self.ground
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
@@ -122,13 +124,13 @@ class Cells:
         return self._on_all(nodes[:, self.from_node[0], self.from_node[1]].astype(np.float32))
 
     def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
-        """The change of :meth:`shift` with the height, a metre, to first order in the motion."""
+        """Return the derivative of :meth:`shift` by the height [1/m], to first order in the motion."""
         change = HEIGHT_STEP * self.attitude.height_m
         other = self._nodes(self.attitude.height_m + change)
         return self._on_all(np.tensordot(v.astype(np.float32) / np.float32(change), other - self.nodes, axes=1))
 
     def along(self, slopes: tuple[Floats, Floats], inner: tuple[slice, slice]) -> Floats:
-        """The image's derivative by each motion ``(3 or 4, cells)``."""
+        """Return the derivative of the image by each component of the motion ``(3 or 4, cells)``."""
         by_bin, by_beam = slopes[0][inner], slopes[1][inner]
         jacobian = np.empty((len(self.derivative), *by_bin.shape), dtype=np.float32)
         for out, (bins, beams) in zip(jacobian, self.derivative, strict=True):

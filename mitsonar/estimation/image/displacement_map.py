@@ -89,7 +89,7 @@ class WindowGrid:
         return self.higher.points[self.centres]
 
     def map(self, v: Doubles) -> Doubles:
-        """The modelled displacement map of a motion [m, rad] ``(n, m, 2)``; zero where no ground is shown."""
+        """Return the modelled displacement map of a motion [m, rad] ``(n, m, 2)``; zero where no ground is shown."""
         return np.nan_to_num(np.stack(self.ground.to_polar(moved(self.points, v)), axis=-1) - self.home)
 
     def by_height(self, v: Doubles) -> Doubles:
@@ -108,5 +108,6 @@ def window_grid(
     roll: float,
     level: FlowLevel,
 ) -> WindowGrid:
+    """Return the windows of a level over level ground; heights in m, pitch and roll in rad."""
     ranges = np.array(range_m)[level.step // 2 :: level.step]
     return WindowGrid(GroundGeometry(ranges, np.array(bearing_rad), bearing, height, pitch, roll), level)

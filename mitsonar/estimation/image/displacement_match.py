@@ -80,8 +80,10 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
 
 
 def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | None:
-    """The motion whose modelled map has the same means in range and in bearing, and the same slope of the displacement in
-    range over bearing, as the displacement map; None where that is singular."""
+    """Fit the motion whose modelled map has the same three numbers as the measured one; None where that is singular.
+
+    They are the mean displacements in range and in bearing, and the slope of the displacement in range over bearing.
+    """
     found = grid.map(v) + flow.displacement
     used = flow.information.any(axis=(2, 3))
     count = int(used.sum())
@@ -107,7 +109,7 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
 
 
 def _apply(unknowns: Doubles, pull: Doubles) -> Doubles:
-    """What each window says of each unknown ``(n, m, unknowns)``."""
+    """Return the gradient by each unknown, of each window ``(n, m, unknowns)``."""
     return (np.swapaxes(unknowns, -1, -2) @ pull[..., None])[..., 0]
 
 
@@ -138,7 +140,7 @@ def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: f
 
 
 def in_blocks(values: Doubles) -> Doubles:
-    """Sums over blocks of windows ``(blocks, ...)``."""
+    """Sum over blocks of windows ``(blocks, ...)``."""
     for axis in (0, 1):
         values = np.add.reduceat(values, np.arange(0, values.shape[axis], BLOCK), axis=axis)
     return values.reshape(-1, *values.shape[2:])

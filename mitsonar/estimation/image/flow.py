@@ -1,4 +1,4 @@
-"""The estimator ``flow``: the deterministic method that the thesis compares its networks with, after Henson and Zakharov
+"""The estimator ``flow``: the deterministic method of Almanza-Medina's comparisons, after Henson and Zakharov
 ("Attitude-trajectory estimation for forward-looking multibeam sonar based on acoustic image registration", IEEE Journal of
 Oceanic Engineering, 2019; Almanza-Medina, 1.2.3, 2.3, 3.4.8).
 
@@ -6,7 +6,7 @@ Oceanic Engineering, 2019; Almanza-Medina, 1.2.3, 2.3, 3.4.8).
 2. The best match among the displacement maps of modelled sensor motions gives sideways, forward and yaw.
 3. A weighted regularised spline joins the motions of a run: :mod:`mitsonar.mapping.trajectory_smoothing`.
 
-The thesis says no more than this. Unsaid there, and chosen here:
+Almanza-Medina gives no further details. Chosen here:
 
 - The flow is Lucas and Kanade's: least squares of brightness within windows, with the slopes of both frames' mean. A window
   says how well it knows each direction, which weighs the match; flow that does not say so (Farnebäck's, DIS) measured worse.
@@ -59,9 +59,8 @@ LEAST_CORRELATION = 0.25
 FEWEST_BLOCKS = 4.0
 MOST_UNSEEN = 0.5
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
-"""What an estimate that is to be believed must have: correlation within windows of the frames as matched; blocks that hold
-the structure; the part of the structure that lies twice as far from the axis in elevation as the sonar sees; standard
-deviations."""
+"""Limits of a valid estimate: correlation within windows of the registered frames; blocks that hold the structure; the part
+of the structure that lies twice as far from the axis in elevation as the field of view; standard deviations [m, m, rad]."""
 
 
 class _Fit(NamedTuple):
@@ -79,8 +78,8 @@ class Flow:
     """Registration by optical flow, with the exact geometry of the sonar over level ground.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
-        pitch_rad: default: what the frames say.
+        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        pitch_rad: default: that of the frames.
         relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
         match: ``map``, each window by what it knows; or ``vector``, three means and slopes of all windows.
         height_std: how well the height over what is seen is known, as part of it; 0: exactly; default: as
@@ -111,7 +110,11 @@ class Flow:
             raise MitsonarError(f"height_std must be 0 or more, a part of the height: got {self.height_std:g}")
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion, its covariance, and whether to believe it; zero motion where there is nothing to match."""
+        """Estimate the motion and its covariance; reject frames without anything to match.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
         first, second = two_frames(frames)
         attitude = attitude_of(frames, "flow", self.height_m, self.pitch_rad, self.relief_m)
         height_std = attitude.height_std_m / attitude.height_m if self.height_std is None else self.height_std
@@ -133,7 +136,7 @@ class Flow:
         return Estimate(Motion(*(float(x) for x in v)), fit.covariance, not reason, reason, about)
 
     def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
-        """Rounds of flow and match from a start; None where there is nothing to match."""
+        """Run rounds of flow and match from a start; None where there is nothing to match."""
         v, converged = start, False
         for _ in range(grid.level.rounds):
             warped, inside = _warped(second, grid, v)
@@ -159,7 +162,7 @@ def _smoothed(image: Floats, level: FlowLevel) -> Floats:
 
 
 def _warped(second: Floats, grid: WindowGrid, v: Doubles) -> tuple[Floats, Floats]:
-    """The second frame drawn as the first, were this the motion; and 1 where that is known, else 0 ``(bins, beams)``."""
+    """Draw the second frame at the cells of the first, for a motion; and 1 where it is known, else 0 ``(bins, beams)``."""
     radius, bearing = grid.ground.to_polar(moved(grid.cells, v))
     row, column = _place(radius, grid.ground.range_m), _place(bearing, grid.ground.bearing_rad)
     bins, beams = second.shape
@@ -213,7 +216,7 @@ def _slopes(image: Floats, inside: Floats) -> tuple[Floats, Floats]:
 
 
 def _in_windows(values: NDArray[np.floating], grid: WindowGrid) -> Doubles:
-    """Sums over the windows ``(n, m)``."""
+    """Sum over the windows ``(n, m)``."""
     sums = cv2.boxFilter(values, -1, grid.window[::-1], normalize=False, borderType=cv2.BORDER_CONSTANT)
     return sums[grid.centres].astype(np.float64)
 
@@ -247,7 +250,7 @@ def _blocks(structure: Doubles) -> float:
 
 
 def _unseen(grid: WindowGrid, structure: Doubles, elevation_fov_deg: float) -> float:
-    """The part of the structure whose ground points lie twice as far from the axis as the sonar sees."""
+    """Return the part of the structure whose elevation is more than twice that of the field of view."""
     drop = np.full((*grid.points.shape[:2], 1), -grid.ground.height_m)
     up = np.concatenate([grid.points, drop], axis=-1) @ grid.ground.turn[:, 2]
     far = np.abs(up) > grid.home[..., 0] * np.sin(np.radians(min(elevation_fov_deg, 90.0)))
@@ -255,7 +258,7 @@ def _unseen(grid: WindowGrid, structure: Doubles, elevation_fov_deg: float) -> f
 
 
 def _rejection(fit: _Fit, blocks: float, unseen: float) -> str:
-    """Why not to believe an estimate; empty where nothing speaks against it."""
+    """Return the reason of a rejection; empty for a valid estimate."""
     if fit.covariance is None:
         return "no motion matches better than those around it"
     std = np.sqrt(np.diag(fit.covariance))

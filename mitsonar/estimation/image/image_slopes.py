@@ -20,6 +20,7 @@ NEIGHBOURS = (3, 7)
 
 
 def blurred(image: Floats, bins: float, beams: float) -> Floats:
+    """Smooth an image ``(bins, beams)`` by a Gaussian of these standard deviations [bins, beams]; 0, 0: not at all."""
     if not bins and not beams:
         return image
     size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
@@ -27,12 +28,12 @@ def blurred(image: Floats, bins: float, beams: float) -> Floats:
 
 
 def sampled(image: Floats, row: Floats, column: Floats) -> Floats:
-    """Values between pixels, bilinear."""
+    """Interpolate an image between pixels, bilinear."""
     return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def slopes_of(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, Floats]:
-    """Central differences over bins and beams of the image as far as it rises over the noise.
+    """Return central differences over bins and beams of the denoised image (Wiener's filter).
 
     ``scale`` is the standard deviation of a difference of two frames; their mean has half of it.
     """
@@ -50,7 +51,7 @@ ONE = np.ones(1, dtype=np.float32)
 
 
 def central_differences(image: Floats) -> tuple[Floats, Floats]:
-    """Central differences over bins and over beams."""
+    """Return central differences over bins and over beams."""
     by_bin = cv2.sepFilter2D(image, -1, ONE, HALVES, borderType=cv2.BORDER_REPLICATE)
     by_beam = cv2.sepFilter2D(image, -1, HALVES, ONE, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(by_bin, dtype=np.float32), np.asarray(by_beam, dtype=np.float32)

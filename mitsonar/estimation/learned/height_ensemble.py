@@ -49,16 +49,16 @@ class HeightEnsemble:
 
     @property
     def consumes(self) -> type:
-        """The class of records that its networks read."""
+        """Return the class of records that its networks read."""
         return ViewFrames if self.views else SonarFrames
 
     @property
     def digest(self) -> str:
-        """Of all its networks."""
+        """Return the digests of all networks."""
         return " ".join(one.digest for one in self.networks)
 
     def estimate(self, frames: SonarFrames | ViewFrames) -> Estimate:
-        """What the chosen network says.
+        """Estimate the motion with the chosen network.
 
         Raises:
             MitsonarError: frames without a height; as the network does.
@@ -73,7 +73,7 @@ class HeightEnsemble:
         return network.estimate(frames)
 
     def chosen(self, height_m: float) -> ImageNetwork | ViewNetwork:
-        """The network whose heights of training are nearest, in ratio; of several, that with its middle nearest."""
+        """Return the network whose heights of training are nearest in ratio; of several, that whose middle is nearest."""
 
         def away(network: ImageNetwork | ViewNetwork) -> tuple[float, float]:
             low, high = network.heights

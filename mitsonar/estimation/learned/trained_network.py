@@ -1,4 +1,4 @@
-"""What all estimators that a checkpoint makes have in common: the network, its sonar, and doubts that need no images."""
+"""What all estimators that a checkpoint makes have in common: the network, its sonar, and rejections that need no images."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ NetworkInput = Tensor | tuple[Tensor | Ground, ...]
 """What a network reads: a tensor, or a tuple of tensors and of the geometry of the ground."""
 
 BEYOND = 1.2
-"""Answers beyond the motions of training by this factor are not believed."""
+"""Factor by which a valid motion may exceed those of training."""
 
 HEIGHT_OFF, ANGLE_OFF_DEG = 0.1, 2.0
 """How far height, as part of it, and pitch and roll may be from those that training has fixed."""
@@ -82,7 +82,7 @@ class TrainedInstrument(NamedTuple):
         return cls(sonar.name, *size, window, math.degrees(span), sonar.elevation_fov_deg, sonar.bearing)
 
     def unlike(self, other: TrainedInstrument) -> str:
-        """The numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
+        """Return the numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
         found = []
         for what in ("bins", "beams", "bearing"):
             if getattr(self, what) != getattr(other, what):
@@ -120,7 +120,7 @@ class Trained:
         return float(low), float(high)
 
     def _take(self, checkpoint: Checkpoint) -> None:
-        """What computes is no field: files and comparisons of options need the digest only."""
+        """Keep the network out of the fields: files and comparisons of options need the digest only."""
         self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
         self._checkpoint, self._network = checkpoint, checkpoint.build()
         self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
@@ -142,7 +142,7 @@ class Trained:
         return str(self._checkpoint.arrangement["kind"])
 
     def _input_of_views(self, frames: ViewFrames) -> NetworkInput:
-        """What the network reads of the pings of its views, a batch of one.
+        """Return the input of the network from the pings of its views, a batch of one.
 
         Raises:
             MitsonarError: views that are not there, or of another sonar than that of training.
@@ -186,7 +186,7 @@ class Trained:
             self._last = key, made
         return self._last[1]
 
-    # ---------------------------------------------------------------- doubts
+    # ---------------------------------------------------------------- rejections
 
     def _rejection_of_geometry(self, frames: SonarFrames | ViewFrames) -> str:
         """Whether the sonar stood as in training, as far as the frames tell; networks that are given it need not."""
@@ -225,12 +225,12 @@ class Trained:
 
 
 def inputs_of(checkpoint: Checkpoint) -> str:
-    """What a network is given beside the images, for tables."""
+    """Return what a network needs beside the images, for tables."""
     return INPUTS if checkpoint.arrangement["ground"] else f"nothing; {checkpoint.fixed} fixed by training"
 
 
 def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead:
-    """What a network answers; several inputs come as a tuple.
+    """Run a network; several inputs come as a tuple.
 
     Raises:
         MitsonarError: inputs of a size that it cannot take.

@@ -54,7 +54,7 @@ class ViewNetwork(Trained):
 
     @property
     def consumes(self) -> type:
-        """The class of records that it reads."""
+        """Return the class of records that it reads."""
         return ViewFrames
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
@@ -68,11 +68,11 @@ class ViewNetwork(Trained):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Names of the views that it reads."""
+        """Return the names of the views that it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
     def estimate(self, frames: ViewFrames) -> Estimate:
-        """The motion between two pings, its covariance by validation, and whether to believe it.
+        """Estimate the motion between two pings, with the covariance of validation.
 
         Args:
             frames: two :class:`~mitsonar.records.view_frames.ViewFrames`.
