@@ -54,15 +54,17 @@ def pairs(made: Path) -> SonarPairs:
 
 
 class Oracle:
-    """Knows the truth; in every third pair it does not stand for what it says."""
+    """Knows the truth; every third estimate is not valid."""
 
+    consumes = SonarFrames
     inputs = "the truth"
+    digest = ""
 
     def __init__(self, pairs: SonarPairs) -> None:
         self.pairs, self.asked = pairs, 0
         self.truth = {float(pairs.pose[pairs.first[k], 0]): pairs.target(k) for k in range(len(pairs))}
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames, /) -> Estimate:
         self.asked += 1
         assert frames.poses is not None
         motion = Motion(*self.truth[float(frames.poses[0, 0])])

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from matplotlib.patches import Rectangle
+from matplotlib.quiver import Quiver
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy import ndimage
@@ -87,8 +89,8 @@ def centres(mosaic: Mosaic) -> tuple[Array, Array]:
     rows, columns = mosaic.mean.shape
     x = np.linspace(west, east, columns + 1)
     y = np.linspace(north, south, rows + 1)
-    grid: tuple[Array, Array] = tuple(np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2))
-    return grid
+    east_m, north_m = np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
+    return east_m, north_m
 
 
 def looking(heading_deg: float, pitch_deg: float = 35.0, roll_deg: float = 0.0, x: float = 0.0, y: float = 0.0) -> Pose:
@@ -483,7 +485,7 @@ def test_geotiff_says_where_its_cells_are(tmp_path: Path) -> None:
     mosaic = small_mosaic()
     save_geotiff(tmp_path / "map.tif", mosaic)
     with tifffile.TiffFile(tmp_path / "map.tif") as file:
-        page = file.pages[0]
+        page = file.pages.first
         bands = page.asarray()
         tags = {tag.code: tag.value for tag in page.tags.values()}
     assert bands.dtype == np.float32
@@ -529,12 +531,13 @@ def test_a_map_is_drawn_where_it_lies_with_a_true_scale_bar() -> None:
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["estimated"].get_xydata(), path.poses[:, :2])
     assert (lines["estimated"].get_color(), lines["true"].get_color()) == ("red", "limegreen")
-    arrows = next(one for one in axes.collections if hasattr(one, "U"))
+    arrows = next(one for one in axes.collections if isinstance(one, Quiver))
     np.testing.assert_allclose([arrows.U[0], arrows.V[0]], [0, 1], atol=1e-12)
     np.testing.assert_allclose([arrows.U[-1], arrows.V[-1]], [1, 0], atol=1e-12)
     bar, label = axes.patches[0], axes.texts[0].get_text()
     assert label.endswith(" cm") or label.endswith(" m")
     said = float(label.split()[0]) * (0.01 if label.endswith(" cm") else 1)
+    assert isinstance(bar, Rectangle)
     assert bar.get_width() == pytest.approx(said)
 
 
@@ -544,7 +547,7 @@ def test_path_figures_show_motions_along_the_new_heading() -> None:
     figure = path_figure({"true": path})
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels[1:] == ["heading (deg)", "sideways (mm)", "forward (mm)", "yaw (deg)"]
-    heading, sideways, forward, yaw = (axes.lines[0].get_ydata() for axes in figure.axes[1:])
+    heading, sideways, forward, yaw = (np.asarray(axes.lines[0].get_ydata(), dtype=float) for axes in figure.axes[1:])
     for values, wanted in ((heading, 90), (sideways, 0), (forward, 100), (yaw, 0)):
         np.testing.assert_allclose(values, wanted, atol=1e-9)
 
@@ -554,7 +557,7 @@ def test_bands_are_two_standard_deviations() -> None:
     covariance = np.tile(np.diag([1e-6, 4e-6, 9e-6]), (10, 1, 1))
     figure = path_figure({"true": path}, motion_covariances={"true": covariance})
     for axes, width in zip(figure.axes[2:], (1.0, 2.0, np.degrees(3e-3)), strict=True):
-        y = axes.collections[0].get_paths()[0].vertices[:, 1]
+        y = np.asarray(axes.collections[0].get_paths()[0].vertices)[:, 1]
         assert y.max() - y.min() == pytest.approx(4 * width)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import DOWN, Command, floor, floor_levels, refused, scene, tiny_recipe
+from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.datasets.generation import make_dataset
@@ -111,7 +112,7 @@ def test_what_stands_on_the_floor_does_not_lift_it() -> None:
     assert abs(DirectHeight().height(vector).height_m - found.height_m) < 1e-6
 
 
-def about(sonar: Sonar) -> tuple[Any, Any]:
+def about(sonar: Sonar) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Time and pose of a frame that looks straight down."""
     return np.zeros(1), np.array([[0, 0, 2.5, np.radians(90), 0, 0]])
 
@@ -198,9 +199,11 @@ def test_frames_that_tell_no_height_are_bridged() -> None:
 class Told:
     """An estimator that needs a height, and says nothing else."""
 
+    consumes = SonarFrames
     inputs = "height"
+    digest = ""
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames, /) -> Estimate:
         assert frames.height_m is not None
         assert np.isfinite(frames.height_m).any()
         return Estimate(Motion(0.0, 0.0, 0.0))
@@ -271,10 +274,10 @@ class TestNetworks:
         assert "vectors of whole, c2" in done.stdout
         for answer, believed in ((0.5, True), (1.05, True), (1.2, False), (-0.2, False)):
             far = HeightNetwork(kept)
-            far._network = lambda inputs, place=answer: self.torch.tensor([[20.0 * place - 10.0]])
-            said = far.height(source.read([0]))
-            assert said.valid is believed
-            assert ("beyond the heights of training" in said.reason) is not believed
+            vars(far)["_network"] = lambda inputs, place=answer: self.torch.tensor([[20.0 * place - 10.0]])
+            one = far.height(source.read([0]))
+            assert one.valid is believed
+            assert ("beyond the heights of training" in one.reason) is not believed
         level = source.read([0])
         assert level.poses is not None
         tilted = replace(level, poses=level.poses - [0, 0, 0, 0.2, 0, 0])

@@ -89,7 +89,7 @@ def two(simulator: Simulator, motion: Motion, noise: str = "none", start: Pose =
 
 def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
     """The frames with some fields replaced."""
-    return SonarFrames(**{**vars(frames), **fields})  # type: ignore[arg-type]
+    return SonarFrames(**{**vars(frames), **fields})
 
 
 # ---------------------------------------------------------------- signs and sizes
