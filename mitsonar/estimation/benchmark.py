@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import overload
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image_crlb import bounds_at, overall
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
+from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
 
@@ -108,6 +110,12 @@ def chosen(count: int, pairs: int | None, seed: int) -> list[int]:
     return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
+@overload
+def frames_of(pairs: SonarPairs, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, SonarFrames]]: ...
+@overload
+def frames_of(pairs: ImpulseSamples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, ImpulseResponses]]: ...
+@overload
+def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Record]]: ...
 def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Record]]:
     """Yield samples as (number, record) with a variation of :data:`VARIATIONS`; impulse responses have none.
 

@@ -180,6 +180,7 @@ def test_measured_heights_hide_the_true_ones() -> None:
     empty = replace(pings, image=np.where(np.arange(3)[:, None, None] == 1, 0, pings.image))
     found, said = measured(empty, DirectHeight())
     assert [one.valid for one in said] == [True, False, True]
+    assert found.height_m is not None
     np.testing.assert_array_equal(np.isfinite(found.height_m), [True, False, True])
 
 
