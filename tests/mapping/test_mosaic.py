@@ -566,8 +566,9 @@ def test_wrong_figures_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="no path"):
         path_figure({})
     for what, count in itertools.product(("motion_covariances", "pose_covariances"), (9,)):
+        options: dict[str, Any] = {what: {"true": np.zeros((count, 3, 3))}}
         with pytest.raises(MitsonarError, match=f"{what} of true must be"):
-            path_figure({"true": path}, **{what: {"true": np.zeros((count, 3, 3))}})
+            path_figure({"true": path}, **options)
     with pytest.raises(MitsonarError, match="names no path that is drawn: got 'other'"):
         path_figure({"true": path}, pose_covariances={"other": np.zeros((11, 3, 3))})
     with pytest.raises(MitsonarError, match="must end in one of"):

@@ -586,9 +586,9 @@ def test_folders_of_others_are_kept(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
-    for options in ({}, {"overwrite": True}, {"resume": True}):
+    for overwrite, resume in ((False, False), (True, False), (False, True)):
         with pytest.raises(MitsonarError, match="kept as it is"):
-            run(mine, path, **options)
+            run(mine, path, overwrite=overwrite, resume=resume)
     assert files_of(mine) == {"thesis.tex": b"years of work"}
     out = tmp_path / "out"
     run(out, path)

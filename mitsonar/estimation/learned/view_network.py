@@ -71,16 +71,16 @@ class ViewNetwork(Trained):
         """Return the names of the views that it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
-    def estimate(self, frames: ViewFrames) -> Estimate:
+    def estimate(self, records: Record) -> Estimate:
         """Estimate the motion between two pings, with the covariance of validation.
 
         Args:
-            frames: two :class:`~mitsonar.records.view_frames.ViewFrames`.
+            records: two :class:`~mitsonar.records.view_frames.ViewFrames`.
 
         Raises:
             MitsonarError: not two pings of these views, another sonar than that of training.
         """
-        self._check_views(frames)
+        frames = self._checked_views(records)
         inputs = self._input_of_views(frames)
         profiles = frames.profiles()
         if not np.isfinite(profiles).all():
@@ -96,8 +96,8 @@ class ViewNetwork(Trained):
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
         return Estimate(motion, covariance, not reason, reason)
 
-    def _check_views(self, frames: Record) -> None:
-        """Two pings of views that it reads."""
+    def _checked_views(self, frames: Record) -> ViewFrames:
+        """Check that there are two pings of the views that it reads."""
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
             raise MitsonarError(
@@ -106,6 +106,7 @@ class ViewNetwork(Trained):
             )
         if len(frames) != 2 or any(view not in frames.values for view in self.views):
             raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")
+        return frames
 
 
 def _rejection_of_profiles(profiles: NDArray[np.float32]) -> str:

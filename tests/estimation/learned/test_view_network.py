@@ -140,7 +140,9 @@ def test_the_layers_are_those_of_the_table(columns: int) -> None:
     names = [name for name, _ in shapes]
     assert names.count("BatchNorm2d") == names.count("ReLU") == 8
     assert names[-1] == "SameAverage"
-    kernels = [tuple(part.get_parameter("weight").shape[-2:]) for part in layers.children() if type(part).__name__ == "SameConv2d"]
+    kernels = [
+        tuple(part.get_parameter("weight").shape[-2:]) for part in layers.children() if type(part).__name__ == "SameConv2d"
+    ]
     assert kernels == [(7, 2), (5, 2), *[(3, 2)] * 7]
     assert sum(part.numel() for part in network.parameters()) == 13_649_283 + (columns - 2) * 3072  # docs/guides/networks.md
 
