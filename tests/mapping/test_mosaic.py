@@ -21,7 +21,7 @@ from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.geotiff import save_geotiff
 from mitsonar.mapping.illumination import illumination
-from mitsonar.mapping.mosaic import Mosaic, build_mosaic
+from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.map_figure import mosaic_figure, path_figure, quality_figure, save_figure
@@ -110,7 +110,7 @@ POSES = [looking(0), looking(40, 37, 5, 3, -2), looking(-125, 30, -6, -4, 1.5), 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
 @pytest.mark.parametrize("pose", POSES)
-def test_the_ground_comes_back(bearing: str, blend: Any, pose: Pose) -> None:
+def test_the_ground_comes_back(bearing: str, blend: Blend, pose: Pose) -> None:
     """Cells well inside hold the ground's level at their centres; a shift by a tenth of a cell would show.
 
     The ground's slope is up to 2.5 a metre, so 0.01 of level stand for 4 mm: bilinear interpolation over beams of 20 mm errs
@@ -131,7 +131,7 @@ def test_the_ground_comes_back(bearing: str, blend: Any, pose: Pose) -> None:
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, -150.0])
 def test_starboard_and_heading_have_the_right_sign(bearing: str, heading_deg: float) -> None:
-    """A bright cell to starboard lies clockwise of the heading, by hand from SPEC's axes."""
+    """A bright cell to starboard lies clockwise of the heading, by hand from the axes of the vehicle."""
     sonar = SONAR.replace(bearing=bearing)
     pose = looking(heading_deg, x=10, y=20)
     frames = blank([pose], 0.0, sonar)
@@ -168,7 +168,7 @@ def test_only_lit_ground_is_touched() -> None:
 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 def test_all_lit_ground_and_no_other_is_seen(bearing: str) -> None:
-    """Every cell by hand, in a fan that rolls: window, beams and elevations by SPEC's directions."""
+    """Every cell by hand, in a fan that rolls: window, beams and elevations by the directions of the beams."""
     sonar = SONAR.replace(bearing=bearing, azimuth_fov_deg=50, range_min=4.0, range_max=5.0)
     pose = looking(0, 35, 6)
     mosaic = build_mosaic(blank([pose], sonar=sonar), cell_m=0.02, blend="centre")
@@ -220,7 +220,7 @@ def test_finer_bins_than_cells_are_averaged() -> None:
 
 
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
-def test_identical_frames_do_not_differ(blend: Any) -> None:
+def test_identical_frames_do_not_differ(blend: Blend) -> None:
     one = frames_of(waves, [POSES[1]])
     mosaic = Mosaic(0.02, blend)
     for _ in range(7):
@@ -235,7 +235,7 @@ def test_identical_frames_do_not_differ(blend: Any) -> None:
 
 
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
-def test_deviation_is_the_noise_s(blend: Any) -> None:
+def test_deviation_is_the_noise_s(blend: Blend) -> None:
     """Noise that is the same all over a frame is not smoothed by interpolation: its level must come back.
 
     120 frames of std 0.05: the estimate's own standard error is 6.5 %, one number for all cells with equal weights.

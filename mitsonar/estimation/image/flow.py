@@ -16,7 +16,7 @@ Almanza-Medina gives no further details. Chosen here:
 - ``match="vector"`` is the paper's own shortcut: a displacement map is described by a small vector "derived from the
   displacement distribution"; which, is unsaid: here the means in range and in bearing and the slope of the displacement in
   range over bearing, without weights.
-- The height over what is seen comes from the first echoes, or from what the frames say; it is known only to ``height_std``,
+- The height over what is seen comes from the first echoes, or from the frames; it is known only to ``height_std``,
   and is a fourth unknown of the match: rocks stand above the ground that the height is measured to.
 """
 

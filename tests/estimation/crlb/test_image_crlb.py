@@ -288,7 +288,7 @@ def test_the_window_follows_the_floor() -> None:
     assert (sonar.range_min, sonar.range_max) == (2 * SONAR.range_min, 2 * SONAR.range_max)
     assert changed[0, 2] == poses[0, 2] + 2.5
     near, far = floor_ranges(Sonar(), 2.5, np.radians(35))
-    assert (round(near, 2), round(far, 2)) == (3.74, 5.54)  # SPEC.md, section 2
+    assert (round(near, 2), round(far, 2)) == (3.74, 5.54)
     pitched, changed = varied(SONAR, poses, heights, "pitch_deg", 45.0)
     assert pitched.range_max < SONAR.range_max
     np.testing.assert_allclose(np.degrees(changed[0, 3]), 45)
@@ -350,7 +350,9 @@ def oracle(beams: int, bins: int, pings: int) -> Oracle:
     return Oracle(SONAR.replace(beams=beams, range_bins=bins), pings)
 
 
-def least_squares(who: Oracle, values: np.ndarray, noise: NoiseModel | None, variance: Any, limit: Bound) -> np.ndarray:
+def least_squares(
+    who: Oracle, values: np.ndarray, noise: NoiseModel | None, variance: np.ndarray | float, limit: Bound
+) -> np.ndarray:
     """Motions ``(n, 3)`` by Gauss-Newton on frames ``(n, pixels)``, rendered anew at each of three steps."""
     echo, empty = (0.0, 0.0) if noise is None else (noise.scale * np.sqrt(np.pi / 2), noise.mean)
     by_motion = who.jacobian[:, 0] + (echo - empty) * who.jacobian[:, 1]

@@ -117,7 +117,7 @@ def about(sonar: Sonar) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.zeros(1), np.array([[0, 0, 2.5, np.radians(90), 0, 0]])
 
 
-def frame_of(image: Any, sonar: Sonar) -> SonarFrames:
+def frame_of(image: NDArray[np.floating], sonar: Sonar) -> SonarFrames:
     time_s, poses = about(sonar)
     return SonarFrames(image, sonar.range_m, sonar.bearing_rad, time_s, sonar, poses)
 

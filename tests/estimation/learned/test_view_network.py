@@ -322,7 +322,7 @@ def test_recipes_of_the_chapter(name: str) -> None:
 
 
 def test_samples_dealt_out_one_by_one_are_on_both_sides(portions: Path) -> None:
-    """The thesis's shuffle: half of what is validated shares a sequence, and so its motion, with what was learnt."""
+    """Almanza-Medina's shuffle: half of what is validated shares a sequence, and so its motion, with what was learnt."""
     split = {"by": "sample", "train": 0.75, "validation": 0.25}
     parts = [SonarPairs(portions, part=part, split=split) for part in ("train", "validation")]
     firsts = [set(pairs.first.tolist()) for pairs in parts]
