@@ -40,9 +40,9 @@ from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.response_packing import with_noise
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb
 from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.response_source import ResponseSource
-from mitsonar.mapping.trajectory_smoothing import path_of
 from mitsonar.motion.composition import motions
 from mitsonar.motion.courses import COURSES, course
 from mitsonar.motion.motion_errors import in_units

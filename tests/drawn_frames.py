@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.mapping.trajectory_smoothing import path_of
+from mitsonar.mapping.motion_series import path_of
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frame_store import FrameStore

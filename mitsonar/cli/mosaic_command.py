@@ -59,7 +59,9 @@ def mosaic(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Lay frames on the ground plane along a path: mean level, standard deviation and count of each cell."""
-    from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
+    from mitsonar.mapping.geotiff import save_geotiff
+    from mitsonar.mapping.illumination import illumination
+    from mitsonar.mapping.mosaic import Mosaic, build_mosaic
     from mitsonar.mapping.open_source import Reading, frames_for
 
     quality = _checked_out(out, true, overwrite)
@@ -158,7 +160,7 @@ def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Tr
 
 def _spread(count: int) -> NDArray[np.intp]:
     """Choose the frames that the illumination is estimated from."""
-    from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES
+    from mitsonar.mapping.illumination import ILLUMINATION_FRAMES
 
     return np.unique(np.linspace(0, count - 1, min(ILLUMINATION_FRAMES, count)).astype(np.intp))
 

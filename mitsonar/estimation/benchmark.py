@@ -1,11 +1,11 @@
-"""Estimators side by side: all on the same pairs in one run, with what they were told changed, and the physical limit."""
+"""The benchmark: all estimators on the same pairs, also with wrong inputs, and the Cramer-Rao lower bound."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import overload
 
 import cv2
 import numpy as np
@@ -19,8 +19,9 @@ from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image_crlb import bounds_at, overall
-from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
+from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
 
@@ -28,6 +29,7 @@ __all__ = [
     "VARIATIONS",
     "Answers",
     "BenchmarkRow",
+    "Samples",
     "answers_of",
     "bounds_of_pairs",
     "chosen",
@@ -38,6 +40,9 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
+Samples = SonarPairs | ImpulseSamples
+"""The samples of a data set that estimators are compared on."""
+
 VARIATIONS: dict[str, str] = {
     "as told": "height, pitch, roll and sound speed are right",
     "height 5 %": "the height told is 5 % too large or too small (of no effect where first echoes tell it)",
@@ -47,20 +52,20 @@ VARIATIONS: dict[str, str] = {
     "heave 5 mm": "the sonar rises or sinks by 5 mm between the pings (rendered again)",
     "jitter": "rays move within their cells, anew each ping (rendered again)",
 }
-"""What is changed, half of the pairs one way and half the other."""
+"""What each variation changes: half of the pairs one way and half the other."""
 
 HEAVE_M = 0.005
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What one estimator said of many pairs.
+    """The estimates of one estimator for many pairs.
 
     Attributes:
         motion: sideways, forward [m], yaw [rad] ``(n, 3)``.
-        believe: whether it stands for it ``(n,)``.
-        covariance: ``(n, 3, 3)``, nan where it gives none.
-        ms: processor time of each, all threads ``(n,)``.
+        valid: whether the estimate is valid ``(n,)``.
+        covariance: ``(n, 3, 3)`` [m, m, rad], nan where there is none.
+        ms: processor time of each estimate, all threads ``(n,)`` [ms]; nan before it is made.
     """
 
     motion: Array
@@ -70,43 +75,53 @@ class Answers:
 
     @classmethod
     def unasked(cls, count: int) -> Answers:
-        """None yet: times are nan."""
+        """Return room for ``count`` estimates, none of which is made yet."""
         nan = np.full((count, 3, 3), np.nan)
         return cls(np.zeros((count, 3)), np.zeros(count, dtype=bool), nan, np.full(count, np.nan))
 
     @property
     def asked(self) -> NDArray[np.bool_]:
-        """Which pairs have been asked for ``(n,)``."""
+        """Return which estimates are made ``(n,)``."""
         return np.isfinite(self.ms)
 
-    def ask(self, place: int, estimator: AnyEstimator, frames: Any) -> None:
-        """Put an estimate in its place."""
+    def ask(self, index: int, estimator: AnyEstimator, frames: Record) -> None:
+        """Estimate one pair and store the result at an index."""
         begun = time.process_time()
         estimate = estimator.estimate(frames)
-        self.ms[place] = 1e3 * (time.process_time() - begun)
-        self.motion[place], self.valid[place] = estimate.motion, estimate.valid
+        self.ms[index] = 1e3 * (time.process_time() - begun)
+        self.motion[index], self.valid[index] = estimate.motion, estimate.valid
         if estimate.covariance is not None:
-            self.covariance[place] = estimate.covariance
+            self.covariance[index] = estimate.covariance
 
-    def arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
-        """By name, to store."""
+    def arrays(self, prefix: str) -> dict[str, NDArray[np.generic]]:
+        """Return all arrays by name, to be stored."""
         return {f"{prefix}/{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
-    def from_arrays(cls, table: Mapping[str, NDArray[Any]], prefix: str) -> Answers:
-        """What :meth:`arrays` gave."""
+    def from_arrays(cls, table: Mapping[str, NDArray[np.generic]], prefix: str) -> Answers:
+        """Restore what :meth:`arrays` returned."""
         return cls(*(np.array(table[f"{prefix}/{field.name}"]) for field in fields(cls)))
 
 
 def chosen(count: int, pairs: int | None, seed: int) -> list[int]:
-    """Numbers of samples: all, or some at random, in order."""
+    """Return numbers of samples: all, or some at random, in order."""
     if pairs is None or pairs >= count:
         return list(range(count))
     return sorted(np.random.default_rng([seed, 11]).choice(count, pairs, replace=False).tolist())
 
 
-def frames_of(pairs: SonarPairs | ImpulseSamples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Any]]:
-    """Samples as (number, frames or impulse responses) with a variation of :data:`VARIATIONS`; of responses only as told."""
+@overload
+def frames_of(pairs: SonarPairs, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, SonarFrames]]: ...
+@overload
+def frames_of(pairs: ImpulseSamples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, ImpulseResponses]]: ...
+@overload
+def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Record]]: ...
+def frames_of(pairs: Samples, numbers: Sequence[int], variation: str) -> Iterator[tuple[int, Record]]:
+    """Yield samples as (number, record) with a variation of :data:`VARIATIONS`; impulse responses have none.
+
+    Raises:
+        MitsonarError: an unknown variation.
+    """
     if isinstance(pairs, ImpulseSamples):
         for number in numbers:
             yield number, pairs.responses(number)
@@ -116,7 +131,7 @@ def frames_of(pairs: SonarPairs | ImpulseSamples, numbers: Sequence[int], variat
         yield from re_rendered(pairs, numbers, jitter=True)
     elif variation in VARIATIONS:
         for number in numbers:
-            yield number, _told(pairs.sonar_frames(number), variation, _sign(number))
+            yield number, _misinformed(pairs.sonar_frames(number), variation, _sign(number))
     else:
         raise MitsonarError(f"unknown variation {variation!r}: known are {', '.join(VARIATIONS)}")
 
@@ -131,9 +146,9 @@ def _heaved(number: int, poses: Array) -> Array:
     return moved
 
 
-def _told(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
-    """Frames that tell something wrong."""
-    change: dict[str, Any] = {}
+def _misinformed(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
+    """Return frames with a wrong height, attitude or sound speed."""
+    change: dict[str, Array] = {}
     poses = None if frames.poses is None else frames.poses.copy()
     if variation == "height 5 %" and frames.height_m is not None:
         change["height_m"] = frames.height_m * (1 + 0.05 * sign)
@@ -147,7 +162,7 @@ def _told(frames: SonarFrames, variation: str, sign: int) -> SonarFrames:
 
 def answers_of(
     estimators: Mapping[str, AnyEstimator],
-    pairs: SonarPairs | ImpulseSamples,
+    pairs: Samples,
     numbers: Sequence[int],
     variation: str = "as told",
     *,
@@ -156,15 +171,15 @@ def answers_of(
     keep_every: int = 100,
     progress: Callable[[int], object] | None = None,
 ) -> dict[str, Answers]:
-    """What all estimators say of the same pairs, one pair after another.
+    """Estimate the same pairs with all estimators, one pair after another.
 
     Args:
         estimators: by name.
         pairs: of a store.
         numbers: of the samples.
         variation: of :data:`VARIATIONS`.
-        known: answers of an earlier run that was broken off; only what is missing is asked for.
-        keep: called every so many pairs, and at the end, with all answers.
+        known: estimates of an interrupted run; only the missing ones are made.
+        keep: called every so many pairs, and at the end, with all estimates.
         keep_every: how many.
         progress: called with how many pairs are done since the last call.
     """
@@ -178,7 +193,7 @@ def answers_of(
 
 def _answers_of(
     estimators: Mapping[str, AnyEstimator],
-    pairs: SonarPairs | ImpulseSamples,
+    pairs: Samples,
     numbers: Sequence[int],
     variation: str,
     known: dict[str, Answers] | None,
@@ -187,14 +202,14 @@ def _answers_of(
     progress: Callable[[int], object] | None,
 ) -> dict[str, Answers]:
     table = {name: (known or {}).get(name) or Answers.unasked(len(numbers)) for name in estimators}
-    place = {number: k for k, number in enumerate(numbers)}
-    missing = [number for number in numbers if not all(table[name].asked[place[number]] for name in estimators)]
+    index = {number: k for k, number in enumerate(numbers)}
+    missing = [number for number in numbers if not all(table[name].asked[index[number]] for name in estimators)]
     if progress is not None:
         progress(len(numbers) - len(missing))
     for count, (number, frames) in enumerate(frames_of(pairs, missing, variation), start=1):
         for name, estimator in estimators.items():
-            if not table[name].asked[place[number]]:
-                table[name].ask(place[number], estimator, frames)
+            if not table[name].asked[index[number]]:
+                table[name].ask(index[number], estimator, frames)
         if progress is not None:
             progress(1)
         if keep is not None and count % keep_every == 0:
@@ -205,7 +220,7 @@ def _answers_of(
 
 
 def with_prior(answers: Answers, largest: Array) -> Answers:
-    """Answers weighed with what networks know from training: motions are even within a box (here: a Gaussian as wide).
+    """Combine estimates with the prior that networks learn: motions uniform in a box, here a Gaussian of equal variance.
 
     Args:
         answers: with covariances.
@@ -222,9 +237,10 @@ def with_prior(answers: Answers, largest: Array) -> Answers:
 def bounds_of_pairs(
     pairs: SonarPairs, numbers: Sequence[int], noise: NoiseModel, progress: Callable[[int], object] | None = None
 ) -> dict[str, Array]:
-    """The two-frame bound by each law of :data:`mitsonar.estimation.crlb.image_crlb.LAWS` ``(3,)`` [m, m, rad]: the root of
-    the mean
-    variance over the first poses of these samples; 0 where no noise leaves no bound."""
+    """Return the two-frame bound ``(3,)`` [m, m, rad] by each model of :data:`mitsonar.estimation.crlb.image_crlb.LAWS`.
+
+    It is the root of the mean variance over the first poses of these samples; 0 where there is no bound without noise.
+    """
     wanted = np.asarray(numbers, dtype=np.int64)
     scene_of = pairs.scene[pairs.first[wanted]]
     gain = float(pairs.store.about["gain"])
@@ -251,13 +267,13 @@ class BenchmarkRow:
 
     Attributes:
         method: its name.
-        inputs: what it is given.
+        inputs: that it needs.
         errors: see :class:`mitsonar.motion.motion_errors.MotionErrors`.
-        ms: median processor time of the believed pairs, all threads.
+        ms: median processor time of the valid pairs, all threads [ms].
         over_limit: RMSE over the bound ``(3,)``; nan where there is none.
-        over_reference: RMSE less that of the reference method ``(3,)`` [mm, mm, deg], with
-        over_reference_low: the lower,
-        over_reference_high: and the upper end of its 95 % interval (paired).
+        over_reference: RMSE less that of the reference method ``(3,)`` [mm, mm, deg].
+        over_reference_low: lower end of its paired 95 % interval.
+        over_reference_high: upper end of the same.
     """
 
     method: str
@@ -269,10 +285,10 @@ class BenchmarkRow:
     over_reference_low: Array
     over_reference_high: Array
 
-    def plain(self) -> dict[str, Any]:
-        """Numbers and texts only, for JSON: nan becomes None."""
+    def plain(self) -> PlainTable:
+        """Return numbers and texts only, for JSON: nan becomes None."""
 
-        def value(one: Any) -> Any:
+        def value(one: object) -> object:
             if isinstance(one, np.ndarray):
                 return [value(float(v)) for v in one]
             if isinstance(one, float | np.floating):
@@ -292,14 +308,14 @@ def rows_of(
     limit: Array | None = None,
     reference: str | None = None,
 ) -> list[BenchmarkRow]:
-    """A table of methods on the same pairs; see section 7 of the reference.
+    """Return a row for each method, all on the same pairs: errors of motion, invalid estimates count as zero motion.
 
     Args:
         answers: by method.
         inputs: by method.
         truth: motions ``(n, 3)`` [m, m, rad].
-        resamples: of :func:`mitsonar.motion.motion_errors.cluster_resamples`; the same for all, so that differences are
-        paired.
+        resamples: of :func:`mitsonar.motion.motion_errors.cluster_resamples`; the same for all, so that
+            differences are paired.
         limit: standard deviations ``(3,)`` [m, m, rad].
         reference: the method that others are compared with; default: the last.
     """

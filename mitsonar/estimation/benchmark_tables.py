@@ -1,18 +1,19 @@
-"""Tables of a comparison or an evaluation as Markdown: what a column says of a row."""
+"""Tables of a comparison or an evaluation as Markdown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+
+from mitsonar.estimation.estimator import PlainTable
 
 __all__ = ["FEWEST_SCENES", "markdown", "table_lines"]
 
 FEWEST_SCENES = 10
-"""With fewer, clustered intervals hold much less than they say."""
+"""Fewest scenes for clustered intervals; with fewer they are much too narrow."""
 
 
-def table_lines(table: dict[str, Any]) -> list[str]:
-    """A table of the report as Markdown."""
+def table_lines(table: PlainTable) -> list[str]:
+    """Return a table of the report as lines of Markdown."""
     lines = ["", f"noise {table['noise']}, {table['variation']}", "", *markdown(table["rows"], COLUMNS)]
     if table["limits"]:
         known = {law: std for law, std in table["limits"].items() if any(value != 0 for value in std)}
@@ -27,8 +28,8 @@ def table_lines(table: dict[str, Any]) -> list[str]:
     return lines
 
 
-def markdown(rows: list[dict[str, Any]], columns: Sequence[str]) -> list[str]:
-    """Methods as lines of a Markdown table with these columns of :data:`CELLS`."""
+def markdown(rows: list[PlainTable], columns: Sequence[str]) -> list[str]:
+    """Return the methods as lines of a Markdown table with these columns of :data:`CELLS`."""
     cells = [list(columns), ["---"] * len(columns), *([CELLS[column](row) for column in columns] for row in rows)]
     width = [max(len(row[k]) for row in cells) for k in range(len(columns))]
     return ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in cells]
@@ -49,12 +50,12 @@ def _joined(values: list[float | None], digits: int) -> str:
     return " / ".join("-" if value is None else f"{value:.{digits}f}" for value in values)
 
 
-def _interval(row: dict[str, Any]) -> str:
+def _interval(row: PlainTable) -> str:
     ends = zip(row["rmse_low"], row["rmse_high"], strict=True)
     return " ".join(f"{_number(low, k)}..{_number(high, k)}" for k, (low, high) in enumerate(ends))
 
 
-CELLS: dict[str, Callable[[dict[str, Any]], str]] = {
+CELLS: dict[str, Callable[[PlainTable], str]] = {
     "method": lambda row: str(row["method"]),
     "RMSE": lambda row: _three(row["rmse"]),
     "as in the thesis": lambda row: _joined(row["thesis"], 2),
@@ -71,7 +72,7 @@ CELLS: dict[str, Callable[[dict[str, Any]], str]] = {
     "ms": lambda row: f"{row['ms']:.1f}",
     "inputs": lambda row: str(row["inputs"]),
 }
-"""What a column says of a row."""
+"""The text of a column, of a row."""
 
 COLUMNS = (
     *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),

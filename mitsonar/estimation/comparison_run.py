@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,21 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
+from mitsonar.datasets.response_samples import ImpulseSamples
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, meant
-from mitsonar.estimation.benchmark import VARIATIONS, Answers, answers_of, bounds_of_pairs, chosen, rows_of, with_prior
+from mitsonar.estimation.benchmark import (
+    VARIATIONS,
+    Answers,
+    Samples,
+    answers_of,
+    bounds_of_pairs,
+    chosen,
+    rows_of,
+    with_prior,
+)
 from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
+from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
 from mitsonar.estimation.named_estimators import estimator_from
 from mitsonar.io.provenance import digest, versions
@@ -40,12 +50,12 @@ class Asked:
     Attributes:
         estimators: their names, commas between them; None: all that need no training.
         noise: levels, commas between them, or ``;``.
-        part: of the data set; None: that which training does not see.
+        part: of the data set; None: the one that training does not use.
         pairs: at most so many; None: all.
-        perturb: rows with something wrong in what estimators are told.
-        jitter: a row with rays that move.
-        prior: rows that know how large motions are.
-        limit: pairs over which the physical limit is computed; 0: none.
+        perturb: rows in which estimators get wrong inputs.
+        jitter: a row with jittered rays.
+        prior: rows with the prior of the size of motions.
+        limit: pairs over which the Cramer-Rao lower bound is computed; 0: none.
         reference: the method that others are compared with; None: the last.
         seed: of noise, choice of pairs and bootstrap.
     """
@@ -64,44 +74,44 @@ class Asked:
 
 @dataclass(frozen=True)
 class Bench:
-    """Estimators, and the pairs that all of them are asked of.
+    """The estimators, and the pairs that all of them estimate.
 
     Attributes:
         methods: by name.
-        levels: noise models by name; None where a ratio says all.
+        levels: noise models by name; None where the name is a ratio of signal to noise.
         samples: by level of noise, the same pairs in each.
-        numbers: of the samples that are asked.
+        numbers: of the samples that are estimated.
         truth: motions of the sonar ``(n, 3)`` [m, m, rad].
         scenes: number of each pair's scene ``(n,)``.
     """
 
-    methods: dict[str, Any]
+    methods: dict[str, AnyEstimator]
     levels: dict[str, NoiseModel | None]
-    samples: dict[str, Any]
+    samples: dict[str, Samples]
     numbers: list[int]
     truth: Array
     scenes: NDArray[np.int64]
 
     @property
-    def first(self) -> Any:
-        """The samples at the first level of noise."""
+    def first(self) -> Samples:
+        """Return the samples at the first level of noise."""
         return next(iter(self.samples.values()))
 
 
 def compare(
     data: str, asked: Asked, out: str | Path | None = None, begin: Begin = lambda what, pairs: nullcontext(lambda done: None)
-) -> dict[str, Any]:
-    """Ask all estimators of the same pairs, and tell their errors; failures count as zero motion.
+) -> PlainTable:
+    """Run all estimators on the same pairs and report their errors; invalid estimates count as zero motion.
 
     Args:
         data: path or URL of a data set.
         asked: what is compared.
-        out: folder for answers, ``table.md`` and ``table.json``; a comparison that was broken off there goes on.
-        begin: told how far things are.
+        out: folder for estimates, ``table.md`` and ``table.json``; an interrupted comparison in it resumes.
+        begin: called with each stage, for progress.
 
     Returns:
-        What ``table.json`` holds: what was asked; ``notes``, sentences that the reader needs; ``tables``, one a level of
-        noise and variation, with ``rows``: what :class:`~mitsonar.estimation.benchmark.BenchmarkRow` holds.
+        The content of ``table.json``: the settings; ``notes``, sentences that the reader needs; ``tables``, one a level of
+        noise and variation, whose ``rows`` hold what :class:`~mitsonar.estimation.benchmark.BenchmarkRow` holds.
 
     Raises:
         MitsonarError: unknown names, too few pairs, or another comparison in the folder.
@@ -140,7 +150,7 @@ def compare(
 
 
 def _bench(data: str, asked: Asked) -> Bench:
-    """Estimators and pairs.
+    """Open the samples and create the estimators.
 
     Raises:
         MitsonarError: unknown names, options that are not for these data, too few pairs.
@@ -164,7 +174,7 @@ def _bench(data: str, asked: Asked) -> Bench:
     if len(first) < 2:
         raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
     if asked.jitter and first.recipe.instrument.jittered:
-        raise MitsonarError("the rays of this data set move already: --jitter is for the thesis's model")
+        raise MitsonarError("the rays of this data set move already: --jitter is for Almanza-Medina's model")
     numbers = chosen(len(first), asked.pairs, asked.seed)
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
@@ -172,13 +182,13 @@ def _bench(data: str, asked: Asked) -> Bench:
     return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]])
 
 
-def _settings(bench: Bench, asked: Asked) -> dict[str, Any]:
-    """What decides the answers; levels of noise may be added later."""
+def _settings(bench: Bench, asked: Asked) -> PlainTable:
+    """Return what decides the estimates; levels of noise may be added later."""
     chosen_of, recipe = bench.first.chosen, bench.first.recipe
-    said = json.dumps(recipe.model_dump(), default=str)
+    recipe_text = json.dumps(recipe.model_dump(), default=str)
     networks = {name: method.digest for name, method in bench.methods.items() if method.digest}
     return {
-        "digest": digest(chosen_of.motion.tobytes(), chosen_of.pose.tobytes(), said),
+        "digest": digest(chosen_of.motion.tobytes(), chosen_of.pose.tobytes(), recipe_text),
         "methods": list(bench.methods),
         "part": asked.part,
         "pairs": len(bench.numbers),
@@ -193,7 +203,7 @@ def _variations(asked: Asked) -> list[str]:
 
 
 def _key(level: str, model: NoiseModel | None) -> str:
-    """Names a noise level by what it is: a file of the same name may change; a ratio says all."""
+    """Name a level of noise by its content: a file of the same name may change. A ratio needs no more."""
     return level if model is None else f"{level} {digest(model.model_dump_json())[:8]}"
 
 
@@ -201,34 +211,34 @@ def _key(level: str, model: NoiseModel | None) -> str:
 
 
 def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
-    """The physical limit by law, over some of the pairs; empty where it is not asked for, and of impulse responses."""
-    model = bench.levels[level]
-    if not limit or model is None:
+    """Return the bound by model of the noise, over some pairs; empty if not asked for, or for impulse responses."""
+    model, samples = bench.levels[level], bench.samples[level]
+    if not limit or model is None or isinstance(samples, ImpulseSamples):
         return {}
     found = kept.load_bounds(_key(level, model), limit)
     if found is None:
         places = np.linspace(0, len(bench.numbers) - 1, min(limit, len(bench.numbers))).astype(int)
         with begin("limit", len(places)) as progress:
-            found = bounds_of_pairs(bench.samples[level], [bench.numbers[k] for k in places], model, progress)
+            found = bounds_of_pairs(samples, [bench.numbers[k] for k in places], model, progress)
         kept.keep_bounds(_key(level, model), limit, found)
     return found
 
 
 def _table(
     bench: Bench, asked: Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
-) -> dict[str, Any]:
-    """Errors of all methods, as JSON can hold them."""
-    said = dict(answers)
+) -> PlainTable:
+    """Return the errors of all methods, as JSON can hold them."""
+    found = dict(answers)
     if asked.prior:
         flight = bench.first.recipe.flight
         largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
-        known = {name: one for name, one in said.items() if np.isfinite(one.covariance).any()}
-        said |= {f"{name}{PRIOR}": with_prior(one, largest) for name, one in known.items()}
-    inputs = {name: bench.methods[name.removesuffix(PRIOR)].inputs for name in said}
+        known = {name: one for name, one in found.items() if np.isfinite(one.covariance).any()}
+        found |= {f"{name}{PRIOR}": with_prior(one, largest) for name, one in known.items()}
+    inputs = {name: bench.methods[name.removesuffix(PRIOR)].inputs for name in found}
     inputs = {name: f"{text}, prior" if name.endswith(PRIOR) else text for name, text in inputs.items()}
     reference = asked.reference or list(bench.methods)[-1]
     resamples = cluster_resamples(bench.scenes, seed=asked.seed)
-    rows = rows_of(said, inputs, bench.truth, resamples, limit=bounds.get("rays"), reference=reference)
+    rows = rows_of(found, inputs, bench.truth, resamples, limit=bounds.get("rays"), reference=reference)
     return {
         "noise": level,
         "variation": variation,
@@ -242,5 +252,5 @@ PRIOR = " with prior"
 
 
 def _finite(values: Array) -> list[float | None]:
-    """For JSON: what is not finite is None."""
+    """Return numbers for JSON: None where not finite."""
     return [float(value) if np.isfinite(value) else None for value in values]

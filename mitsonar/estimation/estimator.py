@@ -1,4 +1,4 @@
-"""The estimator protocol: consecutive records in, the motion between them out, its covariance, and whether it is valid."""
+"""The estimator protocol: consecutive records in; motion, covariance and validity out."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion
+from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.view_frames import ViewFrames
 
 __all__ = [
     "FEWEST_BLOCKS",
@@ -21,6 +23,8 @@ __all__ = [
     "AnyEstimator",
     "Estimate",
     "Estimator",
+    "PlainTable",
+    "Record",
     "blank",
     "correlation_of",
     "matching_rejection",
@@ -30,42 +34,52 @@ __all__ = [
 ]
 
 INPUTS = "pitch; height where no first echoes show"
-"""What methods that know the geometry are given beside the images; see :mod:`mitsonar.geometry.attitude`."""
+"""Inputs of methods that know the geometry, beside the images; see :mod:`mitsonar.geometry.attitude`."""
 
 FEWEST_CELLS = 8
-"""Bins and beams of an image that can be registered."""
+"""Fewest bins and beams of an image that can be registered."""
 
 LEAST_CORRELATION = 8.0
-"""Of frames as matched, in standard deviations of the correlation of independent noise in as many cells."""
+"""Least correlation of registered frames, in standard deviations for independent noise in as many cells."""
 
 LEAST_AT_BEST = 0.3
-"""Of frames that were brought together: a maximum found among noise reaches 0.1 to 0.2."""
+"""Least correlation of registered frames: a maximum among noise reaches 0.1 to 0.2."""
 
 FEWEST_BLOCKS = 8.0
-"""Parts of a frame that share what is matched: one object alone tells little, and its height is not known."""
+"""Fewest blocks of a frame that share the matched energy: a single object is too little, its height is not known."""
+
+
+PlainTable = dict[str, Any]
+"""What JSON holds, by key: texts, numbers, lists, tables and None."""
+
+Real = NDArray[np.integer | np.floating]
+"""An array of real numbers."""
+
+Record = SonarFrames | ViewFrames | ImpulseResponses
+"""What an estimator may consume."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an estimator says of two frames.
+    """The estimate of a motion between two frames.
 
     Attributes:
-        motion: sideways, forward [m], yaw [rad] (eq. 3.4); zero where nothing can be said.
-        covariance: of these ``(3, 3)``, where the estimator knows it.
-        believe: False where it should not be used.
-        reason: why not.
-        about: what else it tells: correlation, iterations ...
+        motion: sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4); zero where nothing can be estimated.
+        covariance: of the motion ``(3, 3)`` [m, m, rad], where the estimator knows it.
+        valid: False where the motion must not be used.
+        reason: of a rejection.
+        about: further results: correlation, iterations, candidates ...
     """
 
     motion: Motion
     covariance: NDArray[np.float64] | None = None
     valid: bool = True
     reason: str = ""
-    about: dict[str, Any] = field(default_factory=dict)
+    about: PlainTable = field(default_factory=dict)
 
 
 def rejected(reason: str) -> Estimate:
-    """No motion, and why not to believe it."""
+    """Return no motion, with the reason of the rejection."""
     return Estimate(Motion(0.0, 0.0, 0.0), None, False, reason)
 
 
@@ -73,7 +87,7 @@ Record_contra = TypeVar("Record_contra", contravariant=True)
 
 
 class Estimator(Protocol[Record_contra]):
-    """Consecutive records (frames, views or impulse responses) to the motion from the first to the last.
+    """Estimates the motion from the first to the last of consecutive frames, views or impulse responses.
 
     Attributes:
         consumes: the class of the records: ``SonarFrames``, ``ViewFrames`` or ``ImpulseResponses``; ``object`` for any.
@@ -82,11 +96,16 @@ class Estimator(Protocol[Record_contra]):
     """
 
     @property
-    def consumes(self) -> type: ...
+    def consumes(self) -> type:
+        """Return the class of the records that it reads; ``object`` for any."""
+
     @property
-    def inputs(self) -> str: ...
+    def inputs(self) -> str:
+        """Return what it needs beside the records, in words."""
+
     @property
-    def digest(self) -> str: ...
+    def digest(self) -> str:
+        """Return the digest of the weights of a trained one; empty for the others."""
 
     def estimate(self, records: Record_contra, /) -> Estimate:
         """Estimate the motion from the first to the last record.
@@ -97,14 +116,14 @@ class Estimator(Protocol[Record_contra]):
 
 
 AnyEstimator = Estimator[Any]
-"""An estimator of whatever it consumes."""
+"""An estimator, whatever records it consumes."""
 
 
 def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The two images as fractions of the maximum, float32.
+    """Return the two images as float32 in 0..1.
 
     Raises:
-        MitsonarError: not two frames, too few bins or beams or in disorder, levels that are not linear or not finite.
+        MitsonarError: not two frames, too few bins or beams, axes that do not rise, levels not linear or not finite.
     """
     if len(frames) != 2:
         raise MitsonarError(f"an estimator takes two frames: got {len(frames)}")
@@ -127,35 +146,33 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 def blank(image: NDArray[np.float32]) -> bool:
-    """Whether all pixels are the same."""
+    """Return whether all pixels are the same."""
     return bool(image.size == 0 or image.min() == image.max())
 
 
-def correlation_of(first: NDArray[Any], second: NDArray[Any]) -> float:
-    """Correlation coefficient of two arrays of one shape; 0 where either is constant."""
+def correlation_of(first: Real, second: Real) -> float:
+    """Return the correlation coefficient of two arrays of one shape; 0 where either is constant."""
     a, b = first - first.mean(), second - second.mean()
     size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
     return float(np.vdot(a, b)) / size if size > 0 else 0.0
 
 
 def spread_of(shares: NDArray[np.floating]) -> float:
-    """How many blocks share what is matched, from the energy of each; few bright ones do not hide many faint ones."""
+    """Return the effective number of blocks, from the energy of each. A few bright ones do not hide many faint."""
     amplitude = np.sqrt(np.maximum(shares, 0))
     energy = float((amplitude**2).sum())
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0
 
 
-def matching_rejection(
-    first: NDArray[Any], second: NDArray[Any], inside: NDArray[np.bool_], *, alike: float, block: int = 32
-) -> str:
-    """What speaks against two images ``(rows, columns)`` that should now be alike; empty where nothing does.
+def matching_rejection(first: Real, second: Real, inside: NDArray[np.bool_], *, alike: float, block: int = 32) -> str:
+    """Return why two registered images ``(rows, columns)`` do not match; empty where they do.
 
     Args:
         first: one.
-        second: the other, as matched.
+        second: the other, registered to it.
         inside: which pixels count.
-        alike: how many neighbouring pixels count as one, since they were smoothed.
-        block: edge of the blocks over which what is matched must be spread [pixels].
+        alike: number of neighbouring pixels that count as one, since the images are smooth.
+        block: edge of the blocks over which the matched energy must be spread [pixels].
     """
     count = int(inside.sum())
     if count < alike:

@@ -1,4 +1,4 @@
-"""Answers of estimators on disk, kept as they come, so that a comparison that was broken off goes on."""
+"""Estimates of a comparison on disk, written as they come, so that an interrupted comparison resumes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark import Answers
 from mitsonar.estimation.benchmark_tables import table_lines
 from mitsonar.estimation.crlb.image_crlb import LAWS
-from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_json, read_npz, write_json, write_whole
 
@@ -34,28 +33,28 @@ COMPARISON = RunKind(
 
 
 class AnswerFolder:
-    """Answers that nobody keeps: of a comparison without a folder."""
+    """The store of a comparison without a folder: it keeps nothing."""
 
     def load(self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int) -> dict[str, Answers] | None:
-        """What an earlier run has found of ``count`` pairs; None where it has not."""
+        """Return the estimates of an earlier run of ``count`` pairs; None where there are none."""
         return None
 
     def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
-        """Keep answers as they come."""
+        """Store all estimates made so far."""
 
     def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
-        """Bounds of an earlier run."""
+        """Return the bounds of an earlier run; None where there are none."""
         return None
 
     def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:
-        """Keep bounds."""
+        """Store bounds."""
 
-    def finish(self, report: dict[str, Any]) -> None:
+    def finish(self, report: PlainTable) -> None:
         """Write the tables."""
 
 
 class AnswersOnDisk(AnswerFolder):
-    """A folder of answers.
+    """A folder of estimates.
 
     Args:
         run: the folder.
@@ -68,7 +67,7 @@ class AnswersOnDisk(AnswerFolder):
         return self.run.path / (re.sub(r"[^\w.-]+", "-", name.replace("%", "percent")) + ending)
 
     def load(self, level: str, variation: str, methods: Mapping[str, AnyEstimator], count: int) -> dict[str, Answers] | None:
-        """What an earlier run has found of ``count`` pairs; None where it has not.
+        """Return the estimates of an earlier run of ``count`` pairs; None where there are none.
 
         Raises:
             MitsonarError: the file is damaged.
@@ -82,20 +81,20 @@ class AnswersOnDisk(AnswerFolder):
             if any(len(values) != count for one in found.values() for values in vars(one).values()):
                 raise ValueError("it holds other numbers of pairs")
             return found
-        except Exception as error:  # a damaged zip raises whatever its bytes lead to
+        except Exception as error:  # a damaged zip may raise anything
             raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
 
     def keep(self, level: str, variation: str, answers: dict[str, Answers]) -> None:
-        """Keep answers as they come."""
+        """Store all estimates made so far."""
         buffer = io.BytesIO()
-        arrays: dict[str, NDArray[Any]] = {}
+        arrays: dict[str, NDArray[np.generic]] = {}
         for name, one in answers.items():
             arrays |= one.arrays(name)
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
         write_whole(self._path(f"answers {level} {variation}", ".npz"), buffer.getvalue())
 
     def load_bounds(self, level: str, count: int) -> dict[str, Array] | None:
-        """Bounds of an earlier run.
+        """Return the bounds of an earlier run; None where there are none.
 
         Raises:
             MitsonarError: the file is damaged.
@@ -113,10 +112,10 @@ class AnswersOnDisk(AnswerFolder):
         return bounds
 
     def keep_bounds(self, level: str, count: int, bounds: dict[str, Array]) -> None:
-        """Keep bounds."""
+        """Store bounds."""
         write_json(self._path(f"limit {level} {count}", ".json"), {law: std.tolist() for law, std in bounds.items()})
 
-    def finish(self, report: dict[str, Any]) -> None:
+    def finish(self, report: PlainTable) -> None:
         """Write the tables."""
         lines = [line for table in report["tables"] for line in table_lines(table)]
         write_whole(self.run.path / "table.md", ("\n".join(lines) + "\n").encode())
@@ -124,11 +123,11 @@ class AnswersOnDisk(AnswerFolder):
         self.run.finish()
 
 
-def kept_answers(out: str | Path | None, settings: dict[str, Any]) -> AnswerFolder:
-    """Where a comparison keeps its answers: in a folder, gone on with, or nowhere.
+def kept_answers(out: str | Path | None, settings: PlainTable) -> AnswerFolder:
+    """Open the store of a comparison: a folder, new or to be resumed, or none.
 
     Raises:
-        MitsonarError: the folder holds other things, or another comparison.
+        MitsonarError: the folder holds something else, or another comparison.
     """
     if out is None:
         return AnswerFolder()

@@ -33,7 +33,7 @@ __all__ = [
     "options_from",
 ]
 
-ESTIMATORS: dict[str, type[Any]] = {
+ESTIMATORS: dict[str, type[AnyEstimator]] = {
     "zero": Zero,
     "ecc": Ecc,
     "flow": Flow,
@@ -42,13 +42,16 @@ ESTIMATORS: dict[str, type[Any]] = {
     "correlation": Correlation,
     "likelihood": Likelihood,
 }
-"""Those that nothing was trained for, of sonar frames and of impulse responses: ``consumes`` says which."""
+"""Estimators without training, of sonar frames or of impulse responses: see ``consumes``."""
+
+Options = dict[str, Any]
+"""Options of an estimator by name: numbers, or yes and no."""
 
 NAMES = (*ESTIMATORS, *SHIPPED)
 
 
-def create_estimator(name: str, **options: Any) -> AnyEstimator:
-    """The estimator of that name.
+def create_estimator(name: str, **options: object) -> AnyEstimator:
+    """Create the estimator of that name.
 
     Raises:
         MitsonarError: unknown name or option; no torch for a trained one.
@@ -62,9 +65,11 @@ def create_estimator(name: str, **options: Any) -> AnyEstimator:
 
 
 def estimator_from(text: str) -> AnyEstimator:
-    """What the command line says: ``NAME``, a checkpoint or the folder of a training run, or either with options,
-    ``NAME:key=value:key=value``; angles as ``..._deg``. Several checkpoints with commas between them: the one trained
-    nearest to the height of the frames answers.
+    """Create an estimator from a text of the command line.
+
+    The text is a name, a checkpoint or the folder of a training run, or one of them with options:
+    ``NAME:key=value:key=value``, angles as ``..._deg``. Of several checkpoints with commas between them, the one trained
+    nearest to the height of the frames is used.
 
     Raises:
         MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
@@ -82,28 +87,28 @@ def estimator_from(text: str) -> AnyEstimator:
 
 
 def _nearest(texts: list[str]) -> AnyEstimator:
-    """Of several checkpoints.
+    """Create the ensemble of several checkpoints.
 
     Raises:
-        MitsonarError: none of them, or estimators that are no networks.
+        MitsonarError: fewer than two, or estimators that are not networks.
     """
     made = [estimator_from(text) for text in texts]
     plain = [text for text, one in zip(texts, made, strict=True) if not one.digest]
     if plain or len(made) < 2:
-        said = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
-        raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {said}")
+        fault = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
+        raise MitsonarError(f"commas stand between two or more checkpoints, of which the height chooses one: {fault}")
     from mitsonar.estimation.learned.height_ensemble import HeightEnsemble
 
     return HeightEnsemble(made)
 
 
 def _maker(name: str) -> Callable[..., AnyEstimator]:
-    """What makes the estimator of that name, from options."""
+    """Return the function that creates the estimator of that name from options."""
     return ESTIMATORS[name] if name in ESTIMATORS else _trained(shipped_path(name))
 
 
 def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
-    """What makes an estimator of a checkpoint, from options.
+    """Return the function that creates an estimator of a checkpoint from options.
 
     Raises:
         MitsonarError: no torch, no such checkpoint or one that cannot be used.
@@ -116,12 +121,12 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
 
 
 def names_checkpoint(name: str) -> bool:
-    """Whether a word of the command line is a path, and no name."""
+    """Return whether a word of the command line is a path, not a name."""
     return "/" in name or "." in name or Path(name).is_dir()
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """A checkpoint.
+    """Load a checkpoint.
 
     Raises:
         MitsonarError: no torch, no such checkpoint or one that cannot be used.
@@ -133,11 +138,11 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     return Checkpoint.load(path)
 
 
-def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[str, Any]:
-    """Options of what makes an estimator, from words as the command line gives them.
+def options_from(name: str, words: list[str], made: Callable[..., object]) -> Options:
+    """Parse the options of an estimator from words of the command line.
 
     Raises:
-        MitsonarError: unknown option, not a number.
+        MitsonarError: an unknown option, or a value that is not a number.
     """
     known, options = _numbers(made), {}
     for word in words:
@@ -157,8 +162,8 @@ def options_from(name: str, words: list[str], made: Callable[..., Any]) -> dict[
     return options
 
 
-def _numbers(made: Callable[..., Any]) -> dict[str, tuple[str, str]]:
-    """Options that are numbers or yes and no, as the command line names them, with their own name and type."""
+def _numbers(made: Callable[..., object]) -> dict[str, tuple[str, str]]:
+    """Return the options that are numbers or yes and no: by their name on the command line, with own name and type."""
     parameters = inspect.signature(made).parameters.values()
     kinds = {one.name: str(one.annotation) for one in parameters}
     numbers = {name: kind for name, kind in kinds.items() if ("float" in kind or kind == "bool") and "tuple" not in kind}

@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from mitsonar.estimation.channel.pings import pings_of
-from mitsonar.estimation.estimator import Estimate, two_frames
+from mitsonar.estimation.estimator import Estimate, Record, two_frames
 from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Zero"]
 
-CHECKS: dict[type, Callable[[Any], object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
-"""What other estimators refuse, this one refuses."""
+CHECKS: dict[type, Callable[..., object]] = {SonarFrames: two_frames, ImpulseResponses: pings_of}
+"""The checks of the other estimators: what they reject, this one rejects."""
 
 
 class Zero:
-    """No motion, whatever the records hold."""
+    """Estimates no motion, whatever the records hold."""
 
     consumes = object
     inputs = "nothing"
     digest = ""
 
-    def estimate(self, records: Any, /) -> Estimate:
-        """Answer no motion.
+    def estimate(self, records: Record, /) -> Estimate:
+        """Return no motion.
 
         Raises:
             MitsonarError: records that no other estimator takes.

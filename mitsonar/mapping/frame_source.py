@@ -1,5 +1,4 @@
-"""Frames of one run, wherever they lie, read some at a time: ``frames.npz``, a long run's ``frames.zarr``, a data set's
-sequence."""
+"""Sonar frames of one run, read some at a time: ``frames.npz``, ``frames.zarr`` of a long run, a sequence of a data set."""
 
 from __future__ import annotations
 
@@ -30,39 +29,45 @@ __all__ = ["FrameSource", "is_data_set", "load_frames", "open_frames", "sequence
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+Pixels = NDArray[np.generic]
+"""Images ``(n, bins, beams)``: uint8 in 0..255, or float32 in 0..1."""
+
+StoredArray = Any
+"""An array of Zarr, whichever form of its metadata; read by indices."""
+
 CHUNK_BYTES = 8 * 2**20
-"""Pixels that are read at a time, about."""
+"""Approximate size of the pixels that are read at a time [bytes]."""
 
 PLANAR = 1e-6
-"""Height, pitch and roll of a path that change less are one [m, rad]: files round them."""
+"""Smallest change of height, pitch or roll along a path [m, rad]: files round them."""
 
 FINDING = "give frames.npz, frames.zarr, the folder of a run, or a data set"
 
 
 @dataclass(frozen=True)
 class FrameSource:
-    """The frames of one run; pixels stay where they are until they are asked for.
+    """The frames of one run; pixels are read on demand.
 
     Attributes:
-        name: what errors call it.
+        name: of the source, for messages.
         like: no frames, but all that is the same for each of them: sonar, bins, beams, level.
-        time_s: of the frames ``(frames,)``; where each beam has its own, their mean.
-        images: reads the frames of such numbers ``(n,)``: ``(n, bins, beams)``.
-        poses: of the sonar ``(frames, 6)`` [m, rad], where known: the truth.
+        time_s: of the frames ``(frames,)`` [s]; where each beam has its own, their mean.
+        images: reads the frames of given numbers ``(n,)``: ``(n, bins, beams)``.
+        poses: true poses of the sonar ``(frames, 6)`` [m, rad], where known.
         height_m: over the ground ``(frames,)``, where known; nan where nothing is below.
-        pitch_rad: where poses are not known, but this is.
-        told_height_m: that was given for frames that lack theirs.
-        noise: that is added when frames are read; its seed; and how the frames are numbered to it.
-        seed: see noise.
-        first_number: see noise.
-        note: which frames these are, where that is not plain from what was asked for.
-        altimeter: what measures the height of each frame that is read, in place of what is told.
+        pitch_rad: of the sonar, where its poses are not known.
+        told_height_m: the height that the user gave for frames without one.
+        noise: added to the frames that are read.
+        seed: of the noise.
+        first_number: number of the first frame, of which the noise is a function.
+        note: which frames these are, where the name does not say it.
+        altimeter: measures the height of each frame that is read, in place of ``height_m``.
     """
 
     name: str
     like: SonarFrames
     time_s: Array
-    images: Callable[[Index], NDArray[Any]]
+    images: Callable[[Index], Pixels]
     poses: Array | None = None
     height_m: Array | None = None
     pitch_rad: float | None = None
@@ -74,11 +79,12 @@ class FrameSource:
     altimeter: HeightEstimator | None = None
 
     def __len__(self) -> int:
+        """Return the number of frames."""
         return len(self.time_s)
 
     @classmethod
     def of(cls, frames: SonarFrames, name: str = "the frames") -> Self:
-        """Frames that are in memory; labels are not kept."""
+        """Take frames that are in memory; labels are not kept."""
         nothing: dict[str, Any] = dict.fromkeys(LABELS)
         frames = replace(frames, **nothing)
         return cls._of(frames.select(slice(0)), frames.time_s, frames.poses, frames.height_m, frames.image.__getitem__, name)
@@ -90,35 +96,38 @@ class FrameSource:
         time_s: Array,
         poses: Array | None,
         height_m: Array | None,
-        images: Callable[[Index], NDArray[Any]],
+        images: Callable[[Index], Pixels],
         name: str,
-        **more: Any,
+        *,
+        first_number: int = 0,
+        note: str = "",
     ) -> Self:
         time = np.asarray(time_s, dtype=float)
-        return cls(name, like, time.mean(axis=1) if time.ndim == 2 else time, images, poses, height_m, **more)
+        time = time.mean(axis=1) if time.ndim == 2 else time
+        return cls(name, like, time, images, poses, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
-        """The same frames with noise of a seed, a function of it and each frame's number."""
+        """Return the same frames with noise: a function of the seed and the number of each frame."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
 
     def with_heights_by(self, estimator: HeightEstimator) -> Self:
-        """The same frames; each tells the height that an estimator finds in it, whatever else was told.
+        """Return the same frames, whose heights an estimator measures when they are read.
 
         Raises:
-            MitsonarError: an estimator that reads views, which frames are not.
+            MitsonarError: an estimator that reads views, not frames.
         """
         if estimator.views is not None:
             raise MitsonarError(
-                f"{self.name}: heights are told from {estimator.kind}s of {', '.join(estimator.views)}, the frames are "
+                f"{self.name}: heights are estimated from {estimator.kind}s of {', '.join(estimator.views)}, the frames are "
                 "images of one view: give direct, or a network that was trained on such images"
             )
         return replace(self, altimeter=estimator)
 
     def with_geometry(self, height_m: float | None = None, pitch_rad: float | None = None) -> Self:
-        """The same frames with a height [m] and a pitch [rad] where they lack them.
+        """Return the same frames with a height [m] and a pitch [rad] where they lack them.
 
         Raises:
-            MitsonarError: they lack nothing, or a number that cannot be.
+            MitsonarError: they lack nothing, or a number outside its limits.
         """
         lacking = self.height_m is None or not np.isfinite(self.height_m).all()
         if height_m is not None and not lacking:
@@ -145,19 +154,19 @@ class FrameSource:
 
     @property
     def sonar_poses(self) -> Array | None:
-        """Of the sonar ``(frames, 6)``, where known."""
+        """Return the poses of the sonar ``(frames, 6)`` [m, rad]; None where they are not known."""
         return self.poses
 
     @property
     def true(self) -> Trajectory | None:
-        """Where the sonar was, where that is known."""
+        """Return the true path of the sonar; None where it is not known."""
         return None if self.poses is None else Trajectory(self.poses, self.time_s)
 
     def check_times(self) -> None:
-        """Frames follow each other.
+        """Check that the times of the frames increase.
 
         Raises:
-            MitsonarError: they do not, or have no times.
+            MitsonarError: they do not, or are not finite.
         """
         bad = np.flatnonzero(~(np.diff(self.time_s) > 0))
         if not np.isfinite(self.time_s).all() or bad.size:
@@ -169,8 +178,9 @@ class FrameSource:
             )
 
     def read(self, index: ArrayLike) -> SonarFrames:
-        """Frames of these numbers ``(n,)``, as estimators may see them: with height, pitch and roll, but with place and
-        heading 0, so that no truth can leak.
+        """Read frames of these numbers ``(n,)`` as estimators may use them.
+
+        Their poses have height, pitch and roll, but position and heading 0, so that no truth can leak.
 
         Raises:
             MitsonarError: pixels that cannot be read.
@@ -190,28 +200,28 @@ class FrameSource:
             self.like,
             image=image,
             time_s=self.time_s[chosen],
-            poses=self._standing(chosen),
+            poses=self._attitudes(chosen),
             height_m=None if self.height_m is None else self.height_m[chosen],
         )
         return frames if self.altimeter is None else measured(frames, self.altimeter)[0]
 
-    def _standing(self, chosen: Index) -> Array | None:
-        """Poses without place and heading ``(n, 6)``."""
+    def _attitudes(self, chosen: Index) -> Array | None:
+        """Return poses without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
         if self.poses is not None:
             return self.poses[chosen] * [0, 0, 1, 1, 1, 0]
         return None if self.pitch_rad is None else np.tile([0.0, 0, 0, self.pitch_rad, 0, 0], (len(chosen), 1))
 
     def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
-        """Frames of these numbers, some at a time."""
+        """Read frames of these numbers, some at a time."""
         chosen = np.asarray(index, dtype=np.intp)
         count = self.frames_a_chunk
         for start in range(0, len(chosen), count):
             yield self.read(chosen[start : start + count])
 
     def along(self, path: Trajectory, tolerance_s: float = 0.01) -> tuple[Index, Array]:
-        """Numbers ``(n,)`` of the frames that a path has a pose for, and these poses ``(n, 6)``.
+        """Return the numbers ``(n,)`` of the frames for which a path has a pose, and these poses ``(n, 6)``.
 
-        A path at one height, pitch and roll, as odometry drives it, does not know them: where the frames do, theirs count.
+        A path of odometry has one height, pitch and roll throughout. Pitch and roll are then those of the frames, if known.
 
         Raises:
             MitsonarError: no frame is at the time of a pose, within the tolerance.
@@ -225,39 +235,39 @@ class FrameSource:
                 f"{self.time_s[-1]:g} s, and no pose is within {tolerance_s:g} s of a frame: give the path of this run"
             ) from None
         poses = path.poses[there].copy()
-        told = self._standing(index)
-        if told is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
-            poses[:, 3:5] = told[:, 3:5]
+        attitudes = self._attitudes(index)
+        if attitudes is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
+            poses[:, 3:5] = attitudes[:, 3:5]
         return index, poses
 
     @property
     def frames_a_chunk(self) -> int:
-        """How many frames are read at a time."""
+        """Return how many frames are read at a time."""
         return max(1, CHUNK_BYTES // max(1, len(self.like.range_m) * len(self.like.bearing_rad) * 4))
 
     def digest(self) -> str:
-        """SHA-256 of what is known of all frames, and of the first, the middle and the last image."""
-        told = hashlib.sha256(self.like.sonar.model_dump_json().encode())
+        """Return the SHA-256 of all data but the images, and of the first, the middle and the last image."""
+        digest = hashlib.sha256(self.like.sonar.model_dump_json().encode())
         for values in (self.like.range_m, self.like.bearing_rad, self.time_s, self.poses, self.height_m):
-            told.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
-        told.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
-        told.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
+            digest.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
+        digest.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
+        digest.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
         if len(self):
             some = np.unique(np.linspace(0, len(self) - 1, 3).astype(np.intp))
-            told.update(np.ascontiguousarray(self.read(some).image).tobytes())
-        return told.hexdigest()
+            digest.update(np.ascontiguousarray(self.read(some).image).tobytes())
+        return digest.hexdigest()
 
 
 def open_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> FrameSource:
-    """The frames at a path or URL.
+    """Open the frames at a path or URL.
 
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, or a data set.
-        sequence: of a data set; default: the longest, the first of these.
+        sequence: of a data set; default: the longest; of several, the first.
         view: of a data set; default: the first.
 
     Raises:
-        MitsonarError: nothing there, or not frames; a sequence or view that is not there.
+        MitsonarError: no frames there; a sequence or view that is not there.
     """
     path = Path(where)
     if is_data_set(where):
@@ -273,39 +283,32 @@ def open_frames(where: str | Path, *, sequence: int | None = None, view: str | N
 
 
 def load_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> SonarFrames:
-    """Load all frames at a path or URL into memory; see :func:`open_frames` for what may lie there.
+    """Load all frames at a path or URL into memory; see :func:`open_frames`.
 
     Raises:
-        MitsonarError: nothing there, or not frames; a sequence or view that is not there.
+        MitsonarError: no frames there; a sequence or view that is not there.
     """
     source = open_frames(where, sequence=sequence, view=view)
     return source.read(np.arange(len(source)))
 
 
 def is_data_set(where: str | Path) -> bool:
-    """Whether a data set lies there; frames of a long run are Zarr too, but have other attributes. URLs are data sets'."""
+    """Return whether a data set is there. Every URL is one. Frames of a long run are Zarr too, with other attributes."""
     path = Path(where)
     if "://" in str(where):
         return True
     if not (path / "zarr.json").is_file():
         return False
-    try:
-        return _group(path).attrs.get("kind") == "mitsonar data set"
-    except MitsonarError:
-        return False
-
-
-def _group(path: Path) -> Any:
     import zarr
 
     try:
-        return zarr.open_group(path, mode="r")
-    except Exception as error:  # a damaged Zarr raises whatever its bytes lead to
-        raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
+        return bool(zarr.open_group(path, mode="r").attrs.get("kind") == "mitsonar data set")
+    except Exception:  # a damaged Zarr may raise anything
+        return False
 
 
 def _of_zarr(path: Path, name: str) -> FrameSource:
-    """Frames of a long run, or of one that was not finished."""
+    """Open the frames of a long run, also of one that is not finished."""
     try:
         found, done = open_group(path, COLUMNS, "time_s", "frames_done")
         arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
@@ -327,11 +330,11 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
     if times.ndim == 1:
         check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
     if done < image.shape[0]:
-        said = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
-        warnings.warn(said, MitsonarWarning, stacklevel=3)
+        message = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
+        warnings.warn(message, MitsonarWarning, stacklevel=3)
     poses, height = table.get("poses"), table.get("height_m")
 
-    def images(index: Index) -> NDArray[Any]:
+    def images(index: Index) -> Pixels:
         picked = _picked(image, index)
         check_column(picked, "image", COLUMNS["image"], {}, str(path))
         return picked
@@ -341,7 +344,7 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
 
 def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
     from mitsonar.config.data_recipe import array_names
-    from mitsonar.datasets.store import DataStore  # half a second that other frames, and workers, do without
+    from mitsonar.datasets.store import DataStore  # its import takes half a second
 
     store = DataStore.open(url)
     stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
@@ -351,7 +354,7 @@ def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSourc
     name = next(iter(stored)) if view is None else view
     if name not in stored:
         raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
-    here, number, said = sequence_in(store, sequence)
+    here, number, which = sequence_in(store, sequence)
     image = store.array(stored[name])
     like = SonarFrames(
         image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
@@ -369,12 +372,12 @@ def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSourc
         lambda index: _picked(image, index + here.start),
         f"{url}, sequence {number}",
         first_number=here.start,
-        note=said + (f", view {name}" if len(stored) > 1 else ""),
+        note=which + (f", view {name}" if len(stored) > 1 else ""),
     )
 
 
 def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
-    """The frames of a data set's sequence, its number, and which it is, in words; default: the longest, the first of these.
+    """Return the frames of a sequence of a data set, its number, and a description. Default: the longest, or the first such.
 
     Raises:
         MitsonarError: no such sequence.
@@ -385,12 +388,12 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
     if not (0 <= number < len(lengths) and lengths[number]):
         raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
     first = int(np.argmax(sequences == number))
-    said = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
-    return slice(first, first + int(lengths[number])), number, said
+    which = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
+    return slice(first, first + int(lengths[number])), number, which
 
 
-def _picked(image: Any, index: Index) -> NDArray[Any]:
-    """Frames of a Zarr array; those at equal steps in one go."""
+def _picked(image: StoredArray, index: Index) -> Pixels:
+    """Read frames of a Zarr array; those at equal steps at once."""
     steps = np.unique(np.diff(index))
     if len(index) and len(steps) <= 1 and (not len(steps) or steps[0] > 0):
         return np.asarray(image[int(index[0]) : int(index[-1]) + 1 : int(steps[0]) if len(steps) else 1])

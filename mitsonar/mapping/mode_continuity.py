@@ -1,4 +1,4 @@
-"""Motions that fit alike are told apart by those before and after: how likely each is, given all others (Rabiner 1989)."""
+"""Ambiguous motions are resolved by their neighbours: the probability of each, given all others (Rabiner 1989)."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ __all__ = ["continued"]
 Array = NDArray[np.float64]
 
 USUAL_M, USUAL_RAD = 0.005, 0.002
-"""How much a motion differs from the one before, usually."""
+"""Standard deviations of the change from one motion to the next."""
 
 SUDDEN = -12.0
-"""Logarithm of the probability of a sudden change, whatever its size: a path may turn a corner."""
+"""Log probability of a sudden change of any size: a path may turn a corner."""
 
 SURE = 0.95
-"""Probability from which a motion is believed."""
+"""Probability from which a motion is valid."""
 
 
 def continued(estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Estimates in which one motion was chosen where several fit alike and its neighbours decide between them.
+    """Choose one motion of each ambiguous estimate, where its neighbours decide.
 
-    An estimator lists them in ``about["modes"]``: probability, sideways, forward [m], yaw [rad] of each, and in
-    ``about["spreads"]`` their covariances. One that is as good as sure, given those before and after, is believed, with its
-    own covariance; where nothing decides, and where there are no modes, estimates stay as they are.
+    An estimator lists the candidates in ``about["modes"]``: probability, sideways, forward [m], yaw [rad] of each. Their
+    covariances are in ``about["spreads"]``. A candidate whose probability, given the motions before and after, reaches
+    :data:`SURE` becomes the valid motion. All other estimates stay as they are.
     """
     modes = [np.array(one.about.get("modes", []), dtype=float).reshape(-1, 4) for one in estimates]
     ambiguous = [len(mine) > 1 and not one.valid for one, mine in zip(estimates, modes, strict=True)]
     if not any(ambiguous):
         return list(estimates)
-    told = [
+    candidates = [
         mine if one.valid or unsure else np.empty((0, 4))
         for one, mine, unsure in zip(estimates, modes, ambiguous, strict=True)
     ]
-    sure = _marginals(told)
+    sure = _marginals(candidates)
     return [
         _with_mode(one, mine, int(share.argmax())) if unsure and share.max() >= SURE else one
         for one, mine, unsure, share in zip(estimates, modes, ambiguous, sure, strict=True)
@@ -50,7 +50,7 @@ def continued(estimates: Sequence[Estimate]) -> list[Estimate]:
 
 
 def _marginals(modes: list[Array]) -> list[Array]:
-    """How likely each mode of each step is, given all steps; steps without modes are stepped over."""
+    """Return the probability of each mode of each step, given all steps; steps without modes are skipped."""
     known = [k for k, mine in enumerate(modes) if len(mine)]
     own = [np.log(np.maximum(modes[k][:, 0], 1e-300)) for k in known]
     change = [_change(modes[a][:, 1:], modes[b][:, 1:], b - a) for a, b in pairwise(known)]
@@ -60,13 +60,13 @@ def _marginals(modes: list[Array]) -> list[Array]:
     for between, mine in zip(change[::-1], own[:0:-1], strict=True):
         after.append(logsumexp(between + (mine + after[-1])[None], axis=1))
     shares = [np.empty(0)] * len(modes)
-    for place, first, last in zip(known, before, after[::-1], strict=True):
-        shares[place] = np.exp(first + last - logsumexp(first + last))
+    for step, first, last in zip(known, before, after[::-1], strict=True):
+        shares[step] = np.exp(first + last - logsumexp(first + last))
     return shares
 
 
 def _change(first: Array, second: Array, steps: int) -> Array:
-    """Logarithms of how likely each of the second motions ``(m, 3)`` follows each of the first ``(n, 3)``: ``(n, m)``."""
+    """Return the log probability that each second motion ``(m, 3)`` follows each first one ``(n, 3)``: ``(n, m)``."""
     usual = np.array([USUAL_M, USUAL_M, USUAL_RAD]) * np.sqrt(steps)
     off = (second[None] - first[:, None]) / usual
     return np.asarray(np.maximum(-0.5 * (off**2).sum(axis=-1), SUDDEN))

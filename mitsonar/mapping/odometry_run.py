@@ -1,4 +1,4 @@
-"""The folder of an odometry: estimates are kept as they come, so that a killed one goes on; then path, table and figure."""
+"""The folder of an odometry: estimates are written as they come, so that a killed run resumes; then path, table, figure."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import json
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
 from mitsonar.io.plain_data import finite_number, parse_json, whole_number
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_bytes, write_json, write_whole
@@ -28,6 +29,9 @@ from mitsonar.motion.motion_errors import AXES, in_units
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.map_figure import path_figure, save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["OdometryFolder", "run_odometry", "table_lines"]
 
@@ -44,6 +48,7 @@ ODOMETRY = RunKind(
     packages=("mitsonar", "numpy", "scipy", "opencv-python-headless"),
     deciding=("mitsonar",),
 )
+"""The files of an odometry: ``true.tum`` where poses are known; ``estimates.jsonl``, a line a pair."""
 
 
 LARGEST_JOURNAL = 2**30
@@ -51,11 +56,11 @@ LARGEST_JOURNAL = 2**30
 
 
 class OdometryFolder:
-    """A folder that an odometry is written to, or lies in.
+    """A folder that an odometry is written to or read from.
 
     Attributes:
         run: what was asked for, and how far it is.
-        path: where.
+        path: of the folder.
     """
 
     def __init__(self, run: RunDirectory) -> None:
@@ -63,10 +68,10 @@ class OdometryFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> OdometryFolder:
-        """A finished odometry.
+        """Open a finished odometry.
 
         Raises:
-            MitsonarError: none, or not finished.
+            MitsonarError: there is none, or it is not finished.
         """
         folder = cls(RunDirectory.open(path, ODOMETRY))
         if not folder.run.finished:
@@ -75,7 +80,7 @@ class OdometryFolder:
 
     @property
     def height_m(self) -> float | None:
-        """Height over the ground that the odometry was told [m].
+        """Return the height over the ground that the user gave [m]; None where none was given.
 
         Raises:
             MitsonarError: ``run.json`` is damaged.
@@ -88,16 +93,16 @@ class OdometryFolder:
 
     @property
     def estimated(self) -> Trajectory:
-        """The path."""
+        """Return the estimated path."""
         return self._path("estimated.tum")
 
     @property
     def true(self) -> Trajectory | None:
-        """The true path, where it was known."""
+        """Return the true path; None where it was not known."""
         return self._path("true.tum") if (self.path / "true.tum").exists() else None
 
     def _path(self, name: str) -> Trajectory:
-        """A path in the convention in which it was written; what it looks at was known then."""
+        """Load a path in the convention in which it was written, without the warnings of a first reading."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MitsonarWarning)
             return Trajectory.load(self.path / name, str(self.run.notes.get("frame", "mitsonar")))
@@ -105,7 +110,7 @@ class OdometryFolder:
     # ---------------------------------------------------------------- estimates
 
     def kept(self) -> dict[int, Estimate]:
-        """Estimates of an earlier try, by the number of their pair; a line that a kill left half written is cut off.
+        """Return the estimates of an earlier run by the number of their pair. Cut off a line that a kill left half written.
 
         Raises:
             MitsonarError: the journal is damaged.
@@ -123,7 +128,7 @@ class OdometryFolder:
             try:
                 pair, estimate = _estimate_in(line)
             except Exception:  # a line leads to whatever its bytes do
-                raise MitsonarError(f"{journal}, line {number} is damaged: begin again with --overwrite") from None
+                raise MitsonarError(f"{journal}, line {number} is damaged: start over with --overwrite") from None
             estimates[pair] = estimate
         return estimates
 
@@ -139,8 +144,8 @@ class OdometryFolder:
 
     # ---------------------------------------------------------------- results
 
-    def write(self, found: Odometry, title: str, more: dict[str, Any]) -> None:
-        """All results; the last one is run.json, which says that they are whole."""
+    def write(self, found: Odometry, title: str, more: PlainTable) -> None:
+        """Write all results. The last one is ``run.json``, which marks them as complete."""
         self.run.start()
         self.run.finished = False
         self.run.note(**more)
@@ -174,73 +179,60 @@ def run_odometry(
     resume: bool = False,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> Odometry:
-    """:func:`mitsonar.mapping.odometry.odometry` into a folder, which holds:
-
-    ``estimated.tum``, and ``true.tum`` where poses are known; ``motions.csv``; ``covariances.npz``; ``table.md`` and
-    ``table.json``; ``path.png``; ``run.json``, the settings; and ``estimates.jsonl``, what the estimator said, a line a
-    pair, from which a killed one goes on; that may be with another ``smooth``, ``scale``, ``start``, ``frame`` and
-    ``workers``.
+    """Run :func:`mitsonar.mapping.odometry.odometry` and write the results, the files of :data:`ODOMETRY`, to a folder.
 
     Args:
-        source: of the frames.
-        name: of the estimator, as it was asked for.
-        estimator: what tells the motions.
-        out: the folder; made.
-        smooth: see :func:`~mitsonar.mapping.odometry.odometry`.
-        scale: see there.
-        start: see there.
+        source: of the records.
+        name: of the estimator, as given.
+        estimator: estimates the motions.
+        out: the folder; it is made.
+        smooth: as ``odometry`` takes it.
+        scale: as above.
+        start: as above.
         frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
-        every: see there.
-        workers: see there.
-        overwrite: replace an odometry that is there.
-        resume: go on with one that was broken off.
-        progress: called with the number of pairs that were added.
+        every: as above.
+        workers: as above.
+        overwrite: replace an odometry in the folder.
+        resume: go on with an interrupted one.
+        progress: as above.
 
     Raises:
-        MitsonarError: as there; the folder holds something else, or cannot be written.
+        MitsonarError: as ``odometry`` does; the folder holds something else, or cannot be written.
     """
     convention_named(frame)
-    asked = {
-        "estimator": name,
-        "options": dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {},  # type: ignore[arg-type]
-        "frames": len(source),
-        "frames_sha256": source.digest(),
-        "every": every,
+    run = RunDirectory.begin(out, ODOMETRY, _asked(source, name, estimator, every), resume=resume, overwrite=overwrite)
+    folder = OdometryFolder(run)
+    kept, begun = folder.kept() if folder.run.resumed else {}, time.perf_counter()
+    pipeline = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, workers=workers, progress=progress)
+    found = pipeline(source, estimator, known=kept, keep=folder.keep)
+    settings = {
+        **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": _named(scale), "frame": frame},
+        **{**_found(found), "seconds": time.perf_counter() - begun},
+        **{"pairs_in_these_seconds": len(found.estimates) - len(kept), "workers": workers},
+    }
+    folder.write(found, f"{Path(source.name).name}, {name}", settings)
+    return found
+
+
+def _named(scale: ArrayLike | Literal["fit"] | None) -> str | None:
+    return scale if isinstance(scale, str) or scale is None else "given"
+
+
+def _found(found: Odometry) -> PlainTable:
+    """Return what the record of the run holds of the path."""
+    lost = int((~found.believed).sum())
+    return {"factors": found.factors, "from": found.path.poses[0], "not_believed": lost, "warnings": found.warnings()}
+
+
+def _asked(source: Source, name: str, estimator: AnyEstimator, every: int) -> PlainTable:
+    """Return what decides the estimates: a run is resumed only with the same."""
+    options: PlainTable = dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {}
+    return {
+        **{"estimator": name, "options": options, "frames": len(source), "frames_sha256": source.digest(), "every": every},
         "height_m": source.told_height_m,
         "pitch_deg": None if source.pitch_rad is None else float(np.degrees(source.pitch_rad)),
         "noise": None if source.noise is None else {**source.noise.model_dump(), "seed": source.seed},
     }
-    folder = OdometryFolder(RunDirectory.begin(out, ODOMETRY, asked, resume=resume, overwrite=overwrite))
-    kept = folder.kept() if folder.run.resumed else {}
-    begun = time.perf_counter()
-    found = odometry(
-        source,
-        estimator,
-        smooth=smooth,
-        scale=scale,
-        start=start,
-        every=every,
-        workers=workers,
-        known=kept,
-        keep=folder.keep,
-        progress=progress,
-    )
-    settings = {
-        "source": source.name,
-        "inputs": estimator.inputs,
-        "smooth": smooth,
-        "scale": scale if isinstance(scale, str) or scale is None else "given",
-        "frame": frame,
-        "factors": found.factors,
-        "from": found.path.poses[0],
-        "not_believed": int((~found.believed).sum()),
-        "warnings": found.warnings(),
-        "seconds": time.perf_counter() - begun,
-        "pairs_in_these_seconds": len(found.estimates) - len(kept),
-        "workers": workers,
-    }
-    folder.write(found, f"{Path(source.name).name}, {name}", settings)
-    return found
 
 
 # ---------------------------------------------------------------- files
@@ -249,27 +241,27 @@ def run_odometry(
 def _line_of(pair: int, estimate: Estimate) -> str:
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
-    said = {"pair": pair, "motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
+    line = {"pair": pair, "motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
     alike = {name: estimate.about[name] for name in ("modes", "spreads") if name in estimate.about}
-    return json.dumps(said | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
+    return json.dumps(line | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
 
 
 def _estimate_in(line: bytes) -> tuple[int, Estimate]:
-    """The number of a pair and its estimate; whatever is wrong raises."""
-    said = parse_json(line, "the line")
-    covariance = None if said["covariance"] is None else np.array(said["covariance"], dtype=float)
-    motion = np.array(said["motion"], dtype=float)
-    if motion.shape != (3,) or not isinstance(said["reason"], str) or type(said["valid"]) is not bool:
-        raise ValueError("motion, reason or believe is something else")
-    if said["valid"] and not np.isfinite(motion).all():
+    """Parse the number of a pair and its estimate; a damaged line raises."""
+    table = parse_json(line, "the line")
+    covariance = None if table["covariance"] is None else np.array(table["covariance"], dtype=float)
+    motion = np.array(table["motion"], dtype=float)
+    if motion.shape != (3,) or not isinstance(table["reason"], str) or type(table["valid"]) is not bool:
+        raise ValueError("motion, reason or valid is of another type")
+    if table["valid"] and not np.isfinite(motion).all():
         raise ValueError("the motion is not finite")
     if covariance is not None and (covariance.shape != (3, 3) or (np.diagonal(covariance) < 0).any()):
-        raise ValueError("covariance is something else")
-    about = said.get("about", {})
+        raise ValueError("covariance is not a covariance")
+    about = table.get("about", {})
     if not isinstance(about, dict):
         raise ValueError("about is no table")
-    pair = whole_number(said["pair"], "pair", 0, 2**40)
-    return pair, Estimate(Motion(*(float(value) for value in motion)), covariance, said["valid"], said["reason"], about)
+    pair = whole_number(table["pair"], "pair", 0, 2**40)
+    return pair, Estimate(Motion(*(float(value) for value in motion)), covariance, table["valid"], table["reason"], about)
 
 
 def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
@@ -279,7 +271,7 @@ def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
 
 
 def _motions_csv(found: Odometry) -> str:
-    """A line a motion: mm and deg, standard deviations empty where unknown."""
+    """Write a line a motion, in mm and deg; standard deviations are empty where unknown."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     names = [f"{axis.name}_{axis.unit}" for axis in AXES]
@@ -288,10 +280,10 @@ def _motions_csv(found: Odometry) -> str:
     moved = in_units(found.series.motions)
     std = _std(found.series.covariances)
     for k, estimate in enumerate(found.estimates):
-        told = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
+        deviations = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
         numbers = [f"{value:.6f}" for value in moved[k]]
         frames = [int(found.frames[k]), int(found.frames[k + 1]), f"{found.series.time_s[k + 1]:.9g}"]
-        table.writerow([*frames, *numbers, *told, int(estimate.valid), estimate.reason])
+        table.writerow([*frames, *numbers, *deviations, int(estimate.valid), estimate.reason])
     return text.getvalue()
 
 
@@ -300,7 +292,7 @@ def _std(covariances: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
 
 
 def _covariances(found: Odometry) -> bytes:
-    """Times, motions and covariances in m and rad; covariances nan where unknown."""
+    """Pack times, motions and covariances in m and rad; covariances are nan where unknown."""
     count = len(found.estimates)
     motions, poses = found.series.covariances, found.pose_covariances
     buffer = io.BytesIO()
@@ -317,7 +309,7 @@ def _covariances(found: Odometry) -> bytes:
 
 
 def table_lines(rows: list[Row]) -> list[str]:
-    """Rows as Markdown that reads well as it is."""
+    """Return rows as the lines of a Markdown table with aligned columns."""
     cells = [("", "value", "unit"), *((name, _number(value, unit), unit) for name, value, unit in rows)]
     width = [max(len(line[k]) for line in cells) for k in range(3)]
     lines = [f"| {name.ljust(width[0])} | {value.rjust(width[1])} | {unit.ljust(width[2])} |" for name, value, unit in cells]
@@ -330,7 +322,7 @@ def _number(value: float, unit: str) -> str:
     return f"{value:,.0f}" if unit == "" and float(value).is_integer() else f"{value:.4g}"
 
 
-def _figure(found: Odometry, title: str) -> Any:
+def _figure(found: Odometry, title: str) -> Figure:
     true = found.true_at_frames
     paths = {"estimated": found.path} | ({} if true is None else {"true": true})
     motions, poses = found.series.covariances, found.pose_covariances

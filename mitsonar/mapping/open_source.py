@@ -1,10 +1,10 @@
-"""Records of one run for odometry and maps, whatever they are: frames, views of a data set, or impulse responses."""
+"""The records of one run for odometry and maps: frames, views of a data set, or impulse responses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Protocol, TypeVar, cast
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.errors import MitsonarError
@@ -23,13 +23,23 @@ Source = FrameSource | ResponseSource | ViewSource
 
 Framed = TypeVar("Framed", FrameSource, ViewSource)
 
+
+class ViewReader(Protocol):
+    """An estimator that reads views of a data set: their names, and ``image`` or ``vector``."""
+
+    @property
+    def views(self) -> tuple[str, ...]: ...
+    @property
+    def kind(self) -> str: ...
+
+
 FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad")
 """Options that impulse responses lack."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How records are read: which, with which noise, and what is assumed where they lack it.
+    """How records are read: which, with which noise, and the height and pitch that are assumed where they lack them.
 
     Attributes:
         sequence: of a data set; None: the longest.
@@ -38,7 +48,7 @@ class Reading:
         seed: of the noise.
         height_m: over the ground [m], for records that lack it.
         pitch_rad: of the sonar [rad], for frames that lack poses.
-        height_by: what measures the height in each frame: ``direct`` or a checkpoint.
+        height_by: measures the height in each frame: ``direct`` or a checkpoint.
     """
 
     sequence: int | None = None
@@ -51,7 +61,7 @@ class Reading:
 
 
 def record_at(where: str | Path) -> type[SonarFrames] | type[ImpulseResponses]:
-    """Return the class of the records that lie at a path or URL."""
+    """Return the class of the records at a path or URL."""
     return ImpulseResponses if holds_responses(where) else SonarFrames
 
 
@@ -66,7 +76,7 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
         _check_consumed(where, there, wanted)
         return _responses_for(where, reading)
     if wanted is ViewFrames:
-        return _with_heights(_views_of(where, estimator, reading), reading)
+        return _with_heights(_views_of(where, cast(ViewReader, estimator), reading), reading)
     if reading.height_m is not None and reading.height_by is not None:
         raise MitsonarError("--height gives the height and --height-by measures it: give one of them")
     source = frames_for(where, reading)
@@ -96,15 +106,15 @@ def views_for(where: str, views: tuple[str, ...], kind: str, reading: Reading) -
     return open_views(where, views, kind, sequence=reading.sequence).with_noise(load_noise(reading.noise), reading.seed)
 
 
-def _views_of(where: str, estimator: Any, reading: Reading) -> ViewSource:
-    """The views that a network was trained on."""
+def _views_of(where: str, estimator: ViewReader, reading: Reading) -> ViewSource:
+    """Open the views that a network was trained on."""
     if any(option is not None for option in (reading.view, reading.height_m, reading.pitch_rad)):
         raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")
     return views_for(where, estimator.views, estimator.kind, reading)
 
 
 def _responses_for(where: str, reading: Reading) -> ResponseSource:
-    """Impulse responses with noise and the assumed height."""
+    """Open impulse responses with noise and the assumed height."""
     if any(getattr(reading, name) is not None for name in FRAME_OPTIONS):
         raise MitsonarError(
             "--sequence, --view, --height-by and --pitch-deg belong to frames; impulse responses have none of them"
@@ -113,7 +123,7 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
 
 
 def _with_heights(source: Framed, reading: Reading) -> Framed:
-    """The same records; each has the height that was measured in it."""
+    """Return the same records, whose heights are measured in them if the user asks for it."""
     return source if reading.height_by is None else source.with_heights_by(height_estimator_from(reading.height_by))
 
 

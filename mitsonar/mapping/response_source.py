@@ -26,7 +26,7 @@ class ResponseNoise:
     snr_db: float
 
     def model_dump(self) -> dict[str, str]:
-        """For the record."""
+        """Return its kind and ratio, for the record of a run."""
         return {"kind": "white", "snr": snr_said(self.snr_db)}
 
 
@@ -35,11 +35,11 @@ class ResponseSource:
     """The pings of one run.
 
     Attributes:
-        name: what errors call it.
-        responses: all of them.
-        told_height_m: that was given for responses that lack theirs.
-        noise: that is added when pings are read, and its seed.
-        seed: see noise.
+        name: of the source, for messages.
+        responses: of all pings.
+        told_height_m: the height that the user gave for responses without one.
+        noise: added to the pings that are read.
+        seed: of the noise.
         note: empty; data sets are read by their samples.
     """
 
@@ -52,33 +52,34 @@ class ResponseSource:
     pitch_rad: float | None = None
 
     def __len__(self) -> int:
+        """Return the number of pings."""
         return len(self.responses)
 
     @property
     def time_s(self) -> NDArray[np.float64]:
-        """Of the pings ``(pings,)``."""
+        """Return the times of the pings ``(pings,)`` [s]."""
         return self.responses.time_s
 
     @property
     def poses(self) -> NDArray[np.float64] | None:
-        """Of the transmitter ``(pings, 6)``, where known: the truth."""
+        """Return the true poses of the transmitter ``(pings, 6)`` [m, rad]; None where they are not known."""
         return self.responses.poses
 
     @property
     def height_m(self) -> NDArray[np.float64] | None:
-        """Over the ground ``(pings,)``, where known."""
+        """Return the height over the ground ``(pings,)`` [m]; None where it is not known."""
         return self.responses.height_m
 
     @property
     def true(self) -> Trajectory | None:
-        """Where the transmitter was, where that is known."""
+        """Return the true path of the transmitter; None where it is not known."""
         return None if self.poses is None else Trajectory(self.poses, self.time_s)
 
     def with_noise(self, snr: str, seed: int = 0) -> Self:
         """Return the same pings with noise at a ratio of signal to noise such as ``20 dB``.
 
         Raises:
-            MitsonarError: a ratio that is none.
+            MitsonarError: not a ratio.
         """
         ratio = snr_of(snr)
         return replace(self, noise=None if ratio is None else ResponseNoise(ratio), seed=seed)
@@ -87,7 +88,7 @@ class ResponseSource:
         """Return the same pings with a height [m] where they lack it.
 
         Raises:
-            MitsonarError: a height that cannot be or that would not be used.
+            MitsonarError: a height that is not above 0, or that would not be used.
         """
         if height_m is None:
             return self
@@ -95,41 +96,43 @@ class ResponseSource:
             raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
         known = self.responses.height_m
         if known is not None and np.isfinite(known).all():
-            raise MitsonarError(f"{self.name} tells its heights, so that {height_m:g} m would not be used: leave it out")
+            raise MitsonarError(f"{self.name} holds heights, so that {height_m:g} m would not be used: leave it out")
         responses = replace(self.responses, height_m=np.full(len(self), height_m))
         return replace(self, responses=responses, told_height_m=height_m)
 
     def check_times(self) -> None:
-        """Pings follow each other.
+        """Check that the times of the pings increase.
 
         Raises:
-            MitsonarError: they do not, or have no times.
+            MitsonarError: they do not, or are not finite.
         """
         if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
             raise MitsonarError(f"{self.name}: times of pings must be finite and increase; write the pings in order")
 
     def read(self, index: ArrayLike) -> ImpulseResponses:
-        """Pings of these numbers ``(n,)``, as estimators may see them: with height and attitude, but with place, heading and
-        velocity unknown, so that no truth can leak."""
+        """Read pings of these numbers ``(n,)`` as estimators may use them.
+
+        They have height and attitude, but neither position, heading nor velocity, so that no truth can leak.
+        """
         chosen = np.asarray(index, dtype=np.intp)
-        seen = self.responses.select(chosen)
-        response = seen.response
+        picked = self.responses.select(chosen)
+        response = picked.response
         if self.noise is not None:
             response = with_noise(response, chosen, self.noise.snr_db, self.seed)
-        poses = None if seen.poses is None else seen.poses * [0, 0, 1, 1, 1, 0]
-        return replace(seen, response=response.astype(np.complex64), poses=poses, velocity=None)
+        poses = None if picked.poses is None else picked.poses * [0, 0, 1, 1, 1, 0]
+        return replace(picked, response=response.astype(np.complex64), poses=poses, velocity=None)
 
     def digest(self) -> str:
-        """SHA-256 of the responses and what is known of them."""
-        told = hashlib.sha256(self.responses.sonar.model_dump_json().encode())
+        """Return the SHA-256 of the responses with their times, poses, heights and noise."""
+        digest = hashlib.sha256(self.responses.sonar.model_dump_json().encode())
         for values in (self.responses.response, self.time_s, self.poses, self.height_m):
-            told.update(b"-" if values is None else np.ascontiguousarray(values).tobytes())
-        told.update(repr((self.noise, self.seed)).encode())
-        return told.hexdigest()
+            digest.update(b"-" if values is None else np.ascontiguousarray(values).tobytes())
+        digest.update(repr((self.noise, self.seed)).encode())
+        return digest.hexdigest()
 
 
 def holds_responses(where: str | Path) -> bool:
-    """Whether impulse responses lie there: the folder that ``mitsonar impulse`` made, or its responses.npz or .zarr."""
+    """Return whether impulse responses are there: a folder of ``mitsonar impulse``, or its responses.npz or .zarr."""
     path = Path(where)
     if path.name.startswith("responses."):
         return path.exists()
@@ -137,9 +140,9 @@ def holds_responses(where: str | Path) -> bool:
 
 
 def open_responses(where: str | Path) -> ResponseSource:
-    """The responses at a path.
+    """Open the responses at a path.
 
     Raises:
-        MitsonarError: damaged, or no responses.
+        MitsonarError: no responses, or a damaged file.
     """
     return ResponseSource(str(where), ImpulseResponses.load(where))

@@ -1,217 +1,53 @@
-"""Motions become a path: composition (Almanza-Medina, eq. 3.4), scale factors, smoothing by a weighted spline or by a Kalman
-filter with RTS smoother, and how the motions' covariances grow into that of the pose.
+"""Smoothing of motions: by a weighted spline, or by a Kalman filter with RTS smoother.
 
-The thesis composes its estimates as they come (3.5.1, 4.4.4, 5.4.5), multiplies single axes by constants where the sonar's
-height or pitch was not known (3.5.2, 3.5.3), and leaves splines and Kalman filters to further work (6.2).
+Almanza-Medina composes estimates without smoothing (3.5.1, 4.4.4, 5.4.5), and leaves splines and Kalman filters to further
+work (6.2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_smoothing_spline
-from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.mapping.motion_series import MotionSeries
 from mitsonar.motion.motion_errors import AXES
-from mitsonar.motion.pose import Pose
-from mitsonar.motion.trajectory import Trajectory
 
-__all__ = [
-    "Ellipse",
-    "MotionSeries",
-    "ellipse",
-    "fit_noise",
-    "fit_scale",
-    "fit_wander",
-    "kalman_smoothed",
-    "path_of",
-    "pose_covariances",
-    "scaled",
-    "spline_period",
-    "spline_smoothed",
-]
+__all__ = ["fit_noise", "fit_wander", "kalman_smoothed", "spline_period", "spline_smoothed"]
 
 Array = NDArray[np.float64]
 
 FEWEST_FOR_SPLINE = 5
-"""What SciPy's smoothing spline asks for; fewer motions are joined by straight lines."""
+"""Fewest motions that SciPy's smoothing spline takes; fewer are joined by straight lines."""
 
 LONGEST_PERIOD = 2000.0
-"""In motions: beyond, the spline is a straight line, and SciPy's equations lose their digits (from 6000 on)."""
-
-
-@dataclass(frozen=True)
-class MotionSeries:
-    """Motions between consecutive frames, and what is known of their errors.
-
-    Attributes:
-        motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)`` (eq. 3.4).
-        time_s: of the frames ``(frames,)``, increasing, not necessarily evenly.
-        covariances: of the motions' errors ``(frames - 1, 3, 3)`` [m, m, rad], where known.
-        believe: False where a motion, and its covariance, is not to be used ``(frames - 1,)``; not given, all are believed.
-        with_next: covariance of each motion's error (rows) with that of the next (columns) ``(frames - 2, 3, 3)``. Errors
-            further apart depend on each other only through those between (Markov). Not given, they are independent.
-    """
-
-    motions: Array
-    time_s: Array
-    covariances: Array | None = None
-    valid: NDArray[np.bool_] | None = None
-    with_next: Array | None = None
-
-    def __post_init__(self) -> None:
-        count = len(self.time_s) - 1
-        if count < 1:
-            raise MitsonarError(f"a path needs two frames or more: got {count + 1}; give a longer run")
-        if self.motions.shape != (count, 3):
-            raise MitsonarError(f"motions must be ({count}, 3) for {count + 1} frame times: got {self.motions.shape}")
-        if not (np.isfinite(self.time_s).all() and (np.diff(self.time_s) > 0).all()):
-            raise MitsonarError("frame times must be finite and increase: sort the frames, or give their times")
-        if self.believed.shape != (count,):
-            raise MitsonarError(f"believe must be ({count},), one for each motion: got {self.believed.shape}")
-        if not self.believed.any():
-            raise MitsonarError(f"none of {count} motions is believed: nothing tells the path; try another estimator")
-        self._refuse(~np.isfinite(self.motions).all(axis=1), "is not finite")
-        if self.covariances is not None:
-            self._check_covariances(self.covariances)
-        if self.with_next is not None and self.with_next.shape != (count - 1, 3, 3):
-            raise MitsonarError(f"with_next must be ({count - 1}, 3, 3): got {self.with_next.shape}")
-
-    def _check_covariances(self, covariances: Array) -> None:
-        if covariances.shape != (len(self), 3, 3):
-            raise MitsonarError(f"covariances must be ({len(self)}, 3, 3), one a motion: got {covariances.shape}")
-        self._refuse(~np.isfinite(covariances).all(axis=(1, 2)), "has a covariance that is not finite")
-        known = np.where(self.believed[:, None, None], covariances, np.eye(3))
-        crooked = np.abs(known - known.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * np.abs(known).max(axis=(1, 2))
-        least = np.linalg.eigvalsh(known)
-        self._refuse(crooked | (least[:, 0] < -1e-9 * least[:, 2]), "has a covariance with a negative variance, or lopsided")
-
-    def _refuse(self, bad: ArrayLike, what: str) -> None:
-        where = np.flatnonzero(np.asarray(bad) & self.believed)
-        if where.size:
-            raise MitsonarError(
-                f"the motion from frame {where[0]} to {where[0] + 1} {what} ({where.size} of {len(self)} are so): "
-                "mark it as not believed, or leave it out"
-            )
-
-    def __len__(self) -> int:
-        """How many motions: one less than frames."""
-        return len(self.time_s) - 1
-
-    @classmethod
-    def from_estimates(cls, estimates: Sequence[Estimate], time_s: ArrayLike) -> Self:
-        """What an estimator said of consecutive frames at ``time_s`` ``(frames,)``; covariances only if every believed
-        estimate has one."""
-        valid = np.array([estimate.valid for estimate in estimates], dtype=bool)
-        unknown = np.full((3, 3), np.nan)
-        covariances = [unknown if one.covariance is None else one.covariance for one in estimates]
-        known = all(one.covariance is not None for one in estimates if one.valid)
-        motions = np.array([one.motion for one in estimates], dtype=float).reshape(-1, 3)
-        return cls(motions, np.asarray(time_s, dtype=float), np.array(covariances) if known else None, valid)
-
-    @cached_property
-    def believed(self) -> NDArray[np.bool_]:
-        """Which motions are to be used ``(frames - 1,)``."""
-        return np.ones(len(self), dtype=bool) if self.valid is None else self.valid
-
-    @cached_property
-    def step_s(self) -> Array:
-        """Time from frame to frame ``(frames - 1,)`` [s]."""
-        return np.diff(self.time_s)
-
-    @cached_property
-    def middle_s(self) -> Array:
-        """Time half-way through each motion ``(frames - 1,)`` [s]: its mean velocity is taken as the velocity then."""
-        return (self.time_s[1:] + self.time_s[:-1]) / 2
-
-    @cached_property
-    def velocity(self) -> Array:
-        """Mean velocity of each motion in the vehicle's frame ``(frames - 1, 3)`` [m/s, m/s, rad/s]."""
-        return self.motions / self.step_s[:, None]
-
-
-# ---------------------------------------------------------------- composition
-
-
-def path_of(motions: ArrayLike, start: Pose, time_s: ArrayLike) -> Trajectory:
-    """The path that motions drive from ``start``: :func:`mitsonar.motion.composition.compose` from frame to frame
-    (Almanza-Medina,
-    eq.
-    3.4), the inverse of :func:`mitsonar.motion.composition.motions`. Height, pitch and roll stay those of ``start``.
-
-    Args:
-        motions: sideways, forward [m], yaw [rad] ``(frames - 1, 3)``.
-        start: the first pose.
-        time_s: of the frames ``(frames,)`` [s].
-
-    Raises:
-        MitsonarError: shapes that do not fit, a motion that is not finite, times that do not increase.
-    """
-    series = MotionSeries(np.asarray(motions, dtype=float), np.asarray(time_s, dtype=float))
-    sideways, forward, yaw = series.motions.T
-    heading = start.heading + np.cumsum(yaw)
-    sin, cos = np.sin(heading), np.cos(heading)
-    poses = np.tile(np.asarray(start, dtype=float), (len(series) + 1, 1))
-    poses[1:, 0] += np.cumsum(forward * sin + sideways * cos)
-    poses[1:, 1] += np.cumsum(forward * cos - sideways * sin)
-    poses[1:, 5] = heading
-    return Trajectory(poses, series.time_s)
-
-
-# ---------------------------------------------------------------- scale
-
-
-def scaled(measured: MotionSeries, factors: ArrayLike) -> MotionSeries:
-    """Motions times one factor for each of sideways, forward, yaw ``(3,)``; their covariances with them. The thesis takes
-    2.3 for sideways (3.5.2), 9.0 for sideways and 4.0 for forward (3.5.3)."""
-    factor = np.asarray(factors, dtype=float)
-    if factor.shape != (3,) or not np.isfinite(factor).all():
-        raise MitsonarError(f"scale factors are three finite numbers, for sideways, forward, yaw: got {factors!r}")
-    both = np.outer(factor, factor)
-    covariances, with_next = (None if c is None else c * both for c in (measured.covariances, measured.with_next))
-    return replace(measured, motions=measured.motions * factor, covariances=covariances, with_next=with_next)
-
-
-def fit_scale(estimated: ArrayLike, true: ArrayLike) -> Array:
-    """Factors ``(3,)`` that bring estimated motions ``(frames - 1, 3)`` nearest to the true ones, of the same shape: least
-    squares through the origin for each axis. An axis that is estimated as zero throughout keeps the factor 1.
-
-    Noise in the estimates makes the factor smaller than their true scale by signal / (signal + noise) power.
-    """
-    e, t = np.asarray(estimated, dtype=float), np.asarray(true, dtype=float)
-    if e.shape != t.shape or e.ndim != 2 or e.shape[1] != 3 or not (np.isfinite(e).all() and np.isfinite(t).all()):
-        raise MitsonarError(
-            f"scale factors need as many true as estimated motions (motions, 3): got {e.shape} and {t.shape}"
-        )
-    power = (e * e).sum(axis=0)
-    return np.where(power > 0, (e * t).sum(axis=0) / np.where(power > 0, power, 1), 1.0)
+"""Longest period [motions]: beyond, the spline is a straight line, and SciPy's equations lose their digits (from 6000)."""
 
 
 # ---------------------------------------------------------------- splines
 
 
 def spline_smoothed(measured: MotionSeries, period_s: ArrayLike | None = None) -> MotionSeries:
-    """Velocities smoothed, axis by axis, by a cubic spline weighted with the inverse variances of the estimates (all motions
-    alike where these are not known); motions that are not believed are bridged. After Henson and Zakharov, whom the thesis
-    compares itself with (3.4.8, 3.5.3), who integrate such splines.
+    """Smooth the velocities, axis by axis, by a cubic spline; bridge invalid motions.
 
-    Before the first and after the last believed motion the velocity stays as it was there. Fewer than five believed motions
-    are not smoothed, but joined by straight lines. The covariance of the smoothed motions is not told (the Kalman filter
-    tells one).
+    The weights are the inverse variances of the estimates; without covariances all motions weigh the same. Henson and
+    Zakharov, whose method Almanza-Medina compares with (3.4.8, 3.5.3), integrate such splines. Before the first and after
+    the last valid motion the velocity is constant. Fewer than five valid motions are not smoothed, but joined by straight
+    lines. The smoothed motions have no covariance; those of :func:`kalman_smoothed` have one.
 
     Args:
         measured: the motions.
-        period_s: a swing of this period [s] keeps half of its size, faster ones less; one number, or one an axis ``(3,)``.
-            Not given: :func:`spline_period`. Beyond 2,000 motions the spline is a straight line, and no longer one is taken.
+        period_s: an oscillation of this period [s] keeps half of its amplitude, faster ones less; one number, or one an
+            axis ``(3,)``. Default: :func:`spline_period`. At most 2,000 motions: there the spline is a straight line.
+
+    Raises:
+        MitsonarError: a period that is not positive, or a variance that is not.
     """
-    known, place, weight = _spline_data(measured)
+    known, abscissa, weight = _spline_data(measured)
     velocity = np.column_stack(
         [np.interp(measured.middle_s, measured.middle_s[known], v[known]) for v in measured.velocity.T]
     )
@@ -224,38 +60,40 @@ def spline_smoothed(measured: MotionSeries, period_s: ArrayLike | None = None) -
         held = np.clip(measured.middle_s, measured.middle_s[known[0]], measured.middle_s[known[-1]])
         for axis in range(3):
             values = measured.velocity[known, axis]
-            spline = make_smoothing_spline(place, values, w=weight[:, axis], lam=strength[axis])
+            spline = make_smoothing_spline(abscissa, values, w=weight[:, axis], lam=strength[axis])
             velocity[:, axis] = spline((held - measured.middle_s[known[0]]) / gap)
     return MotionSeries(velocity * measured.step_s[:, None], measured.time_s)
 
 
 def spline_period(measured: MotionSeries) -> Array:
-    """The period ``(3,)`` [s] at which :func:`spline_smoothed` halves a swing, chosen for each axis by generalised cross
-    validation (Craven and Wahba, 1979) between two and 2,000 motions.
+    """Choose the period ``(3,)`` [s] at which :func:`spline_smoothed` halves an oscillation.
 
-    SciPy's own choice is sought at 0 to n in the unit of the abscissa, so that it changes with the unit of time, and counts
-    residuals without their weights; hence this one.
+    Each axis is chosen by generalised cross validation (Craven and Wahba, 1979), between two and 2,000 motions. SciPy's own
+    choice changes with the unit of time, and ignores the weights of the residuals.
+
+    Raises:
+        MitsonarError: fewer than five valid motions.
     """
-    known, place, weight = _spline_data(measured)
+    known, abscissa, weight = _spline_data(measured)
     if known.size < FEWEST_FOR_SPLINE:
-        raise MitsonarError(f"a spline's period needs {FEWEST_FOR_SPLINE} believed motions: got {known.size}; give more")
+        raise MitsonarError(f"a spline's period needs {FEWEST_FOR_SPLINE} valid motions: got {known.size}; give more")
     values = measured.velocity[known]
 
     def score(log_period: Array) -> Array:
-        return _generalised_cross_validation(place, values, weight, _strength(np.exp(log_period)))
+        return _generalised_cross_validation(abscissa, values, weight, _strength(np.exp(log_period)))
 
     least = _least(score, np.log(np.full(3, 2.0)), np.log(np.full(3, LONGEST_PERIOD)))
     return np.exp(least) * _mean_gap(measured, known)
 
 
 def _spline_data(measured: MotionSeries) -> tuple[NDArray[np.intp], Array, Array]:
-    """Which motions are believed, where they lie (mean gap 1) and their weights (mean 1) for each axis."""
+    """Return which motions are valid, their times (mean gap 1) and their weights for each axis (mean 1)."""
     known = np.flatnonzero(measured.believed)
     weight = np.broadcast_to(measured.step_s[known, None] ** 2, (known.size, 3))
     if measured.covariances is not None:
         weight = weight / _variances(measured)[known]
-    place = (measured.middle_s[known] - measured.middle_s[known[0]]) / _mean_gap(measured, known)
-    return known, place, weight / weight.mean(axis=0)
+    abscissa = (measured.middle_s[known] - measured.middle_s[known[0]]) / _mean_gap(measured, known)
+    return known, abscissa, weight / weight.mean(axis=0)
 
 
 def _mean_gap(measured: MotionSeries, known: NDArray[np.intp]) -> float:
@@ -264,12 +102,12 @@ def _mean_gap(measured: MotionSeries, known: NDArray[np.intp]) -> float:
 
 
 def _strength(period: Array) -> Array:
-    """The factor of the integral of f''^2 that halves a swing of a period in mean gaps, for weights of mean 1."""
+    """Return the factor of the integral of f''^2 that halves an oscillation of a period [mean gaps]; weights of mean 1."""
     return (period / (2 * np.pi)) ** 4
 
 
 def _generalised_cross_validation(x: Array, y: Array, w: Array, strength: Array) -> Array:
-    """The score of smoothing splines of many strengths ``(many, axes)`` through y ``(n, axes)`` with weights w.
+    """Score smoothing splines of many strengths ``(many, axes)`` through y ``(n, axes)`` with weights w.
 
     In Reinsch's form: with B = R + strength S, S = Q'W^-1Q and B c = Q'y, the residuals are strength W^-1 Q c, and the trace
     of (1 - hat matrix) is that of strength B^-1 S.
@@ -292,8 +130,11 @@ def _generalised_cross_validation(x: Array, y: Array, w: Array, strength: Array)
 
 
 def _five_diagonals(band: Array, right: Array) -> tuple[Array, Array]:
-    """Solution ``(n, many, axes)`` of symmetric equations with five diagonals, of which the main one and the two above are
-    given ``(3, n, many, axes)``, and the same diagonals of the inverse (Hutchinson and de Hoog, 1985)."""
+    """Solve symmetric equations with five diagonals (Hutchinson and de Hoog, 1985).
+
+    ``band`` is the main diagonal and the two above ``(3, n, many, axes)``. Return the solution ``(n, many, axes)`` and the
+    same diagonals of the inverse.
+    """
     _, n, *many = band.shape
     d, z, l1, l2 = np.zeros((4, n + 2, *many))  # B = L d L', L z = right; two zeros before the first
     for i in range(2, n + 2):
@@ -315,20 +156,20 @@ def _five_diagonals(band: Array, right: Array) -> tuple[Array, Array]:
 
 
 def kalman_smoothed(measured: MotionSeries, wander: ArrayLike | None = None) -> MotionSeries:
-    """Motions and covariances given all measurements: Kalman filter and Rauch-Tung-Striebel smoother.
+    """Estimate motions and covariances from all measurements: Kalman filter and Rauch-Tung-Striebel smoother.
 
-    The state is the velocity in the vehicle's frame (sideways, forward, yaw); from the middle of one motion to that of the
-    next it walks at random, independently on each axis; nothing is assumed of it beforehand. A measured motion is velocity
-    times its time, with its whole 3 x 3 covariance. Motions that are not believed are filled in. The result's ``with_next``
-    tells how the smoothed errors hang together, without which the pose's covariance would come out too small.
+    The state is the velocity in the vehicle's frame (sideways, forward, yaw). From the middle of one motion to that of the
+    next it is a random walk, independent on each axis, with no prior. A measured motion is velocity times its time, with its
+    whole 3 x 3 covariance. Invalid motions are filled in. ``with_next`` of the result holds the covariances of consecutive
+    errors; without them the covariance of the pose would be too small.
 
     Args:
-        measured: the motions; where they have no covariances, :func:`fit_noise` gives them one for all.
-        wander: how far the velocity walks in a second, one standard deviation: [m/s, m/s, rad/s] per root second ``(3,)``,
-            growing with the root of time. Not given: :func:`fit_wander`.
+        measured: the motions; where they have no covariances, :func:`fit_noise` estimates one for all.
+        wander: standard deviation of the random walk after a second: [m/s, m/s, rad/s] per root second ``(3,)``; it grows
+            with the root of time. Default: :func:`fit_wander`.
 
     Raises:
-        MitsonarError: a variance or wander that is not positive, or too few motions to tell them from.
+        MitsonarError: a variance or wander that is not positive, or too few motions to estimate them.
     """
     if measured.covariances is None:
         covariances = np.tile(np.diag(fit_noise(measured) ** 2), (len(measured), 1, 1))
@@ -345,13 +186,15 @@ def kalman_smoothed(measured: MotionSeries, wander: ArrayLike | None = None) -> 
 
 
 def _walked(measured: MotionSeries, wander: Array) -> Array:
-    """Covariance of the velocity's change from each motion to the next ``(frames - 2, 3, 3)``."""
+    """Return the covariance of the change of velocity from each motion to the next ``(frames - 2, 3, 3)``."""
     return np.diff(measured.middle_s)[:, None, None] * np.diag(wander**2)
 
 
 def _filtered(measured: MotionSeries, wander: Array) -> tuple[Array, Array, Array]:
-    """Velocity after each measurement ``(n, 3)``, its covariance, and how far the smoother carries back what it learns from
-    the next ``(n - 1, 3, 3)``: wholly, before the first believed motion."""
+    """Return the filtered velocity ``(n, 3)``, its covariance, and the gain of the smoother ``(n - 1, 3, 3)``.
+
+    Before the first valid motion the gain is the identity.
+    """
     seen, noise = measured.velocity, np.asarray(measured.covariances) / (measured.step_s**2)[:, None, None]
     walked = _walked(measured, wander)
     first = int(np.argmax(measured.believed))
@@ -372,7 +215,7 @@ def _filtered(measured: MotionSeries, wander: Array) -> tuple[Array, Array, Arra
 
 
 def _rts(mean: Array, covariance: Array, back: Array, walked: Array) -> tuple[Array, Array, Array]:
-    """Smoothed velocity, its covariance, and that of each with the next."""
+    """Return the smoothed velocity, its covariance, and the covariance of each with the next."""
     mean, covariance, lag = mean.copy(), covariance.copy(), np.zeros_like(back)
     one = np.eye(3)
     for k in range(len(mean) - 2, -1, -1):
@@ -385,76 +228,82 @@ def _rts(mean: Array, covariance: Array, back: Array, walked: Array) -> tuple[Ar
 
 
 def fit_wander(measured: MotionSeries) -> Array:
-    """How far the velocity walks in a second ``(3,)`` [m/s, m/s, rad/s per root second]: maximum likelihood of the filter's
-    innovations, each axis by itself with the variances on the diagonal of the covariances.
+    """Estimate the random walk of the velocity in a second ``(3,)`` [m/s, m/s, rad/s per root second].
+
+    It maximises the likelihood of the filter's innovations, each axis by itself, with the diagonal of the covariances.
 
     Raises:
-        MitsonarError: no covariances, a variance that is not positive, or one believed motion among several.
+        MitsonarError: no covariances, a variance that is not positive, or one valid motion among several.
     """
     if measured.covariances is None:
-        raise MitsonarError("fit_wander needs the motions' covariances: give them, or tell the noise by fit_noise")
+        raise MitsonarError("fit_wander needs the motions' covariances: give them, or estimate the noise with fit_noise")
     known = np.flatnonzero(measured.believed)
     if known.size == 1 < len(measured):
-        raise MitsonarError(f"one believed motion of {len(measured)} tells no change of velocity: give wander")
+        raise MitsonarError(f"one valid motion of {len(measured)} shows no change of velocity: give wander")
     gap, seen = np.diff(measured.middle_s[known])[:, None], measured.velocity[known]
     noise = _variances(measured)[known] / measured.step_s[known, None] ** 2
     if known.size == 1:  # nothing to walk to
-        return np.sqrt(noise[0])
+        return np.asarray(np.sqrt(noise[0]))
 
-    def surprise(log_walk: Array) -> Array:
+    def misfit(log_walk: Array) -> Array:
         log_spread, chi = _innovations(seen, noise, gap, np.exp(log_walk))
-        return log_spread + chi
+        return np.asarray(log_spread + chi)
 
     high = np.log(1e2 * (np.diff(seen, axis=0) ** 2 + noise[1:] + noise[:-1]).mean(axis=0) / gap.min())
-    return np.exp(_least(surprise, high - np.log(1e14), high) / 2)
+    return np.exp(_least(misfit, high - np.log(1e14), high) / 2)
 
 
 def fit_noise(measured: MotionSeries) -> Array:
-    """Standard deviation of the motions' errors ``(3,)`` [m, m, rad], one for all motions, where an estimator tells none: by
-    maximum likelihood together with the velocity's wander, from how much consecutive motions differ.
+    """Estimate the standard deviation of the errors ``(3,)`` [m, m, rad], one for all motions, from their differences.
+
+    It maximises the likelihood jointly with the random walk of the velocity.
 
     Raises:
-        MitsonarError: fewer than five believed motions, or an axis that never changes.
+        MitsonarError: fewer than five valid motions, or an axis that never changes.
     """
     known = np.flatnonzero(measured.believed)
     seen, step = measured.velocity[known], measured.step_s[known, None]
     if known.size < 5:
-        raise MitsonarError(f"the noise of motions is told from five of them or more: got {known.size}; give covariances")
+        raise MitsonarError(f"the noise of motions needs five of them or more: got {known.size}; give covariances")
     still = [axis.name for axis, values in zip(AXES, measured.motions[known].T, strict=True) if not np.ptp(values)]
     if still:
-        raise MitsonarError(f"{still[0]} is the same in all motions, so that its noise cannot be told: give covariances")
+        raise MitsonarError(
+            f"{still[0]} is the same in all motions, so that its noise cannot be estimated: give covariances"
+        )
     noise, gap = np.broadcast_to((step.mean() / step) ** 2, seen.shape), np.diff(measured.middle_s[known])[:, None]
 
     def power(log_walk: Array) -> tuple[Array, Array]:
         log_spread, chi = _innovations(seen, noise, gap, np.exp(log_walk))
         return log_spread, chi / len(gap)
 
-    def surprise(log_walk: Array) -> Array:
+    def misfit(log_walk: Array) -> Array:
         log_spread, each = power(log_walk)
-        return log_spread + len(gap) * np.log(each)
+        return np.asarray(log_spread + len(gap) * np.log(each))
 
     unit = np.full(3, -np.log(gap.mean()))  # a walk as large as the noise
-    walk = _least(surprise, unit - np.log(1e10), unit + np.log(1e6))
+    walk = _least(misfit, unit - np.log(1e10), unit + np.log(1e6))
     return np.asarray(np.sqrt(power(walk[None])[1][0]) * step.mean())
 
 
 def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Array, Array]:
-    """Sums over the motions of the log variance and the squared size of what surprises the filter, for many variances of the
-    walk a second ``(many, 3)``; each axis by itself."""
+    """Sum the log variances and the normalised squares of the filter's innovations, each axis by itself.
+
+    ``walk`` holds many variances of the random walk in a second ``(many, 3)``.
+    """
     mean, variance = seen[0] + 0 * walk, noise[0] + 0 * walk
     log_spread, chi = 0 * walk, 0 * walk
     for k in range(1, len(seen)):
         ahead = variance + walk * gap[k - 1]
         spread = ahead + noise[k]
-        news = seen[k] - mean
+        innovation = seen[k] - mean
         gain = ahead / spread
-        log_spread, chi = log_spread + np.log(spread), chi + news**2 / spread
-        mean, variance = mean + gain * news, gain * noise[k]
+        log_spread, chi = log_spread + np.log(spread), chi + innovation**2 / spread
+        mean, variance = mean + gain * innovation, gain * noise[k]
     return log_spread, chi
 
 
 def _variances(measured: MotionSeries) -> Array:
-    """Variances of the motions ``(frames - 1, 3)``, positive where believed."""
+    """Return the variances of the motions ``(frames - 1, 3)``, positive where valid."""
     variance = np.diagonal(np.asarray(measured.covariances), axis1=1, axis2=2)
     for axis, values in zip(AXES, variance[measured.believed].T, strict=True):
         if not (values > 0).all():
@@ -463,7 +312,7 @@ def _variances(measured: MotionSeries) -> Array:
 
 
 def _least(score: Callable[[Array], Array], low: Array, high: Array, points: int = 25, rounds: int = 4) -> Array:
-    """Where each of the columns of ``score((points, axes))`` is least between low and high: a grid, then finer ones."""
+    """Return where each column of ``score((points, axes))`` is least between low and high: a grid, then finer ones."""
     columns = np.arange(low.size)
     for _ in range(rounds):
         grid = np.linspace(low, high, points)
@@ -474,66 +323,3 @@ def _least(score: Callable[[Array], Array], low: Array, high: Array, points: int
 
 def _symmetric(matrix: Array) -> Array:
     return (matrix + matrix.T) / 2
-
-
-# ---------------------------------------------------------------- covariance of the pose
-
-
-def pose_covariances(series: MotionSeries, start: Pose, at_start: ArrayLike | None = None) -> Array:
-    """Covariances of x, y [m] and heading [rad] of every frame ``(frames, 3, 3)`` along the path, to first order.
-
-    Args:
-        series: the motions with their covariances, all believed: smooth a series with gaps first.
-        start: the first pose.
-        at_start: its covariance ``(3, 3)``; not given: known exactly.
-
-    Raises:
-        MitsonarError: no covariances, or a motion that is not believed, whose error nobody knows.
-    """
-    if series.covariances is None:
-        raise MitsonarError("the pose's covariance needs those of the motions: give them, or use kalman_smoothed")
-    if not series.believed.all():
-        gaps = int((~series.believed).sum())
-        raise MitsonarError(
-            f"{gaps} motions are not believed, so that their errors are not known: use kalman_smoothed first"
-        )
-    poses = path_of(series.motions, start, series.time_s).poses
-    along, fresh = _dependence(series.covariances, series.with_next)
-    found = np.zeros((len(poses), 3, 3))
-    joint = np.zeros((6, 6))  # of the pose and of the last motion
-    joint[:3, :3] = found[0] = 0.0 if at_start is None else np.asarray(at_start, dtype=float)
-    for k, (x, y) in enumerate(np.diff(poses[:, :2], axis=0)):
-        sin, cos = np.sin(poses[k + 1, 5]), np.cos(poses[k + 1, 5])
-        pose = np.array([[1, 0, y], [0, 1, -x], [0, 0, 1]])  # derivatives of eq. 3.4: by the pose,
-        motion = np.array([[cos, sin, y], [-sin, cos, -x], [0, 0, 1]])  # and by the motion
-        onward = np.block([[pose, motion @ along[k]], [np.zeros((3, 3)), along[k]]])
-        news = np.vstack([motion, np.eye(3)])
-        joint = _symmetric(onward @ joint @ onward.T + news @ fresh[k] @ news.T)
-        found[k + 1] = joint[:3, :3]
-    return found
-
-
-def _dependence(covariances: Array, with_next: Array | None) -> tuple[Array, Array]:
-    """How each motion's error follows from the one before ``(n, 3, 3)``, and the covariance of what is new in it."""
-    along, fresh = np.zeros_like(covariances), covariances.copy()
-    if with_next is not None and len(with_next):
-        along[1:] = np.linalg.solve(covariances[:-1], with_next).swapaxes(1, 2)
-        fresh[1:] -= along[1:] @ with_next
-    return along, fresh
-
-
-class Ellipse(NamedTuple):
-    """Where a position lies: half axes [m], and the bearing of the longer one [rad], clockwise from +y as a heading."""
-
-    major_m: float
-    minor_m: float
-    heading: float
-
-
-def ellipse(covariance: ArrayLike, probability: float = 0.95) -> Ellipse:
-    """The ellipse that holds the position with a probability, from a covariance that begins with x, y ``(2.., 2..)``."""
-    if not 0 < probability < 1:
-        raise MitsonarError(f"probability must be between 0 and 1: got {probability:g}")
-    variance, axes = np.linalg.eigh(np.asarray(covariance, dtype=float)[:2, :2])
-    minor, major = np.sqrt(np.maximum(variance, 0) * chi2.ppf(probability, 2))
-    return Ellipse(float(major), float(minor), float(np.arctan2(axes[0, 1], axes[1, 1]) % np.pi))

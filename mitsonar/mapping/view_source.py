@@ -1,4 +1,4 @@
-"""Several views of a data set's sequence, or their vectors, read some pings at a time."""
+"""Several views of a sequence of a data set, as images or vectors, read some pings at a time."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ class ViewSource:
     """The pings of one sequence.
 
     Attributes:
-        name: what errors call it.
+        name: of the source, for messages.
         store: of the data set.
         views: that are read, in this order.
         kind: ``image`` or ``vector``.
-        first: number of the sequence's first frame in the store.
-        time_s: of the pings ``(n,)``.
-        poses: of the vehicle, whose motion networks of data sets tell ``(n, 6)``: the truth.
-        sonar_poses: of the sonar on it ``(n, 6)``.
+        first: number of the first frame of the sequence in the store.
+        time_s: of the pings ``(n,)`` [s].
+        poses: true poses of the vehicle, whose motion networks of data sets estimate ``(n, 6)`` [m, rad].
+        sonar_poses: of the sonar on it ``(n, 6)`` [m, rad].
         height_m: over the ground ``(n,)``.
-        noise: that is added when pings are read, and its seed: the same as that of samples of the data set.
-        seed: see noise.
+        noise: added to the pings that are read, as to samples of the data set.
+        seed: of the noise.
         note: which sequence this is.
-        altimeter: what measures the height of each ping that is read, in place of what is told.
+        altimeter: measures the height of each ping that is read, in place of ``height_m``.
     """
 
     name: str
@@ -61,17 +61,18 @@ class ViewSource:
     altimeter: HeightEstimator | None = None
 
     def __len__(self) -> int:
+        """Return the number of pings."""
         return len(self.time_s)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
-        """The same pings with noise of a seed, a function of it and each frame's number."""
+        """Return the same pings with noise: a function of the seed and the number of each frame."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
 
     def with_heights_by(self, estimator: HeightEstimator) -> Self:
-        """The same pings; each tells the height that an estimator finds in its views, whatever else was told.
+        """Return the same pings, whose heights an estimator measures in its views when they are read.
 
         Raises:
-            MitsonarError: the data set lacks what it reads.
+            MitsonarError: the data set lacks these views.
         """
         if estimator.views is not None:
             _check_there(self.store, estimator.views, estimator.kind)
@@ -79,14 +80,14 @@ class ViewSource:
 
     @property
     def true(self) -> Trajectory:
-        """Where the vehicle was."""
+        """Return the true path of the vehicle."""
         return Trajectory(self.poses, self.time_s)
 
     def check_times(self) -> None:
-        """Pings of a sequence follow each other."""
+        """Check nothing: the times of a sequence increase."""
 
     def read(self, index: ArrayLike) -> ViewFrames:
-        """Pings of these numbers ``(n,)``, as estimators may see them: with place and heading 0, so that no truth can leak.
+        """Read pings of these numbers ``(n,)`` with position and heading 0, so that no truth can leak.
 
         Raises:
             MitsonarError: arrays that cannot be read.
@@ -97,11 +98,10 @@ class ViewSource:
             return frames
         views, kind = self.altimeter.views or self.views, self.altimeter.kind if self.altimeter.views else self.kind
         same = (views, kind) == (self.views, self.kind)
-        found: ViewFrames = measured(frames, self.altimeter, frames if same else self._read(chosen, views, kind))[0]
-        return found
+        return measured(frames, self.altimeter, frames if same else self._read(chosen, views, kind))[0]
 
     def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
-        """Pings as they are stored, with noise."""
+        """Read pings as they are stored, with noise."""
         from mitsonar.config.data_recipe import array_names
         from mitsonar.datasets.arrangement import arrangement_of
 
@@ -109,14 +109,14 @@ class ViewSource:
         kept = chosen - chosen[0]
         values, known = {}, {view.name: view for view in self.store.recipe.views}
         made = arrangement_of(self.store.recipe, views=views, kind=kind, noise=self.noise or "none")
-        for place, view in enumerate(views):
+        for number, view in enumerate(views):
             frames = {
                 (view if stored == kind else f"nonzero_{view}"): self.store.read(name, here)[kept][None]
                 for name, (stored, of) in array_names(self.store.recipe).items()
                 if of == view and (stored == kind or (stored == "nonzero" and kind == "vector"))
             }
             numbers = (self.first + chosen.astype(np.int64))[None]
-            values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + place))[0]
+            values[view] = np.asarray(made.noisy(frames, view, numbers, self.seed + number))[0]
         return ViewFrames(
             kind=kind,
             values=values,
@@ -128,35 +128,35 @@ class ViewSource:
         )
 
     def digest(self) -> str:
-        """SHA-256 of what is known of all pings, and of the first and the last of them."""
-        told = hashlib.sha256(self.store.recipe.model_dump_json().encode())
+        """Return the SHA-256 of all data but the views, and of the views of the first and the last ping."""
+        digest = hashlib.sha256(self.store.recipe.model_dump_json().encode())
         for values in (self.time_s, self.poses, self.sonar_poses, self.height_m):
-            told.update(np.ascontiguousarray(values, dtype=float).tobytes())
-        told.update(repr((self.views, self.kind, self.noise, self.seed, self.first, self.altimeter)).encode())
+            digest.update(np.ascontiguousarray(values, dtype=float).tobytes())
+        digest.update(repr((self.views, self.kind, self.noise, self.seed, self.first, self.altimeter)).encode())
         for number in (0, len(self) - 1):
-            told.update(self.read([number]).profiles().tobytes())
-        return told.hexdigest()
+            digest.update(self.read([number]).profiles().tobytes())
+        return digest.hexdigest()
 
 
 def open_views(url: str, views: Sequence[str], kind: str, *, sequence: int | None = None) -> ViewSource:
-    """Views of a data set's sequence; default: the longest, the first of these.
+    """Open views of a sequence of a data set. Default: the longest sequence; of several, the first.
 
     Raises:
         MitsonarError: no data set, or one without such views, kind or sequence.
     """
-    from mitsonar.datasets.store import DataStore  # half a second that other sources do without
+    from mitsonar.datasets.store import DataStore  # its import takes half a second
 
     store = DataStore.open(url)
     _check_there(store, views, kind)
     here, number, note = sequence_in(store, sequence)
     time_s, sonar_poses, height_m = (store.read(name, here) for name in ("time_s", "pose", "height_m"))
     poses = store.read("vehicle_pose", here) if "vehicle_pose" in store.group else sonar_poses
-    name, said = f"{url}, sequence {number}", f"{note}, {kind}s of {', '.join(views)}"
-    return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, sonar_poses, height_m, note=said)
+    name, which = f"{url}, sequence {number}", f"{note}, {kind}s of {', '.join(views)}"
+    return ViewSource(name, store, tuple(views), kind, here.start, time_s, poses, sonar_poses, height_m, note=which)
 
 
 def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
-    """Whether a data set holds these views.
+    """Check that a data set holds these views.
 
     Raises:
         MitsonarError: it does not.

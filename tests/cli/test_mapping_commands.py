@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry_run import OdometryFolder
-from mitsonar.mapping.trajectory_smoothing import path_of
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

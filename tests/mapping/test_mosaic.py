@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from matplotlib.patches import Rectangle
+from matplotlib.quiver import Quiver
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from scipy import ndimage
@@ -17,7 +19,9 @@ from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.mapping.mosaic import Mosaic, build_mosaic, illumination, save_geotiff
+from mitsonar.mapping.geotiff import save_geotiff
+from mitsonar.mapping.illumination import illumination
+from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.map_figure import mosaic_figure, path_figure, quality_figure, save_figure
@@ -85,8 +89,8 @@ def centres(mosaic: Mosaic) -> tuple[Array, Array]:
     rows, columns = mosaic.mean.shape
     x = np.linspace(west, east, columns + 1)
     y = np.linspace(north, south, rows + 1)
-    grid: tuple[Array, Array] = tuple(np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2))
-    return grid
+    east_m, north_m = np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2)
+    return east_m, north_m
 
 
 def looking(heading_deg: float, pitch_deg: float = 35.0, roll_deg: float = 0.0, x: float = 0.0, y: float = 0.0) -> Pose:
@@ -106,7 +110,7 @@ POSES = [looking(0), looking(40, 37, 5, 3, -2), looking(-125, 30, -6, -4, 1.5), 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
 @pytest.mark.parametrize("pose", POSES)
-def test_the_ground_comes_back(bearing: str, blend: Any, pose: Pose) -> None:
+def test_the_ground_comes_back(bearing: str, blend: Blend, pose: Pose) -> None:
     """Cells well inside hold the ground's level at their centres; a shift by a tenth of a cell would show.
 
     The ground's slope is up to 2.5 a metre, so 0.01 of level stand for 4 mm: bilinear interpolation over beams of 20 mm errs
@@ -127,7 +131,7 @@ def test_the_ground_comes_back(bearing: str, blend: Any, pose: Pose) -> None:
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, -150.0])
 def test_starboard_and_heading_have_the_right_sign(bearing: str, heading_deg: float) -> None:
-    """A bright cell to starboard lies clockwise of the heading, by hand from SPEC's axes."""
+    """A bright cell to starboard lies clockwise of the heading, by hand from the axes of the vehicle."""
     sonar = SONAR.replace(bearing=bearing)
     pose = looking(heading_deg, x=10, y=20)
     frames = blank([pose], 0.0, sonar)
@@ -164,7 +168,7 @@ def test_only_lit_ground_is_touched() -> None:
 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 def test_all_lit_ground_and_no_other_is_seen(bearing: str) -> None:
-    """Every cell by hand, in a fan that rolls: window, beams and elevations by SPEC's directions."""
+    """Every cell by hand, in a fan that rolls: window, beams and elevations by the directions of the beams."""
     sonar = SONAR.replace(bearing=bearing, azimuth_fov_deg=50, range_min=4.0, range_max=5.0)
     pose = looking(0, 35, 6)
     mosaic = build_mosaic(blank([pose], sonar=sonar), cell_m=0.02, blend="centre")
@@ -216,7 +220,7 @@ def test_finer_bins_than_cells_are_averaged() -> None:
 
 
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
-def test_identical_frames_do_not_differ(blend: Any) -> None:
+def test_identical_frames_do_not_differ(blend: Blend) -> None:
     one = frames_of(waves, [POSES[1]])
     mosaic = Mosaic(0.02, blend)
     for _ in range(7):
@@ -231,7 +235,7 @@ def test_identical_frames_do_not_differ(blend: Any) -> None:
 
 
 @pytest.mark.parametrize("blend", ["weighted", "centre"])
-def test_deviation_is_the_noise_s(blend: Any) -> None:
+def test_deviation_is_the_noise_s(blend: Blend) -> None:
     """Noise that is the same all over a frame is not smoothed by interpolation: its level must come back.
 
     120 frames of std 0.05: the estimate's own standard error is 6.5 %, one number for all cells with equal weights.
@@ -433,7 +437,7 @@ def wrong(change: str) -> SonarFrames:
     ("change", "options", "message"),
     [
         ("no poses", {}, "no poses"),
-        ("no height", {}, "do not tell their height"),
+        ("no height", {}, "hold no height"),
         ("nan", {}, "finite"),
         ("unsorted", {}, "rise"),
         ("below", {}, "above 0"),
@@ -481,7 +485,7 @@ def test_geotiff_says_where_its_cells_are(tmp_path: Path) -> None:
     mosaic = small_mosaic()
     save_geotiff(tmp_path / "map.tif", mosaic)
     with tifffile.TiffFile(tmp_path / "map.tif") as file:
-        page = file.pages[0]
+        page = file.pages.first
         bands = page.asarray()
         tags = {tag.code: tag.value for tag in page.tags.values()}
     assert bands.dtype == np.float32
@@ -527,12 +531,13 @@ def test_a_map_is_drawn_where_it_lies_with_a_true_scale_bar() -> None:
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["estimated"].get_xydata(), path.poses[:, :2])
     assert (lines["estimated"].get_color(), lines["true"].get_color()) == ("red", "limegreen")
-    arrows = next(one for one in axes.collections if hasattr(one, "U"))
-    np.testing.assert_allclose([arrows.U[0], arrows.V[0]], [0, 1], atol=1e-12)
-    np.testing.assert_allclose([arrows.U[-1], arrows.V[-1]], [1, 0], atol=1e-12)
+    arrows = next(one for one in axes.collections if isinstance(one, Quiver))
+    np.testing.assert_allclose([np.asarray(arrows.U)[0], np.asarray(arrows.V)[0]], [0, 1], atol=1e-12)
+    np.testing.assert_allclose([np.asarray(arrows.U)[-1], np.asarray(arrows.V)[-1]], [1, 0], atol=1e-12)
     bar, label = axes.patches[0], axes.texts[0].get_text()
     assert label.endswith(" cm") or label.endswith(" m")
     said = float(label.split()[0]) * (0.01 if label.endswith(" cm") else 1)
+    assert isinstance(bar, Rectangle)
     assert bar.get_width() == pytest.approx(said)
 
 
@@ -542,7 +547,7 @@ def test_path_figures_show_motions_along_the_new_heading() -> None:
     figure = path_figure({"true": path})
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels[1:] == ["heading (deg)", "sideways (mm)", "forward (mm)", "yaw (deg)"]
-    heading, sideways, forward, yaw = (axes.lines[0].get_ydata() for axes in figure.axes[1:])
+    heading, sideways, forward, yaw = (np.asarray(axes.lines[0].get_ydata(), dtype=float) for axes in figure.axes[1:])
     for values, wanted in ((heading, 90), (sideways, 0), (forward, 100), (yaw, 0)):
         np.testing.assert_allclose(values, wanted, atol=1e-9)
 
@@ -552,7 +557,7 @@ def test_bands_are_two_standard_deviations() -> None:
     covariance = np.tile(np.diag([1e-6, 4e-6, 9e-6]), (10, 1, 1))
     figure = path_figure({"true": path}, motion_covariances={"true": covariance})
     for axes, width in zip(figure.axes[2:], (1.0, 2.0, np.degrees(3e-3)), strict=True):
-        y = axes.collections[0].get_paths()[0].vertices[:, 1]
+        y = np.asarray(axes.collections[0].get_paths()[0].vertices)[:, 1]
         assert y.max() - y.min() == pytest.approx(4 * width)
 
 
@@ -561,8 +566,9 @@ def test_wrong_figures_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="no path"):
         path_figure({})
     for what, count in itertools.product(("motion_covariances", "pose_covariances"), (9,)):
+        options: dict[str, Any] = {what: {"true": np.zeros((count, 3, 3))}}
         with pytest.raises(MitsonarError, match=f"{what} of true must be"):
-            path_figure({"true": path}, **{what: {"true": np.zeros((count, 3, 3))}})
+            path_figure({"true": path}, **options)
     with pytest.raises(MitsonarError, match="names no path that is drawn: got 'other'"):
         path_figure({"true": path}, pose_covariances={"other": np.zeros((11, 3, 3))})
     with pytest.raises(MitsonarError, match="must end in one of"):

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping import odometry_run
 from mitsonar.mapping.frame_source import FrameSource, open_frames
-from mitsonar.mapping.odometry import PAIRS_A_BATCH, bridged, estimate_motions, odometry
+from mitsonar.mapping.motion_series import MotionSeries, path_of
+from mitsonar.mapping.odometry import bridged, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
-from mitsonar.mapping.trajectory_smoothing import MotionSeries, path_of
+from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
@@ -63,9 +64,11 @@ class Told:
     covariance: Array | None = None
     deadly: int | None = None
 
+    consumes = SonarFrames
     inputs = "nothing"
+    digest = ""
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames, /) -> Estimate:
         first, second = (int(number) for number in frames.image[:, 0, 0])
         if first == self.deadly:
             os._exit(9)
@@ -101,9 +104,10 @@ def test_without_poses_the_path_begins_at_the_origin_with_what_is_known() -> Non
     found = odometry(source, estimator)
     np.testing.assert_allclose(found.path.poses[0], [0, 0, 2.5, 0.6, 0, 0])
     assert found.true is None
-    assert ("estimated path length", pytest.approx(np.linalg.norm(motions(path.poses)[:, :2], axis=1).sum()), "m") in (
-        found.rows()
-    )
+    lengths = [(value, unit) for name, value, unit in found.rows() if name == "estimated path length"]
+    assert len(lengths) == 1
+    assert lengths[0][0] == pytest.approx(float(np.linalg.norm(motions(path.poses)[:, :2], axis=1).sum()))
+    assert lengths[0][1] == "m"
 
 
 def test_every_third_frame() -> None:
@@ -257,7 +261,9 @@ def test_the_table_tells_what_a_hand_finds() -> None:
     rows = {name: (value, unit) for name, value, unit in found.rows()}
     driven = motions(path.poses)
     for k, (name, scale, unit) in enumerate((("sideways", 1e3, "mm"), ("forward", 1e3, "mm"), ("yaw", 57.29578, "deg"))):
-        assert rows[f"motion error RMSE, {name}"] == (pytest.approx(scale * np.sqrt((off[:40, k] ** 2).mean())), unit)
+        value, its_unit = rows[f"motion error RMSE, {name}"]
+        assert value == pytest.approx(scale * np.sqrt((off[:40, k] ** 2).mean()))
+        assert its_unit == unit
         assert rows[f"RMSE of always answering zero, {name}"][0] == pytest.approx(
             scale * np.sqrt((driven[:, k] ** 2).mean())
         )
@@ -267,7 +273,8 @@ def test_the_table_tells_what_a_hand_finds() -> None:
     nees = ((off[:40] / STD) ** 2).sum(axis=1).mean() / 3
     assert rows["squared motion error over its covariance, a third"][0] == pytest.approx(nees)
     end = np.linalg.norm(found.path.poses[-1, :2] - path.poses[-1, :2])
-    assert rows["end-point error"] == (pytest.approx(1e3 * end), "mm")
+    assert rows["end-point error"][0] == pytest.approx(1e3 * end)
+    assert rows["end-point error"][1] == "mm"
     lines = table_lines(found.rows())
     assert lines[0].split("|")[2].strip() == "value"
     assert len({len(line) for line in lines}) == 1
@@ -312,7 +319,7 @@ def counted(source: FrameSource) -> tuple[FrameSource, list[int]]:
     """A source that writes down how many frames are asked for."""
     sizes: list[int] = []
 
-    def images(index: NDArray[np.intp]) -> NDArray[Any]:
+    def images(index: NDArray[np.intp]) -> NDArray[np.generic]:
         sizes.append(len(index))
         return source.images(index)
 
@@ -466,7 +473,7 @@ def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(odometry_run, "path_figure", lambda *_, **__: Figure(figsize=(1, 1)))
 
 
-def run(out: Path, path: Trajectory, estimator: Any = None, **options: Any) -> dict[str, bytes]:
+def run(out: Path, path: Trajectory, estimator: AnyEstimator | None = None, **options: Any) -> dict[str, bytes]:
     """An odometry's files, but for run.json, which tells the time, and the picture."""
     source = FrameSource.of(numbered(path))
     run_odometry(source, "told", estimator or Told(path.poses, covariance=np.diag(STD**2)), out, **options)
@@ -579,9 +586,9 @@ def test_folders_of_others_are_kept(tmp_path: Path) -> None:
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("years of work")
-    for options in ({}, {"overwrite": True}, {"resume": True}):
+    for overwrite, resume in ((False, False), (True, False), (False, True)):
         with pytest.raises(MitsonarError, match="kept as it is"):
-            run(mine, path, **options)
+            run(mine, path, overwrite=overwrite, resume=resume)
     assert files_of(mine) == {"thesis.tex": b"years of work"}
     out = tmp_path / "out"
     run(out, path)
@@ -606,7 +613,7 @@ def test_a_height_that_a_stranger_wrote_is_refused(tmp_path: Path) -> None:
     state = json.loads(file.read_text())
     for height in ("2", -1.0, True, 1e400):
         file.write_text(json.dumps({**state, "asked": {**state["asked"], "height_m": height}}))
-        with pytest.raises(MitsonarError, match=r"run\.json is damaged \(height_m is "):
+        with pytest.raises(MitsonarError, match=r"run\.json is damaged \(height_m must be "):
             _ = OdometryFolder.open(tmp_path / "out").height_m
     file.write_text(json.dumps({**state, "asked": {**state["asked"], "height_m": 2.5}}))
     assert OdometryFolder.open(tmp_path / "out").height_m == 2.5

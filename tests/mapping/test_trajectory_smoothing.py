@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,19 +16,9 @@ from scipy.stats import chi2, multivariate_normal
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.mapping.trajectory_smoothing import (
-    MotionSeries,
-    ellipse,
-    fit_noise,
-    fit_scale,
-    fit_wander,
-    kalman_smoothed,
-    path_of,
-    pose_covariances,
-    scaled,
-    spline_period,
-    spline_smoothed,
-)
+from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
+from mitsonar.mapping.pose_covariance import ellipse, pose_covariances
+from mitsonar.mapping.trajectory_smoothing import fit_noise, fit_wander, kalman_smoothed, spline_period, spline_smoothed
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
@@ -49,7 +40,7 @@ def random_covariances(count: int, seed: int = 2) -> Array:
     """Full 3 x 3 covariances of different sizes, correlated."""
     rng = np.random.default_rng(seed)
     root = (np.eye(3) + 0.5 * rng.normal(size=(count, 3, 3))) * STD[:, None] * rng.uniform(0.5, 2, (count, 1, 1))
-    return root @ root.swapaxes(1, 2)
+    return np.asarray(root @ root.swapaxes(1, 2))
 
 
 def drawn(covariances: Array, rng: np.random.Generator) -> Array:
@@ -139,12 +130,12 @@ def test_a_series_of_estimates() -> None:
         ({"covariances": np.full((9, 3, 3), np.nan)}, "frame 0 to 1 has a covariance that is not finite .9 of 9"),
         ({"covariances": np.tile(np.diag([1, 1, -1e-6]), (9, 1, 1))}, "negative variance"),
         ({"covariances": np.tile([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]], (9, 1, 1))}, "lopsided"),
-        ({"valid": np.zeros(9, dtype=bool)}, "none of 9 motions is believed"),
-        ({"valid": np.ones(8, dtype=bool)}, r"believe must be \(9,\)"),
+        ({"valid": np.zeros(9, dtype=bool)}, "none of 9 motions is valid"),
+        ({"valid": np.ones(8, dtype=bool)}, r"valid must be \(9,\)"),
         ({"with_next": np.zeros((9, 3, 3))}, r"with_next must be \(8, 3, 3\)"),
     ],
 )
-def test_a_series_refuses_what_it_cannot_mean(change: dict[str, Array], message: str) -> None:
+def test_a_series_refuses_what_it_cannot_mean(change: dict[str, Any], message: str) -> None:
     with pytest.raises(MitsonarError, match=message):
         replace(swaying(10)[1], **change)
 
@@ -201,6 +192,7 @@ def test_the_period_minimises_generalised_cross_validation() -> None:
     _, measured = swaying(40)
     measured = replace(measured, valid=np.random.default_rng(0).random(39) > 0.2)
     at = measured.believed
+    assert measured.covariances is not None
     middle, variance = measured.middle_s[at], np.diagonal(measured.covariances, axis1=1, axis2=2)[at]
     n, gap = at.sum(), (middle[-1] - middle[0]) / (at.sum() - 1)
     chosen = spline_period(measured)
@@ -258,7 +250,7 @@ def test_few_motions_are_joined_by_straight_lines() -> None:
     # velocities 1 at 0.5 s and 3 at 6 s
     wanted = np.interp(series.middle_s, [0.5, 6], [1, 3])[:, None] * [1, 0, 2] * series.step_s[:, None]
     np.testing.assert_allclose(spline_smoothed(series).motions, wanted, atol=1e-14)
-    with pytest.raises(MitsonarError, match="needs 5 believed motions: got 2"):
+    with pytest.raises(MitsonarError, match="needs 5 valid motions: got 2"):
         spline_period(series)
 
 
@@ -266,7 +258,10 @@ def test_one_motion_stays_as_it_is() -> None:
     single = MotionSeries(np.array([[0.01, 0.02, 0.003]]), np.array([1.0, 1.05]), random_covariances(1))
     for smooth in (spline_smoothed, kalman_smoothed):
         np.testing.assert_allclose(smooth(single).motions, single.motions, rtol=1e-12)
-    np.testing.assert_allclose(kalman_smoothed(single).covariances, single.covariances, rtol=1e-9)
+    smoothed = kalman_smoothed(single).covariances
+    assert smoothed is not None
+    assert single.covariances is not None
+    np.testing.assert_allclose(smoothed, single.covariances, rtol=1e-9)
 
 
 def test_smoothing_needs_errors_above_zero() -> None:
@@ -285,7 +280,8 @@ def least_squares(measured: MotionSeries, wander: Array) -> tuple[Array, Array]:
     """The Gaussian model solved at once: all velocities ``(n, 3)`` and their covariance ``(3 n, 3 n)``."""
     n = len(measured)
     rows, right = [], []
-    for k in np.flatnonzero(measured.believed):
+    assert measured.covariances is not None
+    for k in np.flatnonzero(measured.believed).tolist():
         root = np.linalg.inv(np.linalg.cholesky(measured.covariances[k]))
         row = np.zeros((3, n, 3))
         row[:, k] = root * measured.step_s[k]
@@ -300,7 +296,7 @@ def least_squares(measured: MotionSeries, wander: Array) -> tuple[Array, Array]:
         right.append(np.zeros(3))
     matrix = np.concatenate(rows).reshape(-1, 3 * n)
     solution = np.linalg.lstsq(matrix, np.concatenate(right))[0]
-    return solution.reshape(n, 3), np.linalg.inv(matrix.T @ matrix)
+    return np.asarray(solution.reshape(n, 3), dtype=float), np.asarray(np.linalg.inv(matrix.T @ matrix), dtype=float)
 
 
 WANDER = np.array([0.05, 0.08, 0.02])
@@ -322,6 +318,8 @@ def test_the_smoother_is_the_least_squares_solution(frames: int, gaps: bool) -> 
     velocity, covariance = least_squares(measured, WANDER)
     blocks = covariance.reshape(n, 3, n, 3)
     step = measured.step_s
+    assert smooth.covariances is not None
+    assert smooth.with_next is not None
     np.testing.assert_allclose(smooth.motions, velocity * step[:, None], rtol=0, atol=1e-11)
     for k in range(n):
         np.testing.assert_allclose(smooth.covariances[k], blocks[k, :, k] * step[k] ** 2, rtol=1e-7, atol=1e-16)
@@ -337,6 +335,7 @@ def test_smoothed_covariances_are_symmetric_and_positive() -> None:
     measured = replace(swaying(frames)[1], covariances=covariances)
     for wander in (WANDER, 1e-6 * WANDER, 1e4 * WANDER):
         smooth = kalman_smoothed(measured, wander).covariances
+        assert smooth is not None
         np.testing.assert_array_equal(smooth, smooth.swapaxes(1, 2))
         assert np.linalg.eigvalsh(smooth).min() > 0
         # knowing more never makes less certain
@@ -364,12 +363,13 @@ def test_errors_are_as_large_as_the_covariances_say() -> None:
         valid[10:16] = False
         smooth = kalman_smoothed(replace(measured, valid=valid), WANDER)
         miss = smooth.motions[13] - true[13]
-        middle += miss @ np.linalg.solve(smooth.covariances[13], miss)
+        assert smooth.covariances is not None
+        middle += float(miss @ np.linalg.solve(smooth.covariances[13], miss))
         start = Pose(0, 0, 2)
         pose, wanted = (path_of(m, start, measured.time_s).poses[-1, [0, 1, 5]] for m in (smooth.motions, true))
         miss = pose - wanted
-        end += miss @ np.linalg.solve(pose_covariances(smooth, start)[-1], miss)
-        careless += miss @ np.linalg.solve(pose_covariances(replace(smooth, with_next=None), start)[-1], miss)
+        end += float(miss @ np.linalg.solve(pose_covariances(smooth, start)[-1], miss))
+        careless += float(miss @ np.linalg.solve(pose_covariances(replace(smooth, with_next=None), start)[-1], miss))
     low, high = chi2.ppf([0.0005, 0.9995], 3 * runs) / runs
     assert low < middle / runs < high, f"{middle / runs:.2f} not in {low:.2f}..{high:.2f}"
     assert low < end / runs < high, f"{end / runs:.2f} not in {low:.2f}..{high:.2f}"
@@ -383,6 +383,7 @@ def test_wander_has_the_greatest_likelihood() -> None:
     valid[20:30] = False
     measured = replace(measured, valid=valid)
     got = fit_wander(measured)
+    assert measured.covariances is not None
     gap, n = np.diff(measured.middle_s[valid]), valid.sum()
     difference = np.diff(np.eye(n), axis=0)
     for axis in range(3):
@@ -423,7 +424,7 @@ def test_constant_velocity_is_told_from_noise() -> None:
 def test_what_the_filter_cannot_work_with() -> None:
     _, measured = swaying(10)
     lonely = replace(measured, valid=np.arange(9) == 4)
-    with pytest.raises(MitsonarError, match="tells no change of velocity: give wander"):
+    with pytest.raises(MitsonarError, match="shows no change of velocity: give wander"):
         kalman_smoothed(lonely)
     np.testing.assert_allclose(kalman_smoothed(lonely, WANDER).velocity, np.tile(measured.velocity[4], (9, 1)), rtol=1e-9)
     with pytest.raises(MitsonarError, match="wander must be three positive numbers"):
@@ -482,6 +483,7 @@ def test_pose_covariance_against_monte_carlo(smoothed: bool) -> None:
         errors = (rng.normal(size=(draws, len(joint))) @ np.linalg.cholesky(joint).T * each).reshape(draws, -1, 3)
     else:
         series = measured
+        assert measured.covariances is not None
         errors = drawn(np.tile(measured.covariances, (draws, 1, 1, 1)), rng)
     starts = rng.normal(size=(draws, 3)) * np.sqrt(np.diag(at_start))
     ends = [
@@ -513,5 +515,5 @@ def test_what_has_no_pose_covariance() -> None:
     _, measured = swaying(10)
     with pytest.raises(MitsonarError, match="needs those of the motions"):
         pose_covariances(replace(measured, covariances=None), START)
-    with pytest.raises(MitsonarError, match="2 motions are not believed"):
+    with pytest.raises(MitsonarError, match="2 motions are not valid"):
         pose_covariances(replace(measured, valid=np.arange(9) > 1), START)

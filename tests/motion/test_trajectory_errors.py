@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.trajectory_smoothing import path_of
+from mitsonar.mapping.motion_series import path_of
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import (

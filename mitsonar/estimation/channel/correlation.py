@@ -1,10 +1,11 @@
-"""The estimator ``correlation``: the expert's, as correlation velocity logs and displaced-phase-centre navigation do it.
+"""The estimator ``correlation``, as in correlation velocity logs and displaced-phase-centre navigation.
 
-An echo from the level ground at incidence theta comes earlier by 2 d sin(theta) / c once the vehicle has moved d towards it:
-taps of one receiver turn against each other by 4 pi d sin(theta) / lambda from ping to ping, the more the later they are.
-Coarse: of all motions the one after which the products of both pings' taps add up best, all receivers together; the slope
-over delay is what tells turns apart. Fine: the phases that remain in short windows along delay, by weighted least squares.
-Motions across a receiver's look count for nothing here, though they cost likeness.
+After a motion d of the vehicle towards level ground at incidence theta, its echo arrives earlier by 2 d sin(theta) / c. The
+taps of a receiver are rotated by 4 pi d sin(theta) / lambda from ping to ping; later taps are rotated more.
+
+Coarse: the motion whose phase-compensated products of taps have the largest sum over all receivers. The slope of the phase
+over delay resolves whole turns. Fine: the residual phases in short windows along delay, by weighted least squares. Motions
+across the axis of a receiver are not modelled, though they reduce the correlation.
 """
 
 from __future__ import annotations
@@ -29,32 +30,32 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 ACROSS = 41
-"""Angles across a beam that are averaged over."""
+"""Number of angles across a beam that are averaged."""
 
 STEP = 1 / 16
-"""Of the motions that are tried, in wavelengths."""
+"""Step of the motions that are tried [wavelengths]."""
 
 WINDOW = 8
-"""Taps whose products are averaged."""
+"""Number of taps whose products are averaged."""
 
 MOST_WAVES = 50.0
-"""Motions between pings that are tried, either way."""
+"""Longest motion between pings that is tried, in both directions [wavelengths]."""
 
 LEAST = 4.0
-"""By which the best sum must exceed what pings with nothing in common sum up to, in its standard deviations."""
+"""Least value of the largest sum, in standard deviations of the sum of unrelated pings."""
 
 CLOSE = 0.9
-"""A second motion that sums up to this part of the best leaves open which it is."""
+"""Part of the largest sum from which a second maximum makes the motion ambiguous."""
 
 
 class Products(NamedTuple):
-    """What one receiver's neighbouring pings share.
+    """Products of consecutive pings of one receiver.
 
     Attributes:
         product: of each tap of a ping with that of the next, conjugate, over all pairs ``(taps,)``.
         energy: of both ``(taps,)``.
-        turn: radians a metre by which taps turn with a motion along the look ``(taps,)``.
-        look: its direction: to starboard, forward ``(2,)``.
+        turn: phase by which taps rotate with a motion along the axis ``(taps,)`` [rad/m].
+        look: direction of the axis of the receiver: to starboard, forward ``(2,)``.
     """
 
     product: Complex
@@ -68,8 +69,8 @@ class Correlation:
     """Ping-to-ping correlation, coarse to fine; two degrees of freedom, the heading is taken to stay.
 
     Args:
-        height_m: of the transmitter over the ground; default: what the responses say.
-        speed: the fastest that is looked for along an axis [m/s].
+        height_m: of the transmitter over the ground; default: that of the responses.
+        speed: the fastest that is searched along an axis [m/s].
     """
 
     height_m: float | None = None
@@ -80,7 +81,11 @@ class Correlation:
     digest = ""
 
     def estimate(self, responses: ImpulseResponses) -> Estimate:
-        """The motion, and whether to believe it."""
+        """Estimate the motion.
+
+        Raises:
+            MitsonarError: records of :func:`mitsonar.estimation.channel.pings.pings_of`, or no height.
+        """
         pings = pings_of(responses)
         height = assumed_height(responses, "correlation", self.height_m)
         received = [_products(responses.sonar, z, number, height) for number, z in enumerate(pings.response.swapaxes(0, 1))]
@@ -97,7 +102,7 @@ class Correlation:
 
 
 def _products(sonar: ChannelSonar, response: Complex, number: int, height_m: float) -> Products:
-    """Of one receiver's pings ``(pings, taps)``; taps before the first echo and outside its look count nothing."""
+    """Return the products of one receiver's pings ``(pings, taps)``; 0 outside the echoes of its field of view."""
     field = sonar.receivers[number].field
     cosine = height_m / np.maximum(sonar.delay_s * sonar.sound_speed / 2, height_m)
     sine = _along(field, cosine)
@@ -110,8 +115,7 @@ def _products(sonar: ChannelSonar, response: Complex, number: int, height_m: flo
 
 
 def _along(field: FieldOfView, cosine: Array) -> Array:
-    """How far along its look a receiver's echoes come from, of a unit way ``(taps,)``: the sine of their incidence less what
-    the beam's width takes, mean by energy.
+    """Return the component of unit directions of echoes along the axis of a receiver ``(taps,)``, averaged by energy.
 
     At a slant range R and an angle psi aside, sin^2 psi + along^2 + (height / R)^2 = 1.
     """
@@ -122,7 +126,7 @@ def _along(field: FieldOfView, cosine: Array) -> Array:
 
 
 def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array, str]:
-    """The motion whose turned products add up best ``(2,)`` [m], and what speaks against it."""
+    """Return the motion ``(2,)`` [m] whose compensated products have the largest sum, and the reason of a rejection."""
     line = np.linspace(-reach, reach, 2 * math.ceil(reach / step) + 1)
     sideways, forward = np.meshgrid(line, line, indexing="ij")
     total, spread = np.zeros(sideways.shape), 0.0
@@ -144,7 +148,7 @@ def _coarse(received: list[Products], reach: float, step: float) -> tuple[Array,
 
 
 def _fine(received: list[Products], motion: Array) -> Array:
-    """The motion ``(2,)`` from the phases that remain after a coarse one."""
+    """Refine a motion ``(2,)`` [m] by the residual phases."""
     for _ in range(3):
         information, pull = np.zeros((2, 2)), np.zeros(2)
         for one in received:
@@ -161,6 +165,6 @@ def _fine(received: list[Products], motion: Array) -> Array:
 
 
 def _windows(taps: NDArray[np.inexact]) -> NDArray[np.inexact]:
-    """Sums over neighbouring taps."""
+    """Sum over neighbouring taps."""
     whole = len(taps) // WINDOW * WINDOW
     return np.asarray(taps[:whole].reshape(-1, WINDOW).sum(axis=1))

@@ -1,98 +1,78 @@
-"""The estimator ``likelihood``: the motion under which the pings' responses are the most likely, for scatterers unknown.
+"""The estimator ``likelihood``: the motion of maximum likelihood, for unknown scatterers.
 
-The law is that of :mod:`mitsonar.estimation.channel.response_covariance`. Motions are first sought coarsely
-(:mod:`mitsonar.estimation.channel.motion_search`), then refined by scoring: of R the covariance, D its slope, z the
-responses of
-level s,
+:mod:`mitsonar.estimation.channel.response_covariance` gives the covariance of the responses. Motions are first searched
+coarsely (:mod:`mitsonar.estimation.channel.motion_search`), then refined by scoring. With the covariance R, its derivative D
+and responses z of level s:
 
     gradient = z* R^-1 D R^-1 z / s - tr R^-1 D,    information = tr R^-1 D R^-1 D.
 
-Of many pings each is judged given those shortly before. Pairs of pings may fit several motions alike: across a beam's look
-only the loss of likeness tells, and not to which side. The answer is then their mean, by how likely each is, and a
-covariance that spans them.
+Of many pings the likelihood of each is conditioned on the few before it. Pairs of pings may fit several motions equally:
+across the axis of a beam only the loss of coherence shows, and not its side. The estimate is then the mean of the motions,
+weighted by their probability, with a covariance that spans them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter
 
+from mitsonar.estimation.channel.motion_score import MotionScore, judged
 from mitsonar.estimation.channel.motion_search import ReceiverBand, Search, receiver_bands_of
 from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
-from mitsonar.estimation.channel.response_covariance import block_toeplitz
 from mitsonar.estimation.channel.sub_bands import bands_of
-from mitsonar.estimation.estimator import Estimate, rejected
+from mitsonar.estimation.estimator import Estimate, PlainTable, rejected
 from mitsonar.motion.composition import Motion
 from mitsonar.records.impulse_responses import ImpulseResponses
 
-__all__ = ["Likelihood", "judged"]
+__all__ = ["Likelihood"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-NOISE = np.logspace(-6, 1.5, 46)
-"""Variances of noise that are tried, as parts of the mean power: below lies the error of the law's own integral."""
-
 SURE_PINGS = 3
-"""Pings before one that it is judged by."""
+"""Number of pings on which the next one is conditioned."""
 
 STEPS = 8
-"""Of scoring, at most; it ends when a step is below a fifth of a standard deviation."""
+"""Most steps of scoring; it ends when a step is below a fifth of a standard deviation."""
 
 LEVEL = 0.05
-"""By which the logarithm of the likelihood may fall in a step."""
+"""Largest decrease of the log likelihood in a step."""
 
 LONGEST = 3e-3
-"""A step [m, rad]."""
+"""Longest step [m, rad]."""
 
 APART = 5.0
-"""Motions fit alike when they are so many standard deviations apart, ..."""
+"""Distance of two modes [standard deviations]; nearer ones are one mode."""
 
 NEAR = 0.1
-"""Starts within so many wavelengths of a motion that was found lead to it."""
+"""Distance [wavelengths] within which a start leads to a known mode."""
 
 TURNS = (-0.006, -0.003, 0.003, 0.006)
-"""Turns over all pings that are begun from [rad]."""
+"""Initial turns over all pings [rad]."""
 
 MOST_WAVES = 25.0
-"""Motions between pings that are looked for, either way."""
+"""Longest motion between pings that is searched, in both directions [wavelengths]."""
 
 PLACES = 33
-"""At which the likelihood across a look is computed."""
+"""Number of motions across an axis for which the likelihood is computed."""
 
 ALIKE = 0.01
-"""... and the lesser has this probability."""
+"""Probability from which a mode counts as ambiguous."""
 
 UNSURE = 0.15
-"""A standard deviation beyond which a motion is not to be believed, in wavelengths."""
+"""Largest standard deviation of a valid motion [wavelengths]."""
 
 HOPELESS = 25.0
-"""By which the logarithm of the likelihood of a start may be lower than the best."""
+"""Largest deficit of the log likelihood of a start against the best."""
 
 LEAST_GAIN = 12.0
-"""By which the logarithm of the likelihood must exceed that of pings with nothing in common."""
-
-
-class MotionScore(NamedTuple):
-    """What a receiver says of a motion.
-
-    Attributes:
-        likelihood: its logarithm.
-        gradient: by the motion's free numbers ``(k,)``.
-        information: about them ``(k, k)``.
-        noise: its variance, as a part of the mean power.
-    """
-
-    likelihood: float
-    gradient: Array
-    information: Array
-    noise: float
+"""Least excess of the log likelihood over that of unrelated pings."""
 
 
 class Mode(NamedTuple):
@@ -100,8 +80,8 @@ class Mode(NamedTuple):
 
     Attributes:
         motion: sideways, forward [m], yaw [rad], rise [m].
-        covariance: of its free numbers ``(k, k)``.
-        likelihood: logarithm of its likelihood.
+        covariance: of its free parameters ``(k, k)``.
+        likelihood: its log likelihood.
         noise: of the receivers, as parts of their power.
     """
 
@@ -112,21 +92,21 @@ class Mode(NamedTuple):
 
     @property
     def mass(self) -> float:
-        """Logarithm of its probability, but for a constant."""
+        """Return the logarithm of its probability, up to a constant."""
         return self.likelihood + float(np.linalg.slogdet(self.covariance)[1]) / 2
 
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Maximum likelihood of the motion.
+    """Estimates the motion of maximum likelihood.
 
     Args:
-        height_m: of the transmitter over the ground; default: what the responses say.
-        yaw: whether the vehicle may turn; otherwise its heading is taken to stay.
+        height_m: of the transmitter over the ground; default: that of the responses.
+        yaw: whether the vehicle may turn; otherwise its heading is constant.
         heave: whether it may rise or sink between pings.
-        speed: the fastest that is looked for along an axis [m/s].
-        turn_rate: the fastest turn that is believed [rad/s].
-        modes: motions that the search comes up with and that are compared in full.
+        speed: the fastest that is searched along an axis [m/s].
+        turn_rate: the fastest valid turn [rad/s].
+        modes: number of motions of the search that are compared in full.
     """
 
     height_m: float | None = None
@@ -141,7 +121,11 @@ class Likelihood:
     digest = ""
 
     def estimate(self, responses: ImpulseResponses) -> Estimate:
-        """The motion, how sure it is, and whether to believe it."""
+        """Estimate the motion and its covariance.
+
+        Raises:
+            MitsonarError: records of :func:`mitsonar.estimation.channel.pings.pings_of`, or no height.
+        """
         pings = pings_of(responses)
         height = assumed_height(responses, "likelihood", self.height_m)
         received = [k for k, one in enumerate(responses.sonar.receivers) if one.name not in pings.silent]
@@ -166,11 +150,11 @@ class Likelihood:
 
     @property
     def free(self) -> tuple[int, ...]:
-        """Which of a motion's four numbers are sought."""
+        """Return which of the four parameters of a motion are estimated."""
         return (0, 1, *((2,) if self.yaw else ()), *((3,) if self.heave else ()))
 
     def _modes(self, receiver_bands: list[ReceiverBand], data: list[Complex], search: Search) -> list[Mode]:
-        """Motions that fit, the most probable first."""
+        """Return the modes, the most probable first."""
         near = NEAR * receiver_bands[0].law.sonar.wavelength_m
         found = [refined(receiver_bands, data, np.array([*search.peaks()[0], 0.0, 0.0]), self.free, 1)]
         for number, start in enumerate(across_from(receiver_bands, data, search, found[0])[: self.modes + 1]):
@@ -187,7 +171,7 @@ class Likelihood:
         return sorted(found, key=lambda one: -one.mass)
 
     def _turned(self, receiver_bands: list[ReceiverBand], data: list[Complex], found: list[Mode]) -> list[Mode]:
-        """The same modes begun from turns to both sides: a turn shows as loss of likeness, which hardly has a sign."""
+        """Add modes from initial turns to both sides: the loss of coherence hardly shows the sign of a turn."""
         all_ = list(found)
         for mode in found:
             for yaw in TURNS:
@@ -199,7 +183,7 @@ class Likelihood:
         return all_
 
     def _answer(self, found: list[Mode], alone: float, responses: ImpulseResponses, silent: tuple[str, ...]) -> Estimate:
-        """One motion of several that fit."""
+        """Return one estimate from several modes."""
         intervals, wavelength_m = len(responses) - 1, responses.sonar.wavelength_m
         mass = np.array([one.mass for one in found])
         share = np.exp(mass - mass.max())
@@ -213,7 +197,7 @@ class Likelihood:
             spread += part * np.outer(one.motion - mean, one.motion - mean)
         gain = found[0].likelihood - alone
         listed = list(zip(share, found, strict=True)) if gain >= LEAST_GAIN else []
-        about: dict[str, Any] = {
+        about: PlainTable = {
             "modes": [(float(part), *(float(v) for v in _whole(one.motion, intervals))) for part, one in listed],
             "spreads": [_spread_of(one, free, intervals) for _, one in listed],
             "noise": [float(v) for v in found[0].noise],
@@ -235,18 +219,17 @@ class Likelihood:
 
 
 def _spread_of(mode: Mode, free: list[int], intervals: int) -> list[list[float]]:
-    """Covariance of sideways, forward [m], yaw [rad] over all intervals, of one mode."""
+    """Return the covariance of sideways, forward [m], yaw [rad] of a mode over all intervals."""
     spread = np.zeros((4, 4))
     spread[np.ix_(free, free)] = mode.covariance
-    return np.asarray(intervals**2 * spread[:3, :3]).tolist()
+    return [[float(value) for value in row] for row in intervals**2 * spread[:3, :3]]
 
 
 def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search: Search, mode: Mode) -> Array:
-    """Motions ``(n, 2)`` that differ from a mode along its less sure axis, and may fit as well: first the one to the other
-    side, then the likeliest.
+    """Return motions ``(n, 2)`` that differ from a mode along its less certain axis and may fit as well.
 
-    Receivers that look along that axis have many maxima there, which the search has scored; for the others, which hear a
-    motion across their look as loss of likeness, the likelihood itself is computed at a few places.
+    The first is the mirrored motion, then come the most likely ones. Receivers along that axis have many maxima, which the
+    search has scored. For the others a motion is a loss of coherence: their likelihood is computed for a few motions.
     """
     axis = int(np.diag(mode.covariance)[:2].argmax())
     total = np.zeros(len(search.line))
@@ -255,8 +238,10 @@ def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search:
         if abs(receiver_band.turn[1, axis]) > 0.5:
             total += search.along(number, mode.motion, axis)
         else:
-            told = np.array([judged(receiver_band, z, _moved(mode.motion, axis, place), (), 1).likelihood for place in few])
-            total += PchipInterpolator(few, told)(search.line)
+            values = np.array(
+                [judged(receiver_band, z, _moved(mode.motion, axis, place), (), 1).likelihood for place in few]
+            )
+            total += PchipInterpolator(few, values)(search.line)
     peaks = np.flatnonzero(total == maximum_filter(total, size=5))
     peaks = peaks[(total > total.max() - HOPELESS)[peaks]]
     peaks = peaks[np.argsort(-total[peaks])]
@@ -265,27 +250,27 @@ def across_from(receiver_bands: list[ReceiverBand], data: list[Complex], search:
 
 
 def _moved(motion: Array, axis: int, place: float) -> Array:
-    """A motion with another value along an axis."""
+    """Return a motion with another value along an axis."""
     there = motion.copy()
     there[axis] = place
     return there
 
 
 def _apart(one: Mode, other: Mode) -> float:
-    """Distance of two modes in standard deviations of the less sure one, along the surest axis."""
+    """Return the distance of two modes in standard deviations of the less certain one."""
     way = (one.motion - other.motion)[:2]
     return float(np.sqrt(min(way @ np.linalg.solve(mode.covariance[:2, :2], way) for mode in (one, other))))
 
 
 def _far(one: Mode, other: Mode) -> bool:
-    """Whether two modes are not one: by more than a few standard deviations in place or turn."""
+    """Return whether two modes differ by more than a few standard deviations in position or turn."""
     way = (one.motion - other.motion)[:3]
     spread = np.sqrt(np.maximum(np.diag(one.covariance)[:3], np.diag(other.covariance)[:3]))
     return bool((np.abs(way) > APART * np.maximum(spread, 1e-6)).any())
 
 
 def _whole(motion: Array, intervals: int) -> Motion:
-    """The motion over many intervals of one that stays the same, along the last heading (eq. 3.4)."""
+    """Compose a constant motion over many intervals, along the last heading (Almanza-Medina, eq. 3.4)."""
     sideways, forward, yaw = motion[:3]
     turn = (intervals - 1) * yaw / 2
     cos, sin = np.cos(turn), np.sin(turn)
@@ -297,7 +282,7 @@ def _whole(motion: Array, intervals: int) -> Motion:
 
 
 def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Array, free: Sequence[int], depth: int) -> Mode:
-    """The most likely motion near a given one."""
+    """Refine a motion to the nearest maximum of the likelihood."""
     columns = list(free)
 
     def judge(where: Array) -> list[MotionScore]:
@@ -329,86 +314,3 @@ def refined(receiver_bands: list[ReceiverBand], data: list[Complex], motion: Arr
         sum(one.likelihood for one in said),
         np.array([one.noise for one in said]),
     )
-
-
-def judged(receiver_band: ReceiverBand, response: Complex, motion: Array, free: Sequence[int], depth: int) -> MotionScore:
-    """What a receiver's pings ``(pings, taps)`` say of a motion from ping to ping, each judged by ``depth`` before it.
-
-    The level of the ground's strength and the variance of noise are those that fit best.
-    """
-    here, turn = receiver_band.turn @ motion, receiver_band.turn[np.ix_(free, free)]
-    blocks = [receiver_band.law.slopes(here, lag, free if lag else ()) for lag in range(depth + 1)]
-    taps = blocks[0].shape[1]
-    power = float(np.diag(blocks[0][0]).real.mean())
-    told = [
-        _Part.of(response, [block[0] for block in blocks[:pings]], sign) for pings, sign in ((depth + 1, 1), (depth, -1))
-    ]
-    parts = [part for part in told if part is not None]
-    noise = NOISE * power
-    energy = sum(part.sign * (part.power[:, None] / (part.size[:, None] + noise)).sum(axis=0) for part in parts)
-    there = energy > 0  # what is left of ping given ping may be nothing, where a motion fits not at all
-    level = np.where(there, energy, 1.0) / response.size
-    log = sum(part.sign * part.count * np.log(part.size[:, None] + noise).sum(axis=0) for part in parts)
-    likelihood = np.where(there, -response.size * np.log(level) - log, -np.inf)
-    best = int(likelihood.argmax())
-    gradient, information = np.zeros(len(free)), np.zeros((len(free),) * 2)
-    for part in parts if free and there[best] else []:
-        slopes = [
-            block_toeplitz([np.zeros((taps, taps), dtype=complex), *(block[1 + k] for block in blocks[1 : part.pings])])
-            for k in range(len(free))
-        ]
-        one, two = part.score(slopes, noise[best], float(level[best]))
-        gradient, information = gradient + part.sign * one, information + part.sign * two
-    return MotionScore(float(likelihood[best]), turn.T @ gradient, turn.T @ information @ turn, float(NOISE[best]))
-
-
-@dataclass(frozen=True)
-class _Part:
-    """Runs of neighbouring pings: their covariance in its own directions.
-
-    Attributes:
-        sign: how it counts: 1, or -1 for what is given before.
-        pings: of a run.
-        size: eigenvalues ``(n,)``.
-        vectors: eigenvectors ``(n, n)``.
-        inside: the runs in them ``(n, runs)``.
-    """
-
-    sign: int
-    pings: int
-    size: Array
-    vectors: Complex
-    inside: Complex
-
-    @classmethod
-    def of(cls, response: Complex, blocks: list[Complex], sign: int) -> _Part | None:
-        """Of all runs as long as there are blocks; those that are given before begin with the second ping."""
-        first = 0 if sign > 0 else 1
-        last = len(response) - len(blocks) + (0 if sign > 0 else -1)
-        if not blocks or last < first:
-            return None
-        runs = np.array([response[k : k + len(blocks)].ravel() for k in range(first, last + 1)]).T
-        size, vectors = np.linalg.eigh(block_toeplitz(blocks))
-        return cls(sign, len(blocks), np.maximum(size, 0.0), vectors, vectors.conj().T @ runs)
-
-    @property
-    def count(self) -> int:
-        """How many runs."""
-        return self.inside.shape[1]
-
-    @property
-    def power(self) -> Array:
-        """Along each eigenvector, of all runs."""
-        return np.asarray((np.abs(self.inside) ** 2).sum(axis=1))
-
-    def score(self, slopes: list[Complex], noise: float, level: float) -> tuple[Array, Array]:
-        """Gradient ``(k,)`` and information ``(k, k)``."""
-        solved = self.vectors @ (self.inside / (self.size + noise)[:, None])
-        inverse = (self.vectors / (self.size + noise)) @ self.vectors.conj().T
-        turned = [inverse @ slope for slope in slopes]
-        gradient = [
-            np.vdot(solved, slope @ solved).real / level - self.count * np.trace(one).real
-            for slope, one in zip(slopes, turned, strict=True)
-        ]
-        information = [[self.count * float(np.sum(one * two.T).real) for two in turned] for one in turned]
-        return np.array(gradient), np.array(information)

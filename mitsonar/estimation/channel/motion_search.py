@@ -1,8 +1,8 @@
-"""Where to look for a motion: hypotheses over all motions that a vehicle can make, compared coarsely and quickly.
+"""The coarse search for a motion over all motions that a vehicle can make.
 
-Covariances of a receiver's two pings are computed once for motions on a grid, along its look and across. Responses are first
-brought to the directions in which a single ping is strong, and to equal strength in each. In them a hypothesis is a matrix C
-of what both pings share, and responses b_1, b_2 speak for it by 2 Re b_1* C b_2 - |C|^2: least squares of their products.
+The cross-covariance of two pings of a receiver is computed once for motions on a grid, along its axis and across. Responses
+are first whitened in the strong directions of a single ping. There a hypothesis is a matrix C of the cross-covariance, and
+its score for responses b_1, b_2 is 2 Re b_1* C b_2 - |C|^2: least squares of their products.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 FLOOR = 1e-2
-"""Below which part of the mean power a direction of responses does not count."""
+"""Part of the mean power below which a direction of responses is not used."""
 
 ALONG, ACROSS = 7.5, 1.9
-"""Motions of the grid along the look and across, a wavelength."""
+"""Motions of the grid a wavelength, along the axis of a receiver and across."""
 
 FINE = 15.0
-"""Places of the map that all receivers' scores are added in, a wavelength."""
+"""Cells a wavelength of the map in which the scores of all receivers are added."""
 
 PEAKS = 40
-"""Maxima of the map that are looked at."""
+"""Number of maxima of the map that are used."""
 
 
 class ReceiverBand(NamedTuple):
-    """A receiver turned to look forward, so that receivers of one kind share what is computed.
+    """A receiver turned to face forward, so that receivers of one kind share what is computed.
 
     Attributes:
-        law: of its responses.
+        law: covariance of its responses.
         turn: from motions of the vehicle to motions in its axes ``(4, 4)``.
-        number: its place among the sonar's receivers.
+        number: its index among the receivers of the sonar.
     """
 
     law: ResponseCovariance
@@ -54,27 +54,27 @@ class ReceiverBand(NamedTuple):
 
 
 def single_receiver(sonar: ChannelSonar, receiver: Hydrophone) -> ChannelSonar:
-    """The instrument with this receiver only, and turned so that it looks forward."""
+    """Return the instrument with this receiver only, turned so that it faces forward."""
     heading = math.radians(receiver.field.heading_deg)
     x, y, z = receiver.position
     cos, sin = math.cos(heading), math.sin(heading)
-    place = (round(x * cos - y * sin, 9) + 0.0, round(x * sin + y * cos, 9) + 0.0, z)
+    position = (round(x * cos - y * sin, 9) + 0.0, round(x * sin + y * cos, 9) + 0.0, z)
     field = receiver.field.model_copy(update={"heading_deg": 0.0})
     sender = sonar.transmitter
     if sender.shape != "all":
         sender = sender.model_copy(update={"heading_deg": sender.heading_deg - receiver.field.heading_deg})
-    one = Hydrophone(name="forward", position=place, field=field)
+    one = Hydrophone(name="forward", position=position, field=field)
     return sonar.model_copy(update={"receivers": (one,), "transmitter": sender, "name": "one", "seed": 0})
 
 
 @lru_cache(maxsize=32)
 def response_covariance_of(alone: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> ResponseCovariance:
-    """The law of an instrument of one receiver, kept."""
+    """Return the response covariance of an instrument of one receiver, cached."""
     return ResponseCovariance(alone, alone.receivers[0], height_m, interval_s, reach_m)
 
 
 def receiver_bands_of(sonar: ChannelSonar, height_m: float, interval_s: float, reach_m: float) -> list[ReceiverBand]:
-    """All receivers of an instrument."""
+    """Return all receivers of an instrument, each turned forward."""
     found = []
     for number, receiver in enumerate(sonar.receivers):
         heading = math.radians(receiver.field.heading_deg)
@@ -91,10 +91,10 @@ def receiver_bands_of(sonar: ChannelSonar, height_m: float, interval_s: float, r
 
 @dataclass(frozen=True)
 class CovarianceTable:
-    """What two pings share, for motions on a grid.
+    """Cross-covariances of two pings for motions on a grid.
 
     Attributes:
-        along: motions along the look ``(a,)`` [m].
+        along: motions along the axis of the receiver ``(a,)`` [m].
         across: across it ``(b,)`` [m].
         basis: from taps to directions of equal strength ``(directions, taps)``.
         shared: C of each motion ``(a, b, directions, directions)`` complex64.
@@ -107,14 +107,14 @@ class CovarianceTable:
 
     @classmethod
     def of(cls, law: ResponseCovariance) -> Self:
-        """For all motions within the law's reach."""
+        """Compute the table for all motions within the reach of the covariance."""
         own = law.covariance((0, 0, 0), 0)
         power = float(np.diag(own).real.mean())
         size, vectors = np.linalg.eigh(own + FLOOR * power * np.eye(len(own)))
         strong = size > 2 * FLOOR * power
         basis = (vectors[:, strong] / np.sqrt(size[strong])).conj().T
         along, across = (_grid(law.reach_m, law.sonar.wavelength_m / parts) for parts in (ALONG, ACROSS))
-        # a receiver that sits in the plane of its look hears the same of motions to port and to starboard
+        # a receiver in the plane of its axis has the same covariance for motions to port and to starboard
         alike = law.receiver.position[0] == 0 and law.sonar.transmitter.shape == "all"
         shared = np.empty((len(along), len(across), len(basis), len(basis)), dtype=np.complex64)
         for i, j in np.ndindex(len(along), len(across)):
@@ -125,12 +125,12 @@ class CovarianceTable:
         return cls(along, across, basis, shared)
 
     def score(self, response: Complex) -> Array:
-        """How much pings ``(pings, taps)`` speak for each motion of the grid ``(a, b)``."""
+        """Score each motion of the grid ``(a, b)`` by pings ``(pings, taps)``."""
         b = response @ self.basis.T
         size = float(np.mean(np.abs(b) ** 2))
         product = (b[:-1].T @ b[1:].conj()) / (size or 1.0)
-        told = 2 * np.tensordot(self.shared, product.conj().astype(np.complex64), 2).real
-        return np.asarray(told - (len(b) - 1) * (np.abs(self.shared) ** 2).sum(axis=(2, 3)), dtype=float)
+        matched = 2 * np.tensordot(self.shared, product.conj().astype(np.complex64), 2).real
+        return np.asarray(matched - (len(b) - 1) * (np.abs(self.shared) ** 2).sum(axis=(2, 3)), dtype=float)
 
 
 def _grid(reach: float, step: float) -> Array:
@@ -159,8 +159,7 @@ class Search:
     def of(
         cls, bands: list[Band], response: Complex, height_m: float, interval_s: float, reach_m: float, received: list[int]
     ) -> Self:
-        """Of pings ``(pings, receivers, taps)``, by the receivers ``received``, for motions to ``reach_m`` along each
-        axis."""
+        """Score pings ``(pings, receivers, taps)`` by the receivers ``received``, for motions up to ``reach_m`` [m]."""
         line = _grid(reach_m, min(band.sonar.wavelength_m for band in bands) / FINE)
         plane, scores = np.stack(np.meshgrid(line, line, indexing="ij")), []
         for band in bands:
@@ -176,12 +175,12 @@ class Search:
         return cls(line, np.array(scores))
 
     def peaks(self) -> Array:
-        """Motions ``(n, 2)`` of the largest scores, best first."""
+        """Return the motions ``(n, 2)`` [m] of the largest scores, best first."""
         total = self.scores.sum(axis=0)
         peaks = np.argwhere(total == maximum_filter(total, size=5))
         return np.asarray(self.line[peaks[np.argsort(-total[tuple(peaks.T)])][:PEAKS]])
 
     def along(self, receiver: int, motion: Array, axis: int) -> Array:
-        """Scores of one receiver on the line through a motion along an axis ``(n,)``."""
-        place = int(np.abs(self.line - motion[1 - axis]).argmin())
-        return self.scores[receiver, :, place] if axis == 0 else self.scores[receiver, place]
+        """Return the scores of one receiver on the line through a motion along an axis ``(n,)``."""
+        index = int(np.abs(self.line - motion[1 - axis]).argmin())
+        return self.scores[receiver, :, index] if axis == 0 else self.scores[receiver, index]

@@ -1,4 +1,4 @@
-"""What estimators of impulse responses share: pings fit to be compared, reach and height."""
+"""Checks that all estimators of impulse responses share: of pings, reach and height."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mitsonar.records.impulse_responses import ImpulseResponses
 __all__ = ["Pings", "assumed_height", "pings_of", "reach_of"]
 
 UNEVEN = 0.01
-"""Part of an interval by which pings may come too early or late."""
+"""Part of an interval by which the time of a ping may deviate."""
 
 
 class Pings(NamedTuple):
-    """Responses that can be compared.
+    """Checked responses.
 
     Attributes:
         response: ``(pings, receivers, taps)`` complex128.
-        interval_s: from ping to ping.
-        silent: receivers that heard nothing in one ping or more.
+        interval_s: from ping to ping [s].
+        silent: receivers without any echo in one ping or more.
     """
 
     response: NDArray[np.complex128]
@@ -31,7 +31,7 @@ class Pings(NamedTuple):
 
 
 def pings_of(responses: ImpulseResponses) -> Pings:
-    """The responses, fit to be compared.
+    """Check responses and convert them to complex128.
 
     Raises:
         MitsonarError: fewer than two pings, times that do not rise evenly, values that are not finite.
@@ -52,7 +52,7 @@ def pings_of(responses: ImpulseResponses) -> Pings:
 
 
 def reach_of(interval_s: float, speed: float, wavelength_m: float, most_waves: float) -> float:
-    """The longest motion between pings [m].
+    """Return the longest motion between pings [m].
 
     Raises:
         MitsonarError: more wavelengths than can be searched.
@@ -62,13 +62,13 @@ def reach_of(interval_s: float, speed: float, wavelength_m: float, most_waves: f
         raise MitsonarError(
             f"pings {interval_s:g} s apart at up to {speed:g} m/s leave motions of up to {reach:.3g} m open, "
             f"{reach / wavelength_m:.3g} wavelengths, of which at most {most_waves:g} can be searched: measure more often, "
-            f"or tell the estimator a lower speed (NAME:speed={most_waves * wavelength_m / interval_s:.2g})"
+            f"or give the estimator a lower speed (NAME:speed={most_waves * wavelength_m / interval_s:.2g})"
         )
     return reach
 
 
 def assumed_height(responses: ImpulseResponses, name: str, height_m: float | None) -> float:
-    """The height of the transmitter over the ground: as given, or the mean of what the responses say.
+    """Return the height of the transmitter over the ground [m]: as given, or the mean of the responses' heights.
 
     Raises:
         MitsonarError: neither is there, or it is not positive or beyond the instrument's range.

@@ -1,14 +1,14 @@
-"""The law of impulse responses over a level ground of unknown scatterers: their covariance, for any motion between pings.
+"""The covariance of impulse responses over level ground of unknown scatterers, for any motion between pings.
 
-Scatterers that nothing is known of, one independent of the next, make the taps of all pings together a complex Gaussian
-vector of mean 0. All it tells of the motion is its covariance, an integral over the ground P of what both pings make of a
-scatterer there (Almanza-Medina, eq. 5.15, for both):
+With independent unknown scatterers, the taps of all pings are a complex Gaussian vector of mean 0. Its covariance depends
+on the motion. It is an integral over the ground P of the responses of both pings to a scatterer there (Almanza-Medina,
+eq. 5.15, for both):
 
     E[h_i(t) h_j(s)*] = S int a_i a_j exp(-j 2 pi f_c (D_i - D_j)) p(t - D_i) p(s - D_j) dP
 
-with delays D that count the receiver's own way while sound travels (5.14, its exact root), amplitudes a by spreading,
-cosines and fields of view, and the pulse p. The ground is the same everywhere: only how one ping lies to the other matters.
-Poses are therefore counted from the middle between both.
+with delays D that include the motion of the receiver while sound travels (5.14, its exact root), amplitudes a by spreading,
+cosines and fields of view, and the pulse p. The ground is homogeneous: only the relative pose of both pings matters. Poses
+are therefore relative to the middle between both.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,34 +32,34 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 TAILS = 1.0
-"""Taps before the first echo that count, in pulses 1 / F_d long."""
+"""Taps before the first echo that are used, in pulses of 1 / F_d."""
 
 FAINTEST = 1e-4
-"""Power of the last taps that count, as a part of the largest."""
+"""Power of the last taps that are used, as a part of the largest."""
 
 QUIET = 24.0
 """Length of silence after which a response may repeat, in pulses: their tails are then below 1e-5."""
 
 NODES = 4.0
-"""Points of the ground for each period of what is integrated."""
+"""Points of the ground for each period of the integrand."""
 
 PANEL = 12
-"""Points of a panel of Gauss-Legendre along the look."""
+"""Points of a panel of Gauss-Legendre along the axis of a receiver."""
 
 MARGIN_M = 0.25
-"""By which the ground reaches beyond what a receiver in the middle hears: it moves, and does not sit in the middle."""
+"""Margin of the ground around the footprint of a receiver in the middle: receivers move, and have offsets."""
 
 MOST_POINTS = 400_000
 
 STEP = 1e-4
-"""Of the differences that slopes are [m, rad]."""
+"""Step of the numerical derivatives [m, rad]."""
 
 PRECISION = 1e-7
-"""Of the non-uniform Fourier transform."""
+"""Precision of the non-uniform Fourier transform."""
 
 
 class LinkResponse(NamedTuple):
-    """What a ping makes of each point of the ground.
+    """Delay and amplitude of the echo of each point of the ground.
 
     Attributes:
         delay: from the transmitter by the point to the receiver ``(points,)`` [s].
@@ -73,7 +73,7 @@ class LinkResponse(NamedTuple):
 def link_response(
     sonar: ChannelSonar, receiver: Hydrophone, height_m: float, points: Array, pose: ArrayLike, velocity: ArrayLike
 ) -> LinkResponse:
-    """What a ping makes of points of the level ground.
+    """Compute delay and amplitude of the echoes of points of level ground.
 
     Args:
         sonar: the instrument; its transmitter's field of view counts too.
@@ -102,13 +102,13 @@ def link_response(
 
 
 def _sensitivity(sonar: ChannelSonar, receiver: Hydrophone | None, direction: Array) -> Array:
-    """Of the transmitter, or of a receiver, to unit directions ``(3, n)`` in the vehicle's axes."""
+    """Return the sensitivity of the transmitter, or of a receiver, to unit directions ``(3, n)`` in the vehicle's axes."""
     field = sonar.transmitter if receiver is None else sonar.field_of_view[receiver.name]
     return np.asarray(field.sensitivity(*(field.axes @ direction)), dtype=float)
 
 
 class Nodes(NamedTuple):
-    """Points of the ground ``(n, 2)`` [m] with the area that each stands for ``(n,)`` [m2]."""
+    """Points of the ground ``(n, 2)`` [m] with the area of each ``(n,)`` [m2]."""
 
     points: Array
     area: Array
@@ -116,14 +116,14 @@ class Nodes(NamedTuple):
 
 @dataclass(frozen=True)
 class ResponseCovariance:
-    """Covariances of one receiver's responses.
+    """Covariances of the responses of one receiver.
 
     Args:
         sonar: the instrument.
         receiver: one of its receivers.
         height_m: of the transmitter over the ground.
         interval_s: from ping to ping, in which the vehicle makes the motion.
-        reach_m: the longest motion to be asked for, which the points of the ground must be dense enough for.
+        reach_m: the longest motion; it sets the density of the points of the ground.
     """
 
     sonar: ChannelSonar
@@ -134,7 +134,7 @@ class ResponseCovariance:
 
     @cached_property
     def nodes(self) -> Nodes:
-        """Points for the integral over the ground, about the middle between the pings."""
+        """Return the points of the integral over the ground, relative to the middle between the pings."""
         along, across = _extent(self.sonar, self.receiver, self.height_m)
         steep = np.abs(along).max() + MARGIN_M
         sine = steep / math.hypot(steep, self.height_m)
@@ -148,7 +148,7 @@ class ResponseCovariance:
         count = math.ceil(8 + NODES * cycles)
         if len(u) * count > MOST_POINTS:
             raise MitsonarError(
-                f"receiver {self.receiver.name} sees more ground than its law can be computed for: {len(u)} x {count} "
+                f"receiver {self.receiver.name} covers too much ground to compute its covariance: {len(u)} x {count} "
                 f"points; give it a field of view narrower than {wide:.0f} m on the ground"
             )
         w, dw = np.polynomial.legendre.leggauss(count)
@@ -159,23 +159,23 @@ class ResponseCovariance:
         x, y = u * math.sin(turn) + side * math.cos(turn), u * math.cos(turn) - side * math.sin(turn)
         points = np.stack([x.ravel(), y.ravel()], axis=1)
         received = np.zeros(len(points), dtype=bool)
-        for place in self.reach_m / 2 * np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]):
-            received |= link_response(self.sonar, self.receiver, self.height_m, points, (*place, 0), (0, 0)).amplitude > 0
+        for offset in self.reach_m / 2 * np.array([(0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]):
+            received |= link_response(self.sonar, self.receiver, self.height_m, points, (*offset, 0), (0, 0)).amplitude > 0
         return Nodes(points[received], area.ravel()[received])
 
     @cached_property
     def taps(self) -> slice:
-        """Taps that hold echoes."""
-        look = link_response(self.sonar, self.receiver, self.height_m, self.nodes.points, (0, 0, 0), (0, 0))
-        tap = np.rint(look.delay * self.sonar.sampling_hz).astype(int)
-        power = np.bincount(tap, look.amplitude**2 * self.nodes.area)
+        """Return the taps that hold echoes."""
+        links = link_response(self.sonar, self.receiver, self.height_m, self.nodes.points, (0, 0, 0), (0, 0))
+        tap = np.rint(links.delay * self.sonar.sampling_hz).astype(int)
+        power = np.bincount(tap, links.amplitude**2 * self.nodes.area)
         loud = np.flatnonzero(power > FAINTEST * power.max())
         tail = math.ceil(TAILS / self.sonar.bandwidth_hz * self.sonar.sampling_hz)
         return slice(max(0, int(loud[0]) - tail), min(self.sonar.taps, int(loud[-1]) + 1))
 
     @cached_property
     def synthesis(self) -> tuple[float, float, Complex]:
-        """Middle of the delays and period [s] of the frequencies, and what makes taps of them ``(taps, frequencies)``."""
+        """Return the middle delay and the period [s] of the spectrum, and the matrix to taps ``(taps, frequencies)``."""
         delay = self.sonar.delay_s[self.taps]
         middle = (delay[0] + delay[-1]) / 2
         period = delay[-1] - delay[0] + QUIET / self.sonar.bandwidth_hz
@@ -185,7 +185,7 @@ class ResponseCovariance:
         return middle, period, np.exp(2j * np.pi * np.outer(delay - middle, frequency)) * level
 
     def link_responses(self, motion: ArrayLike, lag: float = 1.0) -> tuple[LinkResponse, LinkResponse]:
-        """What both pings make of the ground, ``lag`` intervals apart.
+        """Compute the echoes of the ground in both pings, ``lag`` intervals apart.
 
         Args:
             motion: sideways, forward [m], yaw [rad] in one interval (eq. 3.4), and by how much the vehicle rises [m].
@@ -203,16 +203,18 @@ class ResponseCovariance:
         return found[0], found[1]
 
     def covariance(self, motion: ArrayLike, lag: float = 1.0) -> Complex:
-        """E[h_i h_j*] of the earlier ping's taps i and the later one's j ``(taps, taps)``, for scatterers of strength 1 a
-        square metre. ``lag`` 0: of a ping with itself."""
+        """Return E[h_i h_j*] of taps i of the earlier and j of the later ping ``(taps, taps)``; ``lag`` 0: of one ping.
+
+        The scatterers have a strength of 1 a square metre.
+        """
         first, second = self.link_responses(motion, lag)
         weight = self.nodes.area * first.amplitude * second.amplitude
-        return self._taps_of(self._spectra(first, second, weight[None]))[0]
+        return np.asarray(self._taps_of(self._spectra(first, second, weight[None]))[0])
 
     def slopes(self, motion: ArrayLike, lag: float, free: Sequence[int]) -> Complex:
-        """:meth:`covariance`, and how it changes with some of the motion's four numbers ``(1 + free, taps, taps)``.
+        """Return :meth:`covariance` and its derivatives by free parameters of the motion ``(1 + free, taps, taps)``.
 
-        Carrier phase and amplitude change, and the pulses stay where they are: they tell the less the narrower the band.
+        Only carrier phase and amplitude change; the shift of the pulses is neglected, which suits narrow bands.
         """
         first, second = self.link_responses(motion, lag)
         weight = first.amplitude * second.amplitude
@@ -226,8 +228,8 @@ class ResponseCovariance:
             weights.append((amplitude - 2j * np.pi * self.sonar.carrier_hz * weight * way) / (2 * STEP))
         return self._taps_of(self._spectra(first, second, self.nodes.area * np.array(weights)))
 
-    def _spectra(self, first: LinkResponse, second: LinkResponse, weight: NDArray[Any]) -> Complex:
-        """Integrals over the ground at the frequencies of both pings ``(n, frequencies, frequencies)``, of n weights."""
+    def _spectra(self, first: LinkResponse, second: LinkResponse, weight: NDArray[np.inexact]) -> Complex:
+        """Integrate n weights over the ground at the frequencies of both pings ``(n, frequencies, frequencies)``."""
         import finufft
 
         middle, period, made = self.synthesis
@@ -236,28 +238,28 @@ class ResponseCovariance:
         turned = weight * np.exp(-2j * np.pi * self.sonar.carrier_hz * (first.delay - second.delay))
         count = made.shape[1]
         found = finufft.nufft2d1(x, y, turned, (count, count), eps=PRECISION, isign=-1, nthreads=1)
-        return np.asarray(found).reshape(len(weight), count, count)
+        return np.asarray(found, dtype=np.complex128).reshape(len(weight), count, count)
 
     def _taps_of(self, spectra: Complex) -> Complex:
-        """Taps of both pings ``(n, taps, taps)`` of spectra ``(n, frequencies, frequencies)``."""
+        """Return the taps of both pings ``(n, taps, taps)`` from spectra ``(n, frequencies, frequencies)``."""
         made = self.synthesis[2]
         return np.asarray(made @ spectra @ made.conj().T)
 
 
 def _clockwise(way: Array, turn: float) -> Array:
-    """A level way, turned."""
+    """Turn a level displacement clockwise."""
     cos, sin = math.cos(turn), math.sin(turn)
     return np.array([way[0] * cos + way[1] * sin, way[1] * cos - way[0] * sin])
 
 
 def _four(motion: ArrayLike) -> Array:
-    """Sideways, forward, yaw, rise of a motion that may be without the last."""
+    """Return sideways, forward, yaw, rise of a motion that may lack the last."""
     given = np.asarray(motion, dtype=float)
     return np.append(given, 0.0) if len(given) == 3 else given
 
 
 def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, Array]:
-    """Nodes and weights of Gauss-Legendre in ``panels`` parts."""
+    """Return nodes and weights of Gauss-Legendre in ``panels`` parts."""
     x, weight = np.polynomial.legendre.leggauss(nodes)
     edge = np.linspace(start, end, panels + 1)
     half = np.diff(edge)[:, None] / 2
@@ -265,15 +267,15 @@ def _panels(start: float, end: float, panels: int, nodes: int) -> tuple[Array, A
 
 
 def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple[Array, tuple[Array, Array]]:
-    """The ground that a receiver hears: places along its look ``(n,)``, and there its edges across ``(n,)`` each [m]."""
+    """Return the footprint of a receiver: positions along its axis ``(n,)``, and its two edges across ``(n,)`` each [m]."""
     far = math.sqrt(max(sonar.range_max**2 - height_m**2, 0.0))
     step = height_m / 200
     line = np.arange(-far - step, far + 2 * step, step)
     turn = math.radians(receiver.field.heading_deg)
     u, w = np.meshgrid(line, line, indexing="ij")
     x, y = u * math.sin(turn) + w * math.cos(turn), u * math.cos(turn) - w * math.sin(turn)
-    look = link_response(sonar, receiver, height_m, np.stack([x.ravel(), y.ravel()], axis=1), (0, 0, 0), (0, 0))
-    received = (look.amplitude > 0).reshape(u.shape) & (np.hypot(u, w) <= far)
+    links = link_response(sonar, receiver, height_m, np.stack([x.ravel(), y.ravel()], axis=1), (0, 0, 0), (0, 0))
+    received = (links.amplitude > 0).reshape(u.shape) & (np.hypot(u, w) <= far)
     if not received.any():
         raise MitsonarError(
             f"receiver {receiver.name} hears no level ground {height_m:g} m below within {sonar.range_max:g} m: "
@@ -288,7 +290,7 @@ def _extent(sonar: ChannelSonar, receiver: Hydrophone, height_m: float) -> tuple
 
 
 def block_toeplitz(blocks: Sequence[Complex]) -> Complex:
-    """The covariance of pings from those by lag, the earlier ping first."""
+    """Assemble the covariance of all pings from those by lag, the earlier ping first."""
     count = range(len(blocks))
     whole = np.block([[blocks[j - i] if j >= i else blocks[i - j].conj().T for j in count] for i in count])
     return np.asarray((whole + whole.conj().T) / 2)

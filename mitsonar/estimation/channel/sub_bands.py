@@ -1,9 +1,9 @@
-"""A wide band as narrow ones side by side.
+"""A wide band is divided into narrow ones.
 
-Scatterers that nothing is known of make frequencies farther apart than one over the spread of delays (some 100 Hz)
-independent of each other. Parts of a band that do not overlap therefore tell of the motion independently, each a channel
-sonar of its own carrier, and what is computed of each grows with the cube of its taps: n parts cost n squared times less
-than the whole, and say as much but for what crosses their edges.
+For unknown scatterers, frequencies farther apart than one over the spread of delays (some 100 Hz) are independent. Parts of
+a band that do not overlap therefore hold independent information on the motion; each is a channel sonar of its own carrier.
+The cost of a part grows with the cube of its taps: n parts cost n squared times less than the whole band. Only the
+correlation across their edges is lost.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ __all__ = ["BAND_HZ", "Band", "bands_of"]
 Complex = NDArray[np.complex128]
 
 BAND_HZ = 4800.0
-"""Bandwidth of a part."""
+"""Least bandwidth of a part [Hz]."""
 
 FAINT = 1e-3
-"""Frequencies at which the whole band is fainter are left out."""
+"""Frequencies at which the whole band has a smaller amplitude are left out."""
 
 
 class Band(NamedTuple):
     """A part of a band.
 
     Attributes:
-        sonar: that would measure it alone.
-        place: its frequencies among those of the whole's measurement ``(taps,)``.
+        sonar: an instrument of this part alone.
+        place: indices of its frequencies among those of the whole's measurement ``(taps,)``.
         gain: from the whole's spectrum to the part's ``(taps,)``.
     """
 
@@ -40,12 +40,12 @@ class Band(NamedTuple):
     gain: NDArray[np.float64]
 
     def of(self, response: Complex) -> Complex:
-        """The part's response ``(..., taps)`` of the whole's."""
+        """Return the response of this part ``(..., taps)`` from the response of the whole band."""
         return np.asarray(np.fft.ifft(np.fft.fft(response, axis=-1)[..., self.place] * self.gain, axis=-1))
 
 
 def bands_of(sonar: ChannelSonar, width_hz: float = BAND_HZ) -> list[Band]:
-    """The parts of an instrument's band, as many as are at least ``width_hz`` wide and sampled alike."""
+    """Return the parts of an instrument's band: as many as are at least ``width_hz`` wide and sampled alike."""
     count = max(1, int(sonar.bandwidth_hz / width_hz))
     while sonar.taps % count:
         count -= 1

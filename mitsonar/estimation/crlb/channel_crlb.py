@@ -1,9 +1,8 @@
-"""The limit of motion from impulse responses of an unknown ground: the Cramer-Rao bound of its law.
+"""The Cramer-Rao lower bound of motion from impulse responses of unknown ground.
 
-Pings of a ground of which nothing is known are Gaussian with the covariance R of
-:mod:`mitsonar.estimation.channel.response_covariance`. The
-Fisher information of the motion is tr(R^-1 R_a R^-1 R_b), added over receivers, whose fields of view hardly overlap. No
-unbiased estimator errs less. It is a *local* limit: it does not know that another motion may fit as well.
+Pings of unknown ground are Gaussian with the covariance R of :mod:`mitsonar.estimation.channel.response_covariance`. The
+Fisher information of the motion is tr(R^-1 R_a R^-1 R_b), added over receivers, whose fields of view hardly overlap. The
+bound is *local*: it does not include that another motion may fit as well.
 """
 
 from __future__ import annotations
@@ -44,7 +43,9 @@ def channel_crlb(
     snr_db: float = NOISELESS_DB,
     free: Sequence[int] = (0, 1),
 ) -> Array:
-    """Least standard deviations of the free ones of sideways, forward [m], yaw [rad], rise [m] from first to last ping.
+    """Return the least standard deviations ``(k,)`` of the free parameters of the motion from the first to the last ping.
+
+    The parameters are sideways, forward [m], yaw [rad] and rise [m]. A parameter that cannot be observed has inf.
 
     Args:
         sonar: the instrument.
@@ -73,7 +74,7 @@ def impulse_information(
     snr_db: float = NOISELESS_DB,
     free: Sequence[int] = (0, 1),
 ) -> Array:
-    """Fisher information of the free ones of the motion's four numbers ``(k, k)``; arguments of :func:`channel_crlb`.
+    """Return the Fisher information of the free parameters ``(k, k)``; the arguments are those of :func:`channel_crlb`.
 
     Raises:
         MitsonarError: fewer than two pings.
@@ -86,12 +87,12 @@ def impulse_information(
     total = np.zeros((len(free), len(free)))
     for band in bands_of(sonar):
         for receiver_band in receiver_bands_of(band.sonar, height_m, span_s / (pings - 1), reach):
-            total += _told(receiver_band, given, pings, 10 ** (-snr_db / 10), free)
+            total += _information(receiver_band, given, pings, 10 ** (-snr_db / 10), free)
     return total
 
 
-def _told(receiver_band: ReceiverBand, motion: Array, pings: int, noise: float, free: Sequence[int]) -> Array:
-    """By one receiver."""
+def _information(receiver_band: ReceiverBand, motion: Array, pings: int, noise: float, free: Sequence[int]) -> Array:
+    """Return the information of one receiver."""
     whole = _covariance(receiver_band.law, receiver_band.turn @ motion, pings)
     power = float(np.diag(whole).real.mean())
     inverse = np.linalg.inv(whole + noise * power * np.eye(len(whole)))
@@ -104,5 +105,5 @@ def _told(receiver_band: ReceiverBand, motion: Array, pings: int, noise: float, 
 
 
 def _covariance(law: ResponseCovariance, motion: Array, pings: int) -> Complex:
-    """Of all pings' taps, for a motion over all of them."""
+    """Return the covariance of the taps of all pings, for a motion over all of them."""
     return block_toeplitz([law.covariance(motion / (pings - 1), lag) for lag in range(pings)])

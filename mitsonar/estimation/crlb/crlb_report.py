@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,8 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_subject import Subject
 from mitsonar.estimation.crlb.image_crlb import LAWS, Bound, bounds_at, overall, varied
-from mitsonar.simulation.imaging import Simulator
+from mitsonar.estimation.estimator import PlainTable
+from mitsonar.simulation.imaging import CALIBRATION_FRAMES, RenderedPings, Simulator, constant_gain
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 
 __all__ = ["Table", "Value", "bounds_of_subject", "report_lines", "report_of"]
@@ -61,23 +61,26 @@ def bounds_of_subject(
     return table
 
 
-def _gain(simulator: Any, poses: NDArray[np.float64]) -> float:
-    """The constant gain of all views of the first frames, as that of a run."""
+def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
+    """Return the constant gain of all views of the first frames, as for a run."""
     batches = []
-    for looks in simulator.render_views(poses[:CALIBRATION_FRAMES]):
-        flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in looks], axis=1)
-        batches.append(RenderedPings(looks[0].first, flat[:, :, None], looks[0].counts, looks[0].height_m))
+    for views in simulator.render_views(poses[:CALIBRATION_FRAMES]):
+        flat = np.concatenate([pings.levels.reshape(len(pings), -1) for pings in views], axis=1)
+        batches.append(RenderedPings(views[0].first, flat[:, :, None], views[0].counts, views[0].height_m))
     if not any(pings.levels.any() for pings in batches):
         raise MitsonarError("no ray met anything within the window: check the pose (pitch > 0 looks down) and the window")
     return constant_gain(batches)[0]
 
 
-def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> dict[str, Any]:
-    """As JSON can hold it: numbers in mm and deg, null where there is no bound or the motion is not observable."""
+def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
+    """Return the bounds as JSON can hold them.
+
+    Numbers are in mm and deg; they are null where there is no bound or the motion is not observable.
+    """
     found = []
     for value, table in rows:
         for (portion, kind, law), bounds in table.items():
-            row: dict[str, Any] = {} if name is None else {name: value}
+            row: PlainTable = {} if name is None else {name: value}
             row |= {"portion": portion, "data": kind, "law": law, "poses": len(bounds)}
             known = [one for one in bounds if one is not None]
             for frames, words in ((1, "one_frame"), (2, "two_frames")):
@@ -101,8 +104,8 @@ def _numbers(values: NDArray[np.float64]) -> list[float | None]:
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in values]
 
 
-def report_lines(report: dict[str, Any]) -> list[str]:
-    """The table: least standard deviations."""
+def report_lines(report: PlainTable) -> list[str]:
+    """Return the table of least standard deviations as lines."""
     name = report["vary"]
     titles = [name] if name else []
     titles += ["portion", "data", "law", "one frame: mm / mm / deg", "two frames: mm / mm / deg", "poses"]

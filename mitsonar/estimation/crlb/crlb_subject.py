@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.variant import release_memory
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 __all__ = ["Place", "Subject", "subject_of_data", "subject_of_scene"]
 
@@ -31,7 +34,7 @@ class Place:
         heights: over the ground ``(n,)`` [m].
     """
 
-    scene: Any
+    scene: mi.Scene
     poses: NDArray[np.float64]
     heights: NDArray[np.float64]
 
@@ -56,7 +59,7 @@ class Subject:
 
 
 def subject_of_scene(
-    scene: Any, sonar: Sonar, poses: NDArray[np.float64], *, segments: list[str], gain: float | None = None
+    scene: mi.Scene, sonar: Sonar, poses: NDArray[np.float64], *, segments: list[str], gain: float | None = None
 ) -> Subject:
     """Poses in one scene.
 

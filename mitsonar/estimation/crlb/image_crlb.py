@@ -1,9 +1,8 @@
-"""The physical limit of motion estimation: the Cramer-Rao bound of a known scene, sonar and noise.
+"""The Cramer-Rao lower bound of motion estimation for a known scene, sonar and noise.
 
 No unbiased estimator of the motion (sideways, forward, yaw) has a covariance below the inverse of the Fisher information
-F = J' W J: J how pixels change with the motion, W what a noisy pixel tells of itself (:mod:`mitsonar.acoustics.noise`). The
-bound is
-that of an oracle: who owns the renderer, and knows the scene, its height and what the sonar would see without noise.
+F = J' W J: J how pixels change with the motion, W the information of a noisy pixel (:mod:`mitsonar.acoustics.noise`).
+The bound is that of an oracle, which owns the renderer and knows the scene, its height and the frames without noise.
 
 *One frame* is registered with that oracle: covariance 1 / F. *Two frames*, both noisy, of a known relief: twice that. It is
 optimistic, since a real estimator has to find the relief and the reflectivity of every cell in the same two frames.
@@ -65,7 +64,7 @@ class Bound:
 
     Attributes:
         information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
-        doubt: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
+        reason: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
     """
 
     information: NDArray[np.float64]
@@ -76,7 +75,7 @@ class Bound:
         return Bound(self.information + other.information, self.reason + other.reason)
 
     def covariance(self, frames: int = 1) -> NDArray[np.float64]:
-        """The least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
+        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
 
         The pseudo-inverse where not all can be observed: the variance of an axis with a part in what cannot be is inf.
         """
@@ -93,7 +92,7 @@ class Bound:
         return np.asarray(frames * inverse)
 
     def std(self, frames: int = 1) -> NDArray[np.float64]:
-        """The least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
+        """Return the least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
         return np.asarray(np.sqrt(np.diag(self.covariance(frames))))
 
     @property
@@ -105,7 +104,7 @@ class Bound:
         return np.asarray(np.where(np.isfinite(variance), self._error(finite) / (2 * variance), np.nan))
 
     def _error(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard error of v' F v for each column v ``(3, n)``."""
+        """Return the standard error of v' F v for each column v ``(3, n)``."""
         v = directions
         variance: NDArray[np.float64] = np.einsum("ijkl,in,jn,kn,ln->n", self.reason, v, v, v, v)
         return np.sqrt(np.maximum(variance, 0))
@@ -137,7 +136,7 @@ class InformationTerms(NamedTuple):
 def bound(
     derivative: Derivative, noise: NoiseModel, *, kind: str = "image", law: str = "pixel", greys: int = 255
 ) -> Bound | None:
-    """The bound of one view.
+    """Compute the bound of one view.
 
     Without noise nothing but rounding stands between a pixel and its level. The exact law then tells the motion without
     limit, and the answer is None; ``gaussian`` counts rounding as a variance of 1 / (12 255^2), as for pixels that noise of
@@ -169,7 +168,7 @@ def _terms(derivative: Derivative, noise: NoiseModel, kind: str, greys: int = 25
 
 
 def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> InformationTerms:
-    """What pixels tell."""
+    """Return the information of pixels."""
     changing = derivative.jacobian.any(axis=(0, 3, 4))
     level, filled = derivative.level[changing], derivative.filled[changing]
     told = information(noise, level, filled, greys=greys)
@@ -179,7 +178,7 @@ def _by_pixels(derivative: Derivative, noise: NoiseModel, greys: int) -> Informa
 
 
 def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
-    """What sums over the beams tell."""
+    """Return the information of sums over the beams."""
     jacobian = derivative.jacobian.sum(axis=2, dtype=float)
     changing = jacobian.any(axis=(0, 2, 3))
     level, filled = derivative.level[changing], derivative.filled[changing]
@@ -191,7 +190,7 @@ def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
 
 
 def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
-    """J1' W J2, made symmetric, and its doubt.
+    """Compute F = J1' W J2, made symmetric, and the covariance of its elements.
 
     Args:
         jacobian: two independent estimates of how k numbers of n independent values change with the motion ``(2, n, k, 3)``.
@@ -231,7 +230,7 @@ def bounds_of_views(
 
 
 def together(parts: Sequence[Bound | None]) -> Bound | None:
-    """The bound of several views, whose noise is independent; None where one alone tells everything."""
+    """Add the information of several views, whose noise is independent; None where one view alone has no bound."""
     known = [part for part in parts if part is not None]
     return sum(known[1:], known[0]) if len(known) == len(parts) else None
 

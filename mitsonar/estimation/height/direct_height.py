@@ -1,4 +1,4 @@
-"""Height estimators: one frame in, the height over the ground out; the direct one, from first return and fall-off."""
+"""Height estimators: one frame in, the height over the ground out. ``direct`` fits first return and fall-off of levels."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Above = SonarFrames | ViewFrames
 """One frame, or one ping of several views."""
 
 CANDIDATES = 400
-"""Heights that are tried first, at equal ratios."""
+"""Number of heights that are tried first, at equal ratios."""
 
 PARTS = 40
-"""Heights between such ends into which a profile is resolved."""
+"""Number of heights between such ends into which a profile is resolved."""
 
 PASSES = (((0.75, 1.2), 0.75), ((0.75, 1.1), 0.7))
 """Ends of these heights, as parts of the height found before, and the part of the ground's echo that comes from above the
@@ -33,7 +33,7 @@ floor: tops and flanks of what stands on it. Noise spreads parts to all heights,
 above. On rocky fields from 1 to 10 m and hulls, without noise and with much, these err least."""
 
 SPREAD = 0.1
-"""Quantiles this far to either side tell how sure that is."""
+"""Distance of the quantiles, to either side, that give the standard deviation."""
 
 KEPT = 16
 """Attitudes, to a milliradian, whose profiles of level ground are kept."""
@@ -42,20 +42,20 @@ FINEST = 0.01
 """Least standard deviation, as part of the height."""
 
 LEAST = 0.5
-"""Correlation of a profile with that of the ground as found, below which it is not believed."""
+"""Least correlation of a profile with the fitted ground for a valid height."""
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class HeightEstimate:
-    """What an estimator says of one frame.
+    """The estimate of a height from one frame.
 
     Attributes:
-        height_m: of the sonar over the ground; nan where nothing can be said.
-        std_m: how sure that is; nan where unknown.
-        believe: False where it should not be used.
-        reason: why not.
+        height_m: of the sonar over the ground; nan where nothing can be estimated.
+        std_m: its standard deviation; nan where unknown.
+        valid: False where the height must not be used.
+        reason: of a rejection.
     """
 
     height_m: float
@@ -65,7 +65,7 @@ class HeightEstimate:
 
 
 class HeightEstimator(Protocol):
-    """From one frame to the height.
+    """Estimates the height from one frame.
 
     Attributes:
         inputs: what it needs beside the frame.
@@ -75,14 +75,14 @@ class HeightEstimator(Protocol):
 
     @property
     def views(self) -> tuple[str, ...] | None:
-        """Whose frames it reads; None: those of a single image."""
+        """Return the views that it reads; None: a single image."""
 
     @property
     def kind(self) -> str:
-        """``image`` or ``vector``, of views."""
+        """Return what it reads of views: ``image`` or ``vector``."""
 
     def height(self, frame: Above) -> HeightEstimate:
-        """The height of one frame.
+        """Estimate the height of one frame.
 
         Raises:
             MitsonarError: not one frame, or one without what the estimator needs.
@@ -91,14 +91,14 @@ class HeightEstimator(Protocol):
 
 @dataclass
 class DirectHeight:
-    """The height at which level ground has the frame's range profile: where the first echo comes from, and how levels fall
-    off behind it. What stands on the ground answers as if the sonar were lower: the profile is resolved into ground at many
-    heights (non-negative least squares, with an even background for noise), and the floor lies above most of them.
+    """Fits the height at which level ground has the range profile of the frame: first echo and fall-off of levels.
 
-    It looks at the sum over beams, so that a frame and its vector tell the same.
+    Objects on the ground look like ground nearer to the sonar. The profile is therefore resolved into ground at many heights
+    (non-negative least squares, with an even background for noise), and the floor is a high quantile of them. Only the sum
+    over beams is used, so that a frame and its vector give the same height.
 
     Attributes:
-        pitch_rad: of the sonar; None: as the frames say.
+        pitch_rad: of the sonar; None: that of the frames.
         views: see :class:`HeightEstimator`.
     """
 
@@ -111,10 +111,10 @@ class DirectHeight:
         self._floors: dict[tuple[str, tuple[str, ...], float, float], FloorProfile] = {}
 
     def height(self, frame: Above) -> HeightEstimate:
-        """The height over the floor.
+        """Estimate the height over the floor.
 
         Raises:
-            MitsonarError: not one frame; neither a pitch that was given nor poses; a sonar that sees no ground.
+            MitsonarError: not one frame; neither a given pitch nor poses; a sonar whose field of view holds no ground.
         """
         profile, sonar = profile_of(frame)
         reason = rejection_of_profile(profile)
@@ -141,7 +141,7 @@ class DirectHeight:
         return HeightEstimate(float(height), std)
 
     def _floor_of(self, frame: Above, sonar: Sonar) -> FloorProfile:
-        """Level ground as this sonar sees it, kept for the frames that follow."""
+        """Return the profile of level ground for this sonar, cached for the next frames."""
         pose = None if frame.poses is None else frame.poses[0]
         pitch = self.pitch_rad if self.pitch_rad is not None else (None if pose is None else float(pose[3]))
         if pitch is None or not np.isfinite(pitch):
@@ -158,7 +158,7 @@ class DirectHeight:
 
 
 def profile_of(frame: Above) -> tuple[Array, Sonar]:
-    """Levels along range, summed over beams and views, and the sonar.
+    """Return the levels along range ``(bins,)``, summed over beams and views, and the sonar.
 
     Raises:
         MitsonarError: not one frame, levels that are not linear or not finite.
@@ -168,7 +168,7 @@ def profile_of(frame: Above) -> tuple[Array, Sonar]:
     if isinstance(frame, ViewFrames):
         return _finite(frame.profiles().sum(axis=(0, 1), dtype=float)), next(iter(frame.sonars.values()))
     if frame.level != "linear":
-        raise MitsonarError(f"heights are told from linear images: got {frame.level}; convert them first")
+        raise MitsonarError(f"heights are estimated from linear images: got {frame.level}; convert them first")
     profile = frame.image[0].sum(axis=1, dtype=float)
     half = (frame.range_m[-1] - frame.range_m[0]) / max(1, len(frame.range_m) - 1) / 2
     window = {"range_min": max(0.0, float(frame.range_m[0] - half)), "range_max": float(frame.range_m[-1] + half)}
@@ -183,12 +183,12 @@ def _finite(profile: Array) -> Array:
 
 
 def rejection_of_profile(profile: Array) -> str:
-    """Whether there is anything in it."""
+    """Return why a profile shows nothing; empty where it shows something."""
     return "" if np.ptp(profile) > 0 else "nothing in the frame to tell a height from"
 
 
 def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
-    """How often each ray is in the sum of the views; None where all are alike.
+    """Return how often each ray is in the sum of the views; None where all are equal.
 
     Raises:
         MitsonarError: receivers of a bistatic sonar, whose ranges are others.
@@ -198,7 +198,7 @@ def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
     others = [view for view in views if view not in SEGMENTS]
     if others:
         raise MitsonarError(
-            f"heights are told directly from a sonar's own image or portions of its view: got the receiver {others[0]}"
+            f"heights are estimated directly from a sonar's own image or portions of its view: got the receiver {others[0]}"
         )
     rays = np.sum([Segment(sonar, view).member for view in views], axis=0, dtype=float)
     shape = (sonar.rays_per_beam, sonar.beams, -1)
@@ -206,13 +206,13 @@ def _weight_of(sonar: Sonar, views: tuple[str, ...]) -> Array | None:
 
 
 def _resolved(ground: Array, profile: Array) -> Array:
-    """How much of a profile is ground at each height ``(heights,)``, beside an even background."""
+    """Return the part of a profile that is ground at each height ``(heights,)``, beside an even background."""
     even = np.full((len(profile), 1), 1 / len(profile))
     return np.asarray(nnls(np.hstack([ground, even]), profile / profile.max())[0][:-1])
 
 
 def _nearest_alike(profile: Array, floor: FloorProfile, edges: Array) -> float | None:
-    """The height at which level ground correlates best with a profile; None where no height shows ground in the window."""
+    """Return the height whose ground correlates best with a profile; None where no height shows ground in the window."""
     heights = np.geomspace(max(edges[0], edges[-1] / 1e3) / floor.farthest, edges[-1] / floor.nearest, CANDIDATES)
     ground = floor.at(heights, edges)
     ground -= ground.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What level ground sends back along range, at any height: first return, and the fall-off behind it."""
+"""The range profile of level ground at any height: first return and fall-off of levels."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from mitsonar.motion.pose import Pose, vehicle_rotation
 __all__ = ["FloorProfile"]
 
 MANY = 256
-"""Beams, and rays of a beam, of which no more are taken."""
+"""Most beams, and rays of a beam, that are used."""
 
 FARTHEST = 40.0
-"""Range over height beyond which ground is not looked for."""
+"""Largest range over height of the ground."""
 
 Array = NDArray[np.float64]
 
 
 class FloorProfile:
-    """The range profile of level ground of one reflectivity: ranges are proportional to the height, so that one curve over
-    range / height serves all of them.
+    """The range profile of level ground of constant reflectivity, as a curve over range / height.
 
     Levels are those of :func:`mitsonar.acoustics.echo_level.level`: a ray's cosine in the ``thesis`` model; cosine, solid
     angle, spreading and gain in ``physical``.
@@ -62,23 +61,23 @@ class FloorProfile:
 
     @cached_property
     def _along(self) -> tuple[Array, Array]:
-        """Ranges of rays over the height, rising, and the sum of levels up to each."""
+        """Return the ranges of rays over the height, rising, and the sum of levels up to each."""
         away = 1 / self._down
         gain = 1.0 if self.sonar.model == "thesis" else away ** (self.sonar.gain_exponent - 2)
         return away, np.cumsum(self._part * self._down * gain)
 
     @property
     def nearest(self) -> float:
-        """Range of the first return over the height."""
+        """Return the range of the first return over the height."""
         return float(self._along[0][0])
 
     @property
     def farthest(self) -> float:
-        """Range of the last return over the height."""
+        """Return the range of the last return over the height."""
         return float(self._along[0][-1])
 
     def at(self, height_m: float | Array, edges_m: Array) -> Array:
-        """Levels of the bins between edges ``(..., bins)``, at heights ``(...)``; their sum is 1 where all is within."""
+        """Return the levels of the bins between edges ``(..., bins)`` at heights ``(...)`` [m]; their sum is 1 at most."""
         away, total = self._along
         ends = np.asarray(edges_m) / np.asarray(height_m, dtype=float)[..., None]
-        return np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1]
+        return np.asarray(np.diff(np.interp(ends, away, total, left=0.0), axis=-1) / total[-1])

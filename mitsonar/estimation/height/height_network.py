@@ -1,16 +1,16 @@
-"""The height estimator that a checkpoint is: a network of one frame, or one vector (Almanza-Medina, 4.5)."""
+"""The height estimator of a checkpoint: a network of one frame, or of one vector (Almanza-Medina, 4.5)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.height.direct_height import Above, HeightEstimate, profile_of, rejection_of_profile
-from mitsonar.estimation.learned.trained_network import Trained, TrainedInstrument, answer_of, one_thread
+from mitsonar.estimation.learned.trained_network import NetworkInput, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.instruments.views import Whole
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.view_frames import ViewFrames
@@ -18,12 +18,12 @@ from mitsonar.records.view_frames import ViewFrames
 __all__ = ["HeightNetwork"]
 
 BEYOND = 0.1
-"""Answers beyond the heights of training by this part of their interval are not believed."""
+"""Part of the interval of the heights of training by which a valid height may exceed it."""
 
 
 @dataclass(init=False, eq=False)
 class HeightNetwork(Trained):
-    """A trained network that tells heights.
+    """A trained network that estimates heights.
 
     Args:
         checkpoint: of it; it must take one frame.
@@ -38,20 +38,20 @@ class HeightNetwork(Trained):
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
         if checkpoint.arrangement["frames"] != 1:
             raise MitsonarError(
-                f"this {checkpoint.network} tells motions of {checkpoint.arrangement['frames']} frames, not heights: give "
-                "one that was trained with input.frames: 1, or direct"
+                f"this {checkpoint.network} estimates motions of {checkpoint.arrangement['frames']} frames, not heights: "
+                "give one that was trained with input.frames: 1, or direct"
             )
         self.force = force
         self._take(checkpoint)
 
     @property
     def views(self) -> tuple[str, ...] | None:
-        """Names of the views that it reads; None: a single image."""
+        """Return the names of the views that it reads; None: a single image."""
         views = tuple(self._checkpoint.arrangement["views"])
         return None if views == (Whole.name,) else views
 
     def height(self, frame: Above) -> HeightEstimate:
-        """The height that the network says; its standard deviation is that of validation.
+        """Estimate the height; its standard deviation is that of validation.
 
         Raises:
             MitsonarError: not one frame, other views or another sonar than those of training.
@@ -74,8 +74,8 @@ class HeightNetwork(Trained):
             )
         return HeightEstimate(height, std)
 
-    def _input(self, frame: Above) -> Any:
-        """What the network reads, a batch of one."""
+    def _input(self, frame: Above) -> NetworkInput:
+        """Return the input of the network, a batch of one."""
         if isinstance(frame, ViewFrames):
             return self._input_of_views(frame)
         names = self._checkpoint.arrangement["views"]
@@ -85,4 +85,6 @@ class HeightNetwork(Trained):
             )
         self._check_instrument(names[0], TrainedInstrument.in_frames(frame.sonar, frame.range_m, frame.bearing_rad))
         values = {names[0]: torch.from_numpy(np.asarray(frame.image)[None])}
-        return self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})(values, torch.arange(1)[None], 0)
+        arranged = self._arranged({names[0]: (frame.range_m, frame.bearing_rad)})
+        inputs: NetworkInput = arranged(values, torch.arange(1)[None], 0)
+        return inputs

@@ -12,7 +12,7 @@ __all__ = ["height_estimator_from"]
 
 
 def height_estimator_from(text: str) -> HeightEstimator:
-    """What the command line says: ``direct``, a checkpoint or the folder of a training run, or either with options.
+    """Create a height estimator from a text: ``direct``, a checkpoint or the folder of a training run, with options or not.
 
     Raises:
         MitsonarError: no such checkpoint, one of motions, an unknown option.

@@ -27,8 +27,8 @@ class Ecc:
     """Rigid registration of the frames as seen from above.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
-        pitch_rad: default: what the frames say.
+        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        pitch_rad: default: that of the frames.
     """
 
     height_m: float | None = None
@@ -39,7 +39,11 @@ class Ecc:
     digest = ""
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion, and whether to believe it; zero motion where OpenCV finds none."""
+        """Estimate the motion; reject frames for which OpenCV finds none.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
         images = two_frames(frames)
         attitude = attitude_of(frames, "ecc", self.height_m, self.pitch_rad)
         if attitude.reason or any(blank(image) for image in images):
@@ -69,7 +73,7 @@ class Ecc:
         inside: NDArray[np.bool_],
         size: int,
     ) -> str:
-        """Why not to believe the match, both smoothed as OpenCV did; empty where nothing speaks against it."""
+        """Return the reason of a rejection, from images smoothed as in OpenCV; empty for a valid match."""
         smooth = [cv2.GaussianBlur(image, (size, size), 0) for image in (first, second)]
         back = cv2.warpAffine(smooth[1], warp, first.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         seen = cv2.warpAffine(

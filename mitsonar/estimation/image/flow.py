@@ -1,4 +1,4 @@
-"""The estimator ``flow``: the deterministic method that the thesis compares its networks with, after Henson and Zakharov
+"""The estimator ``flow``: the deterministic method of Almanza-Medina's comparisons, after Henson and Zakharov
 ("Attitude-trajectory estimation for forward-looking multibeam sonar based on acoustic image registration", IEEE Journal of
 Oceanic Engineering, 2019; Almanza-Medina, 1.2.3, 2.3, 3.4.8).
 
@@ -6,7 +6,7 @@ Oceanic Engineering, 2019; Almanza-Medina, 1.2.3, 2.3, 3.4.8).
 2. The best match among the displacement maps of modelled sensor motions gives sideways, forward and yaw.
 3. A weighted regularised spline joins the motions of a run: :mod:`mitsonar.mapping.trajectory_smoothing`.
 
-The thesis says no more than this. Unsaid there, and chosen here:
+Almanza-Medina gives no further details. Chosen here:
 
 - The flow is Lucas and Kanade's: least squares of brightness within windows, with the slopes of both frames' mean. A window
   says how well it knows each direction, which weighs the match; flow that does not say so (Farnebäck's, DIS) measured worse.
@@ -16,15 +16,14 @@ The thesis says no more than this. Unsaid there, and chosen here:
 - ``match="vector"`` is the paper's own shortcut: a displacement map is described by a small vector "derived from the
   displacement distribution"; which, is unsaid: here the means in range and in bearing and the slope of the displacement in
   range over bearing, without weights.
-- The height over what is seen comes from the first echoes, or from what the frames say; it is known only to ``height_std``,
+- The height over what is seen comes from the first echoes, or from the frames; it is known only to ``height_std``,
   and is a fourth unknown of the match: rocks stand above the ground that the height is measured to.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,9 +31,10 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
+from mitsonar.estimation.image.displacement_map import FlowLevel, WindowGrid, window_grid
+from mitsonar.estimation.image.displacement_match import STILL, TINY, WindowFlow, in_blocks, match_map, match_vector
 from mitsonar.geometry.attitude import attitude_of
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.geometry.ground_plane import moved
 from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -43,68 +43,24 @@ __all__ = ["Flow"]
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-
-class FlowLevel(NamedTuple):
-    """One step from coarse to fine: every so many bins of frames smoothed over bins and beams (standard deviations); windows
-    of so many bins and beams; at most so many rounds of flow and match."""
-
-    step: int
-    bins: float
-    beams: float
-    window: tuple[int, int]
-    rounds: int
-
-
 LEVELS = (
     FlowLevel(8, 16.0, 3.0, (136, 33), 6),
     FlowLevel(4, 6.0, 1.5, (68, 17), 6),
     FlowLevel(1, 1.0, 0.6, (33, 9), 25),
 )
 
-STILL = np.array([1e-4, 1e-4, 3e-5])
-"""Steps below which a level ends [m, m, rad]."""
-
 LONGEST_STEP = np.array([0.06, 0.06, np.radians(1.2)])
 """What one round may add [m, m, rad]: where the flow is wrong, it is wrong without limit."""
 
-CAUCHY = 8.0
-"""Windows whose squared misfit is so many times the usual have half the weight."""
-
-FAINT, QUIET, TINY = 1e-3, 0.1, 1e-20
-"""Parts of the mean structure and of the mean residual that are added to each window's; what keeps zero from dividing."""
-
-HIGHER = 0.02
-"""The step in height that the map's change is taken from, as a part of it."""
-
-SIZE = np.array([0.01, 0.01, 0.003])
-"""Motions of like size [m, m, rad]."""
-
-BLOCK = 4
-"""Windows that overlap, and that show one rock, err alike: blocks of so many by so many count once."""
+FAINT, QUIET = 1e-3, 0.1
+"""Parts of the mean structure and of the mean residual that are added to those of each window."""
 
 LEAST_CORRELATION = 0.25
 FEWEST_BLOCKS = 4.0
 MOST_UNSEEN = 0.5
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
-"""What an estimate that is to be believed must have: correlation within windows of the frames as matched; blocks that hold
-the structure; the part of the structure that lies twice as far from the axis in elevation as the sonar sees; standard
-deviations."""
-
-
-class _Flow(NamedTuple):
-    """In each window: displacement left over [m, rad] ``(n, m, 2)``; its information, and the same without what noise adds
-    to slopes ``(n, m, 2, 2)``."""
-
-    displacement: Doubles
-    information: Doubles
-    shared: Doubles
-
-
-class _Match(NamedTuple):
-    """Motion, and its covariance, or None where the match is not a maximum."""
-
-    motion: Doubles
-    covariance: Doubles | None
+"""Limits of a valid estimate: correlation within windows of the registered frames; blocks that hold the structure; the part
+of the structure that lies twice as far from the axis in elevation as the field of view; standard deviations [m, m, rad]."""
 
 
 class _Fit(NamedTuple):
@@ -122,8 +78,8 @@ class Flow:
     """Registration by optical flow, with the exact geometry of the sonar over level ground.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
-        pitch_rad: default: what the frames say.
+        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        pitch_rad: default: that of the frames.
         relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
         match: ``map``, each window by what it knows; or ``vector``, three means and slopes of all windows.
         height_std: how well the height over what is seen is known, as part of it; 0: exactly; default: as
@@ -154,7 +110,11 @@ class Flow:
             raise MitsonarError(f"height_std must be 0 or more, a part of the height: got {self.height_std:g}")
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion, its covariance, and whether to believe it; zero motion where there is nothing to match."""
+        """Estimate the motion and its covariance; reject frames without anything to match.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
         first, second = two_frames(frames)
         attitude = attitude_of(frames, "flow", self.height_m, self.pitch_rad, self.relief_m)
         height_std = attitude.height_std_m / attitude.height_m if self.height_std is None else self.height_std
@@ -163,7 +123,7 @@ class Flow:
         fit = None
         for level in self.levels:
             trained_at = (attitude.height_m, attitude.pitch_rad, attitude.roll_rad)
-            grid = _grid(*axes, frames.sonar.bearing, *trained_at, level)
+            grid = window_grid(*axes, frames.sonar.bearing, *trained_at, level)
             fit = self._register(_smoothed(first, level), _smoothed(second, level), grid, v, height_std)
             if fit is None:
                 return Estimate(Motion(0.0, 0.0, 0.0), None, False, "nothing in the frames to match")
@@ -175,13 +135,13 @@ class Flow:
         about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen}
         return Estimate(Motion(*(float(x) for x in v)), fit.covariance, not reason, reason, about)
 
-    def _register(self, first: Floats, second: Floats, grid: _Grid, start: Doubles, height_std: float) -> _Fit | None:
-        """Rounds of flow and match from a start; None where there is nothing to match."""
+    def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
+        """Run rounds of flow and match from a start; None where there is nothing to match."""
         v, converged = start, False
         for _ in range(grid.level.rounds):
             warped, inside = _warped(second, grid, v)
             flow = _flow(first, warped, inside, grid)
-            match = _match_map(grid, flow, v, height_std) if self.match == "map" else _match_vector(grid, flow, v)
+            match = match_map(grid, flow, v, height_std) if self.match == "map" else match_vector(grid, flow, v)
             if match is None:
                 return None
             step = match.motion - v
@@ -195,93 +155,14 @@ class Flow:
         return _Fit(v, match.covariance, correlation, _structure(flow, grid), converged)
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """The cells of a level's frames over the ground, and the windows over them."""
-
-    ground: GroundGeometry
-    level: FlowLevel
-
-    @cached_property
-    def cells(self) -> Floats:
-        """Ground points of all cells ``(bins, beams, 2)``."""
-        return self.ground.points.astype(np.float32)
-
-    @cached_property
-    def window(self) -> tuple[int, int]:
-        """Size of the windows in this level's rows and columns."""
-        bins, beams = self.level.window
-        return max(3, bins // self.level.step), beams
-
-    @cached_property
-    def centres(self) -> tuple[slice, slice]:
-        """The cells in the middle of the windows; these overlap by half."""
-        rows, columns = (max(1, size // 2) for size in self.window)
-        return slice(rows // 2, None, rows), slice(columns // 2, None, columns)
-
-    @cached_property
-    def home(self) -> Doubles:
-        """Range [m] and bearing [rad] of the windows' centres ``(n, m, 2)``."""
-        return np.stack(np.meshgrid(self.ground.range_m, self.ground.bearing_rad, indexing="ij"), axis=-1)[self.centres]
-
-    @cached_property
-    def spacing(self) -> Doubles:
-        """Metres of a row and radians of a column at the centres ``(n, m, 2)``."""
-        steps = [np.gradient(axis) for axis in (self.ground.range_m, self.ground.bearing_rad)]
-        return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1)[self.centres]
-
-    @cached_property
-    def points(self) -> Doubles:
-        """Ground points of the centres ``(n, m, 2)``."""
-        return self.ground.points[self.centres]
-
-    @cached_property
-    def derivative(self) -> Doubles:
-        """Of the centres' displacement by the motion ``(n, m, 2, 3)``; zero where they show no ground."""
-        return np.nan_to_num(self.ground.derivative[self.centres])
-
-    @cached_property
-    def higher(self) -> GroundGeometry:
-        """The same sonar :data:`HIGHER` times its height further up."""
-        return replace(self.ground, height_m=self.ground.height_m * (1 + HIGHER))
-
-    @cached_property
-    def higher_points(self) -> Doubles:
-        """Ground points of the centres, seen from there ``(n, m, 2)``."""
-        return self.higher.points[self.centres]
-
-    def map(self, v: Doubles) -> Doubles:
-        """The modelled displacement map of a motion [m, rad] ``(n, m, 2)``; zero where no ground is shown."""
-        return np.nan_to_num(np.stack(self.ground.to_polar(moved(self.points, v)), axis=-1) - self.home)
-
-    def by_height(self, v: Doubles) -> Doubles:
-        """How that map changes with the height, in parts of it ``(n, m, 2, 1)``."""
-        map_there = np.stack(self.higher.to_polar(moved(self.higher_points, v)), axis=-1) - self.home
-        return (np.nan_to_num(map_there - self.map(v)) / HIGHER)[..., None]
-
-
-@lru_cache(maxsize=16)
-def _grid(
-    range_m: tuple[float, ...],
-    bearing_rad: tuple[float, ...],
-    bearing: Bearing,
-    height: float,
-    pitch: float,
-    roll: float,
-    level: FlowLevel,
-) -> _Grid:
-    ranges = np.array(range_m)[level.step // 2 :: level.step]
-    return _Grid(GroundGeometry(ranges, np.array(bearing_rad), bearing, height, pitch, roll), level)
-
-
 def _smoothed(image: Floats, level: FlowLevel) -> Floats:
     """Every so many bins of the smoothed image."""
     smooth = cv2.GaussianBlur(image, (0, 0), sigmaX=level.beams, sigmaY=level.bins)
     return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
 
 
-def _warped(second: Floats, grid: _Grid, v: Doubles) -> tuple[Floats, Floats]:
-    """The second frame drawn as the first, were this the motion; and 1 where that is known, else 0 ``(bins, beams)``."""
+def _warped(second: Floats, grid: WindowGrid, v: Doubles) -> tuple[Floats, Floats]:
+    """Draw the second frame at the cells of the first, for a motion; and 1 where it is known, else 0 ``(bins, beams)``."""
     radius, bearing = grid.ground.to_polar(moved(grid.cells, v))
     row, column = _place(radius, grid.ground.range_m), _place(bearing, grid.ground.bearing_rad)
     bins, beams = second.shape
@@ -299,7 +180,7 @@ def _place(value: Floats, axis: Doubles) -> Floats:
     return np.interp(value, axis, np.arange(len(axis)), left=-1, right=len(axis)).astype(np.float32)
 
 
-def _flow(first: Floats, warped: Floats, inside: Floats, grid: _Grid) -> _Flow:
+def _flow(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> WindowFlow:
     """Lucas and Kanade's step in each window."""
     (by_row, by_column), (row_there, column_there) = (_slopes(image, inside) for image in (first, warped))
     row, column = (by_row + row_there) / 2, (by_column + column_there) / 2
@@ -324,7 +205,7 @@ def _flow(first: Floats, warped: Floats, inside: Floats, grid: _Grid) -> _Flow:
     )
     per = known / (noise + QUIET * noise.mean() + TINY)
     scale = per[..., None, None] / (grid.spacing[..., :, None] * grid.spacing[..., None, :])
-    return _Flow(cells * grid.spacing, _symmetric(rows, cross, columns) * scale, shared * scale)
+    return WindowFlow(cells * grid.spacing, _symmetric(rows, cross, columns) * scale, shared * scale)
 
 
 def _slopes(image: Floats, inside: Floats) -> tuple[Floats, Floats]:
@@ -334,8 +215,8 @@ def _slopes(image: Floats, inside: Floats) -> tuple[Floats, Floats]:
     return by_row * inside, by_column * inside
 
 
-def _in_windows(values: NDArray[Any], grid: _Grid) -> Doubles:
-    """Sums over the windows ``(n, m)``."""
+def _in_windows(values: NDArray[np.floating], grid: WindowGrid) -> Doubles:
+    """Sum over the windows ``(n, m)``."""
     sums = cv2.boxFilter(values, -1, grid.window[::-1], normalize=False, borderType=cv2.BORDER_CONSTANT)
     return sums[grid.centres].astype(np.float64)
 
@@ -345,106 +226,7 @@ def _symmetric(one: Doubles, cross: Doubles, other: Doubles) -> Doubles:
     return np.stack([np.stack([one, cross], axis=-1), np.stack([cross, other], axis=-1)], axis=-2)
 
 
-def _match_map(grid: _Grid, flow: _Flow, v: Doubles, height_std: float) -> _Match | None:
-    """Weighted robust least squares between the displacement map and the exact map of a motion; None where that is singular.
-
-    The unknowns are the motion and, unless ``height_std`` is 0, the height in parts of it.
-    """
-    found = grid.map(v) + flow.displacement
-    unknowns = grid.derivative if not height_std else np.concatenate([grid.derivative, grid.by_height(v)], axis=-1)
-    used = flow.information.any(axis=(2, 3))
-    if used.sum() < BLOCK * BLOCK:
-        return None
-    p = np.append(v, 0.0)[: unknowns.shape[-1]]
-    prior = np.zeros(len(p))
-    for _ in range(10):
-        misfit = found - grid.map(p[:3]) - (unknowns[..., 3:] @ p[3:])
-        pull = (flow.information @ misfit[..., None])[..., 0]
-        squared = np.maximum((misfit * pull).sum(axis=-1), 0)
-        usual = float(np.median(squared[used])) / 1.39 + TINY  # the median of chi-square with 2 degrees of freedom
-        prior[3:] = usual * BLOCK**2 / height_std**2 if height_std else 0.0
-        weight = 1 / (1 + squared / (CAUCHY * usual))
-        scores = _apply(unknowns, pull) * weight[..., None]
-        normal = _normal(unknowns, flow.information * weight[..., None, None]).sum(axis=(0, 1)) + np.diag(prior)
-        if not _regular(normal):
-            return None
-        step = np.linalg.solve(normal, scores.sum(axis=(0, 1)) - prior * p)
-        p = p + step
-        if (np.abs(step[:3]) < STILL / 10).all():
-            break
-    # robust scores rise by the weight's square, over both directions; noise is in either frame's slopes, not in the shared
-    normals = _normal(unknowns, flow.shared * (weight * weight)[..., None, None])
-    if not _regular(normals.sum(axis=(0, 1)) + np.diag(prior)):
-        return _Match(p[:3], None)
-    return _Match(p[:3], _covariance(normals, scores, prior, height_std))
-
-
-def _match_vector(grid: _Grid, flow: _Flow, v: Doubles) -> _Match | None:
-    """The motion whose modelled map has the same means in range and in bearing, and the same slope of the displacement in
-    range over bearing, as the displacement map; None where that is singular."""
-    found = grid.map(v) + flow.displacement
-    used = flow.information.any(axis=(2, 3))
-    count = int(used.sum())
-    if count < BLOCK * BLOCK:
-        return None
-    aside = np.where(used, grid.home[..., 1] - grid.home[..., 1][used].mean(), 0.0)
-    one, none = used.astype(float), np.zeros(used.shape)
-    # what each window adds to the vector: (n, m, 2, 3)
-    summary = np.stack([np.stack([one, none, aside], axis=-1), np.stack([none, one, none], axis=-1)], axis=-2) / count
-    slope = (np.swapaxes(summary, -1, -2) @ grid.derivative).sum(axis=(0, 1))
-    if np.linalg.matrix_rank(slope * SIZE) < 3:
-        return None
-    for _ in range(10):
-        scores = _apply(summary, found - grid.map(v))
-        step = np.linalg.solve(slope, scores.sum(axis=(0, 1)))
-        v = v + step
-        if (np.abs(step) < STILL / 10).all():
-            break
-    # noise in the slopes holds the flow back by this much
-    gain = np.linalg.pinv(flow.information, hermitian=True) @ flow.shared
-    normals = np.swapaxes(summary, -1, -2) @ gain @ grid.derivative
-    return _Match(v, _covariance(normals, scores, np.zeros(3), 0.0))
-
-
-def _apply(unknowns: Doubles, pull: Doubles) -> Doubles:
-    """What each window says of each unknown ``(n, m, unknowns)``."""
-    return (np.swapaxes(unknowns, -1, -2) @ pull[..., None])[..., 0]
-
-
-def _normal(unknowns: Doubles, information: Doubles) -> Doubles:
-    """Unknowns' information from each window ``(n, m, unknowns, unknowns)``."""
-    return np.asarray(np.swapaxes(unknowns, -1, -2) @ (information @ unknowns))
-
-
-def _regular(normal: Doubles) -> bool:
-    """Whether normal equations can be solved and have a maximum."""
-    size = np.sqrt(np.maximum(np.diag(normal), TINY))
-    eigenvalues = np.linalg.eigvalsh(normal / np.outer(size, size))
-    return bool(eigenvalues[0] > 1e-8 * eigenvalues[-1])
-
-
-def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: float) -> Doubles | None:
-    """Of the motion ``(3, 3)``, from how it changes when one block of windows is left out (jackknife), and from what was
-    assumed of the height; None where one block alone decides."""
-    each, said = _in_blocks(normals), _in_blocks(scores)
-    whole = each.sum(axis=0) + np.diag(prior)
-    try:
-        change = np.linalg.solve(whole - each, said[..., None])[..., 0]
-        assumed = np.linalg.solve(whole, np.diag(prior * height_std))
-    except np.linalg.LinAlgError:
-        return None
-    blocks = len(each)
-    return np.asarray((change.T @ change * (blocks - 1) / blocks + assumed @ assumed.T)[:3, :3])
-
-
-def _in_blocks(values: Doubles) -> Doubles:
-    """Sums over blocks of windows ``(blocks, ...)``."""
-    for axis in (0, 1):
-        values = np.add.reduceat(values, np.arange(0, values.shape[axis], BLOCK), axis=axis)
-    return values.reshape(-1, *values.shape[2:])
-
-
-def _correlation(first: Floats, warped: Floats, inside: Floats, grid: _Grid) -> float:
+def _correlation(first: Floats, warped: Floats, inside: Floats, grid: WindowGrid) -> float:
     """Of the frames as matched, within windows: what both have of shading over the whole image does not count."""
     one, other = first * inside, warped * inside
     count = np.maximum(_in_windows(inside, grid), 1)
@@ -456,19 +238,19 @@ def _correlation(first: Floats, warped: Floats, inside: Floats, grid: _Grid) -> 
     return float(together) / np.sqrt(both) if both > TINY else 0.0
 
 
-def _structure(flow: _Flow, grid: _Grid) -> Doubles:
+def _structure(flow: WindowFlow, grid: WindowGrid) -> Doubles:
     """How much each window says of displacements, in cells, where both frames agree ``(n, m)``."""
-    return np.maximum((np.diagonal(flow.shared, axis1=2, axis2=3) * grid.spacing**2).sum(axis=-1), 0)
+    return np.asarray(np.maximum((np.diagonal(flow.shared, axis1=2, axis2=3) * grid.spacing**2).sum(axis=-1), 0))
 
 
 def _blocks(structure: Doubles) -> float:
     """How many blocks hold the structure: their number if all hold as much, one if one holds all."""
-    each = _in_blocks(structure)
+    each = in_blocks(structure)
     return float(each.sum() ** 2 / max(float((each**2).sum()), TINY))
 
 
-def _unseen(grid: _Grid, structure: Doubles, elevation_fov_deg: float) -> float:
-    """The part of the structure whose ground points lie twice as far from the axis as the sonar sees."""
+def _unseen(grid: WindowGrid, structure: Doubles, elevation_fov_deg: float) -> float:
+    """Return the part of the structure whose elevation is more than twice that of the field of view."""
     drop = np.full((*grid.points.shape[:2], 1), -grid.ground.height_m)
     up = np.concatenate([grid.points, drop], axis=-1) @ grid.ground.turn[:, 2]
     far = np.abs(up) > grid.home[..., 0] * np.sin(np.radians(min(elevation_fov_deg, 90.0)))
@@ -476,7 +258,7 @@ def _unseen(grid: _Grid, structure: Doubles, elevation_fov_deg: float) -> float:
 
 
 def _rejection(fit: _Fit, blocks: float, unseen: float) -> str:
-    """Why not to believe an estimate; empty where nothing speaks against it."""
+    """Return the reason of a rejection; empty for a valid estimate."""
     if fit.covariance is None:
         return "no motion matches better than those around it"
     std = np.sqrt(np.diag(fit.covariance))

@@ -28,7 +28,7 @@ class GroundView:
 
     Args:
         frames: whose cells are projected.
-        standing: height over what is seen, pitch, roll.
+        attitude: height over what is seen, pitch, roll.
         cell_m: edge of a pixel; larger where the view would have more than a million.
     """
 
@@ -59,7 +59,7 @@ class GroundView:
         return float(left), float(right), float(near), float(far)
 
     @cached_property
-    def _places(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    def _pixel_positions(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Row and column in the frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
         left, right, near, far = self.reach
         x = np.arange(left, right, self.edge) + self.edge / 2
@@ -78,11 +78,11 @@ class GroundView:
 
         What lies around them is dark in every frame: an outline that moves with the sonar.
         """
-        return self._places[2]
+        return self._pixel_positions[2]
 
     def draw(self, image: Floats) -> Floats:
-        """A frame's image ``(bins, beams)`` seen from above ``(rows, columns)``; 0 outside the fan."""
-        row, column, _ = self._places
+        """Draw an image ``(bins, beams)`` as seen from above ``(rows, columns)``; 0 outside the fan."""
+        row, column, _ = self._pixel_positions
         if not row.size:
             return np.zeros((0, 0), dtype=np.float32)
         finer = self.edge / float(np.median(np.diff(self.frames.range_m)))
@@ -102,7 +102,7 @@ class GroundView:
         return np.column_stack([there[1] - there[0], there[2] - there[0], there[0]]).astype(np.float32)
 
     def motion(self, warp: NDArray[np.floating]) -> Motion:
-        """The motion behind a warp; :meth:`warp` goes the other way."""
+        """Return the motion of a warp, the inverse of :meth:`warp`."""
         yaw = float(np.arctan2(warp[0, 1], warp[0, 0]))
         still = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
         step = (warp[:, 2] - still[:, 2]) * self.edge

@@ -43,8 +43,8 @@ class Phase:
     """Registration by phase correlation of the frames as seen from above.
 
     Args:
-        height_m: over the ground, where the window shows no first echoes; default: what the frames say.
-        pitch_rad: default: what the frames say.
+        height_m: over the ground, where the window shows no first echoes; default: that of the frames.
+        pitch_rad: default: that of the frames.
     """
 
     height_m: float | None = None
@@ -55,7 +55,11 @@ class Phase:
     digest = ""
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion, and whether to believe it."""
+        """Estimate the motion; reject frames without anything to match.
+
+        Raises:
+            MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
+        """
         images = two_frames(frames)
         attitude = attitude_of(frames, "phase", self.height_m, self.pitch_rad)
         view = GroundView(frames, attitude, CELL_M)
@@ -83,7 +87,7 @@ def _window(inside: NDArray[np.bool_]) -> Floats:
 
 
 def _back(second: Floats, view: GroundView, motion: Motion) -> Floats:
-    """The second frame brought to where the first is."""
+    """Warp the second frame to the first."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(second, view.warp(motion), second.shape[::-1], flags=flags))
 
@@ -135,14 +139,14 @@ def _summit(three: NDArray[np.float64]) -> float:
 
 
 def _turned(motion: Motion, yaw: float) -> Motion:
-    """A motion followed by a turn on the spot: its steps are now along the new heading."""
+    """Compose a motion with a turn on the spot: its steps are now along the new heading."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     sideways, forward = motion.sideways * cos - motion.forward * sin, motion.sideways * sin + motion.forward * cos
     return Motion(float(sideways), float(forward), motion.yaw + yaw)
 
 
 def _shifted(motion: Motion, shift: tuple[float, float], view: GroundView) -> Motion:
-    """A motion less what still shows: features that lie off to starboard tell a motion to port."""
+    """Correct a motion by a residual shift: features displaced to starboard mean a motion to port."""
     warp = view.warp(motion).astype(float)
     warp[:, 2] += warp[:, :2] @ shift
     return view.motion(warp)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.learned.image_network import ImageNetwork
 from mitsonar.estimation.learned.view_network import ViewNetwork
 from mitsonar.records.sonar_frames import SonarFrames
@@ -33,28 +33,32 @@ class HeightEnsemble:
         MitsonarError: networks that read different things.
     """
 
-    networks: list[Any]
+    networks: Sequence[AnyEstimator]
     inputs: str = field(default="height, which chooses the network", init=False)
 
     def __post_init__(self) -> None:
-        reads = {(type(one), getattr(one, "views", None), one.kind) for one in self.networks}
-        if len(reads) != 1 or not all(isinstance(one, ImageNetwork | ViewNetwork) for one in self.networks):
+        reads = {(type(one), getattr(one, "views", None), one.kind) for one in self._members}
+        if len(reads) != 1 or len(self._members) != len(self.networks):
             said = "; ".join(sorted(f"{kind}s of {', '.join(views or ('one view',))}" for _, views, kind in reads))
             raise MitsonarError(f"networks that stand in for each other must read the same views: got {said}")
         ((_, self.views, self.kind),) = reads
 
     @property
+    def _members(self) -> list[ImageNetwork | ViewNetwork]:
+        return [one for one in self.networks if isinstance(one, ImageNetwork | ViewNetwork)]
+
+    @property
     def consumes(self) -> type:
-        """The class of records that its networks read."""
+        """Return the class of records that its networks read."""
         return ViewFrames if self.views else SonarFrames
 
     @property
     def digest(self) -> str:
-        """Of all its networks."""
+        """Return the digests of all networks."""
         return " ".join(one.digest for one in self.networks)
 
-    def estimate(self, frames: Any) -> Estimate:
-        """What the chosen network says.
+    def estimate(self, frames: SonarFrames | ViewFrames) -> Estimate:
+        """Estimate the motion with the chosen network.
 
         Raises:
             MitsonarError: frames without a height; as the network does.
@@ -65,15 +69,15 @@ class HeightEnsemble:
                 "the height chooses the network, and the frames tell none: measure it with --height-by direct"
             )
         height = float(known.mean())
-        estimate: Estimate = self.chosen(height).estimate(frames)
-        return estimate
+        network: AnyEstimator = self.chosen(height)
+        return network.estimate(frames)
 
-    def chosen(self, height_m: float) -> Any:
-        """The network whose heights of training are nearest, in ratio; of several, that with its middle nearest."""
+    def chosen(self, height_m: float) -> ImageNetwork | ViewNetwork:
+        """Return the network whose heights of training are nearest in ratio; of several, that whose middle is nearest."""
 
-        def away(network: Any) -> tuple[float, float]:
+        def away(network: ImageNetwork | ViewNetwork) -> tuple[float, float]:
             low, high = network.heights
             outside = max(np.log(low / height_m), np.log(height_m / high), 0.0)
             return float(outside), float(abs(np.log(height_m / np.sqrt(low * high))))
 
-        return min(self.networks, key=away)
+        return min(self._members, key=away)

@@ -1,15 +1,15 @@
-"""The estimator that a checkpoint is: a trained network between two frames and a motion, with doubts where they are due."""
+"""The estimator that a checkpoint is: a trained network between two frames and a motion, with checks of the result."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.datasets.ground_nodes import ground_of
@@ -19,6 +19,7 @@ from mitsonar.estimation.learned.trained_network import BEYOND, Trained, Trained
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.networks.checkpoint import Checkpoint
+from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.warp_grid import Ground, WarpGrid
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -58,7 +59,7 @@ class ImageNetwork(Trained):
 
     @property
     def consumes(self) -> type:
-        """The class of records that it reads."""
+        """Return the class of records that it reads."""
         return SonarFrames
 
     def __init__(
@@ -87,7 +88,7 @@ class ImageNetwork(Trained):
             )
 
     def estimate(self, frames: SonarFrames) -> Estimate:
-        """The motion that the network says, its covariance, and whether to believe it.
+        """Estimate the motion and its covariance.
 
         Raises:
             MitsonarError: not two frames, another sonar than that of training, frames without what the network needs.
@@ -97,7 +98,7 @@ class ImageNetwork(Trained):
             self._check_instrument(view, TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad))
         if any(blank(image) for image in images):
             return rejected("nothing in the frames to match")
-        attitude = self._standing(frames)
+        attitude = self._attitude_of(frames)
         if attitude is not None and attitude.reason:
             return rejected(attitude.reason)
         ground = {} if attitude is None else _batch(ground_of(frames, attitude))
@@ -114,14 +115,14 @@ class ImageNetwork(Trained):
             reason = _rejection_of_answer(images, ground, motion) if ground else self._rejection_of_match(frames, images)
         return Estimate(motion, covariance, not reason, reason)
 
-    def _standing(self, frames: SonarFrames) -> Attitude | None:
+    def _attitude_of(self, frames: SonarFrames) -> Attitude | None:
         """Height and pitch, for a network that is given them."""
         if not self._checkpoint.arrangement["ground"]:
             return None
         return attitude_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
 
-    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Any:
-        """What the network says of the frames, as a batch of one."""
+    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Tensor | GaussianHead:
+        """Return the answer of the network, a batch of one."""
         (view,) = self._checkpoint.arrangement["views"]
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
         return answer_of(self._network, (inputs, ground) if ground else inputs)
@@ -131,7 +132,7 @@ class ImageNetwork(Trained):
         (view,) = self._checkpoint.arrangement["views"]
         return self._arranged({view: (frames.range_m, frames.bearing_rad)})
 
-    # ---------------------------------------------------------------- doubts
+    # ---------------------------------------------------------------- rejections
 
     def _rejection_of_match(self, frames: SonarFrames, images: Pair) -> str:
         """Whether the frames show one place at all: they must be alike once shifted, as far as training's motions go."""
@@ -156,7 +157,7 @@ class ImageNetwork(Trained):
 
 
 def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
-    """A batch of one."""
+    """Return tensors of a batch of one."""
     return {name: torch.from_numpy(values)[None] for name, values in table.items()}
 
 
@@ -177,5 +178,5 @@ def smooth(image: NDArray[np.float32], step: int = 1) -> NDArray[np.float32]:
 
 
 def without_slow(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What is slow belongs to the sonar's lighting, not to the ground."""
+    """Remove what varies slowly: it belongs to the illumination, not to the ground."""
     return np.asarray(image - cv2.blur(image, (16, 16)), dtype=np.float32)

@@ -1,6 +1,6 @@
 """The ten classical regressors of Almanza-Medina, table 5.4, with scikit-learn in place of MATLAB's Regression Learner.
 
-They read flattened matrices of 5.2.5. What the thesis leaves unsaid is as the Regression Learner has it: features
+They read flattened matrices of 5.2.5. Details that Almanza-Medina does not give follow the Regression Learner: features
 standardised for support vector machines and Gaussian processes, box constraint and half width of the insensitive tube from
 the targets' interquartile range, kernel scale the root of the number of features (ours, MATLAB samples the data); boosting
 by least squares with a learning rate of 0.1 and trees of at most ten splits; bagged trees see all features. The Gaussian
@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ NORMAL_IQR = 1.349
 class Regression(Protocol):
     """What scikit-learn's regressors do."""
 
-    def fit(self, X: Array, y: Array) -> Any:
+    def fit(self, X: Array, y: Array) -> object:
         """Learn from features ``(n, features)`` and targets ``(n,)``."""
 
     def predict(self, X: Array) -> Array:
@@ -116,7 +116,7 @@ class Turned:
         return self
 
     def transform(self, X: Array) -> Array:
-        """Samples ``(n, f)`` in these directions ``(n, min(n, f) + 1)``."""
+        """Project samples ``(n, f)`` on these directions ``(n, min(n, f) + 1)``."""
         turned = (X - self.mean) @ self.axes
         rest = ((X - self.mean) ** 2).sum(axis=1) - (turned**2).sum(axis=1)
         return np.column_stack([turned, np.sqrt(np.maximum(rest, 0))])
@@ -178,7 +178,7 @@ def score_all(
     components: int | None = None,
     progress: Callable[[RegressionScore], object] = lambda score: None,
 ) -> list[RegressionScore]:
-    """Fit regressors and score them, in one direction: the thesis's forward unless told otherwise.
+    """Fit regressors and score them, in one direction; default: forward, as Almanza-Medina.
 
     Args:
         train: features ``(n, f)`` and displacements ``(n, 2 or 3)`` [m, m, rad] of :func:`flattened`.

@@ -1,4 +1,4 @@
-"""What all estimators that a checkpoint makes have in common: the network, its sonar, and doubts that need no images."""
+"""What all estimators that a checkpoint makes have in common: the network, its sonar, and rejections that need no images."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.datasets.arrangement import Arrangement
@@ -23,16 +23,31 @@ from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_errors import AXES, in_units
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
+from mitsonar.networks.gaussian_head import GaussianHead
+from mitsonar.networks.warp_grid import Ground
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
-__all__ = ["ANGLE_OFF_DEG", "BEYOND", "HEIGHT_OFF", "Trained", "TrainedInstrument", "answer_of", "inputs_of", "one_thread"]
+__all__ = [
+    "ANGLE_OFF_DEG",
+    "BEYOND",
+    "HEIGHT_OFF",
+    "NetworkInput",
+    "Trained",
+    "TrainedInstrument",
+    "answer_of",
+    "inputs_of",
+    "one_thread",
+]
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Ranges of the bins and bearings of the beams."""
+"""Ranges of the bins ``(bins,)`` [m] and bearings of the beams ``(beams,)`` [rad]."""
+
+NetworkInput = Tensor | tuple[Tensor | Ground, ...]
+"""What a network reads: a tensor, or a tuple of tensors and of the geometry of the ground."""
 
 BEYOND = 1.2
-"""Answers beyond the motions of training by this factor are not believed."""
+"""Factor by which a valid motion may exceed those of training."""
 
 HEIGHT_OFF, ANGLE_OFF_DEG = 0.1, 2.0
 """How far height, as part of it, and pitch and roll may be from those that training has fixed."""
@@ -67,7 +82,7 @@ class TrainedInstrument(NamedTuple):
         return cls(sonar.name, *size, window, math.degrees(span), sonar.elevation_fov_deg, sonar.bearing)
 
     def unlike(self, other: TrainedInstrument) -> str:
-        """The numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
+        """Return the numbers in which another differs: ``beams 128, not 96; ...``; empty where none does."""
         found = []
         for what in ("bins", "beams", "bearing"):
             if getattr(self, what) != getattr(other, what):
@@ -105,18 +120,19 @@ class Trained:
         return float(low), float(high)
 
     def _take(self, checkpoint: Checkpoint) -> None:
-        """What computes is no field: files and comparisons of options need the digest only."""
+        """Keep the network out of the fields: files and comparisons of options need the digest only."""
         self.digest, self.inputs = checkpoint.digest, inputs_of(checkpoint)
         self._checkpoint, self._network = checkpoint, checkpoint.build()
         self._trained = {view: TrainedInstrument.of(sonar) for view, sonar in checkpoint.sonars.items()}
         self._last: tuple[bytes, Arrangement] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """For other processes: torch would share its tensors through file descriptors."""
         return {**asdict(self), "content": self._checkpoint.to_bytes()}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: dict[str, object]) -> None:
         content = state.pop("content")
+        assert isinstance(content, bytes)
         vars(self).update(state)
         self._take(Checkpoint.from_bytes(content))
 
@@ -125,8 +141,8 @@ class Trained:
         """``image`` or ``vector``, that it reads."""
         return str(self._checkpoint.arrangement["kind"])
 
-    def _input_of_views(self, frames: ViewFrames) -> Any:
-        """What the network reads of the pings of its views, a batch of one.
+    def _input_of_views(self, frames: ViewFrames) -> NetworkInput:
+        """Return the input of the network from the pings of its views, a batch of one.
 
         Raises:
             MitsonarError: views that are not there, or of another sonar than that of training.
@@ -144,7 +160,8 @@ class Trained:
         if frames.kind == "vector":  # noise has been drawn before
             values |= {f"nonzero_{view}": torch.zeros_like(one, dtype=torch.int32) for view, one in values.items()}
         axes = {view: (frames.sonars[view].range_m, frames.bearing_rad[view]) for view in names}
-        return self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+        inputs: NetworkInput = self._arranged(axes)(values, torch.arange(len(frames))[None], 0)
+        return inputs
 
     def _check_instrument(self, view: str, has: TrainedInstrument) -> None:
         """Refuse another sonar than that of training, unless it is forced."""
@@ -169,7 +186,7 @@ class Trained:
             self._last = key, made
         return self._last[1]
 
-    # ---------------------------------------------------------------- doubts
+    # ---------------------------------------------------------------- rejections
 
     def _rejection_of_geometry(self, frames: SonarFrames | ViewFrames) -> str:
         """Whether the sonar stood as in training, as far as the frames tell; networks that are given it need not."""
@@ -208,18 +225,19 @@ class Trained:
 
 
 def inputs_of(checkpoint: Checkpoint) -> str:
-    """What a network is given beside the images, for tables."""
+    """Return what a network needs beside the images, for tables."""
     return INPUTS if checkpoint.arrangement["ground"] else f"nothing; {checkpoint.fixed} fixed by training"
 
 
-def answer_of(network: nn.Module, inputs: Any) -> Any:
-    """What a network answers; several inputs come as a tuple.
+def answer_of(network: nn.Module, inputs: NetworkInput) -> Tensor | GaussianHead:
+    """Run a network; several inputs come as a tuple.
 
     Raises:
         MitsonarError: inputs of a size that it cannot take.
     """
     try:
-        return called(network, inputs)
+        answer: Tensor | GaussianHead = called(network, inputs)
+        return answer
     except MitsonarError:
         raise
     except (RuntimeError, TypeError, ValueError, IndexError, AttributeError) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, rejected
+from mitsonar.estimation.estimator import Estimate, Record, rejected
 from mitsonar.estimation.learned.trained_network import Trained, answer_of, one_thread
 from mitsonar.instruments.views import SEGMENTS
 from mitsonar.motion.composition import Motion
@@ -54,7 +54,7 @@ class ViewNetwork(Trained):
 
     @property
     def consumes(self) -> type:
-        """The class of records that it reads."""
+        """Return the class of records that it reads."""
         return ViewFrames
 
     def __init__(self, checkpoint: Checkpoint, *, force: bool = False) -> None:
@@ -68,19 +68,19 @@ class ViewNetwork(Trained):
 
     @property
     def views(self) -> tuple[str, ...]:
-        """Names of the views that it reads."""
+        """Return the names of the views that it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
-    def estimate(self, frames: Any) -> Estimate:
-        """The motion between two pings, its covariance by validation, and whether to believe it.
+    def estimate(self, records: Record) -> Estimate:
+        """Estimate the motion between two pings, with the covariance of validation.
 
         Args:
-            frames: two :class:`~mitsonar.records.view_frames.ViewFrames`.
+            records: two :class:`~mitsonar.records.view_frames.ViewFrames`.
 
         Raises:
             MitsonarError: not two pings of these views, another sonar than that of training.
         """
-        self._check_views(frames)
+        frames = self._checked_views(records)
         inputs = self._input_of_views(frames)
         profiles = frames.profiles()
         if not np.isfinite(profiles).all():
@@ -96,8 +96,8 @@ class ViewNetwork(Trained):
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
         return Estimate(motion, covariance, not reason, reason)
 
-    def _check_views(self, frames: Any) -> None:
-        """Two pings of views that it reads."""
+    def _checked_views(self, frames: Record) -> ViewFrames:
+        """Check that there are two pings of the views that it reads."""
         views = ", ".join(self.views)
         if not isinstance(frames, ViewFrames):
             raise MitsonarError(
@@ -106,6 +106,7 @@ class ViewNetwork(Trained):
             )
         if len(frames) != 2 or any(view not in frames.values for view in self.views):
             raise MitsonarError(f"two pings of {views} are needed: got {len(frames)} of {', '.join(frames.values)}")
+        return frames
 
 
 def _rejection_of_profiles(profiles: NDArray[np.float32]) -> str:

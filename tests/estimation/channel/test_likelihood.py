@@ -10,7 +10,8 @@ import pytest
 from points import PointGround, run
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.channel.likelihood import Likelihood, judged
+from mitsonar.estimation.channel.likelihood import Likelihood
+from mitsonar.estimation.channel.motion_score import judged
 from mitsonar.estimation.channel.motion_search import receiver_bands_of
 from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz, link_response
 from mitsonar.estimation.channel.sub_bands import bands_of
@@ -194,7 +195,8 @@ def test_likelihood_reaches_its_limit() -> None:
     """Motions that are not ambiguous: normalised errors of 24 pairs about 1."""
     rng, normalised = np.random.default_rng(0), []
     for seed in range(24):
-        motion = Motion(*rng.uniform(-0.02, 0.02, 2), 0.0)
+        sideways, forward = rng.uniform(-0.02, 0.02, 2).tolist()
+        motion = Motion(sideways, forward, 0.0)
         answer = Likelihood(speed=SPEED).estimate(pair(motion, seed=100 + seed, noise=1e-4))
         error = (np.array(answer.motion) - motion)[:2]
         assert answer.covariance is not None

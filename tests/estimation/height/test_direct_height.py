@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import DOWN, Command, floor, floor_levels, refused, scene, tiny_recipe
+from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.datasets.generation import make_dataset
@@ -24,7 +25,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.measured_heights import measured
-from mitsonar.mapping.odometry import estimate_motions
+from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.view_source import open_views
 from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
@@ -111,12 +112,12 @@ def test_what_stands_on_the_floor_does_not_lift_it() -> None:
     assert abs(DirectHeight().height(vector).height_m - found.height_m) < 1e-6
 
 
-def about(sonar: Sonar) -> tuple[Any, Any]:
+def about(sonar: Sonar) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Time and pose of a frame that looks straight down."""
     return np.zeros(1), np.array([[0, 0, 2.5, np.radians(90), 0, 0]])
 
 
-def frame_of(image: Any, sonar: Sonar) -> SonarFrames:
+def frame_of(image: NDArray[np.floating], sonar: Sonar) -> SonarFrames:
     time_s, poses = about(sonar)
     return SonarFrames(image, sonar.range_m, sonar.bearing_rad, time_s, sonar, poses)
 
@@ -179,6 +180,7 @@ def test_measured_heights_hide_the_true_ones() -> None:
     empty = replace(pings, image=np.where(np.arange(3)[:, None, None] == 1, 0, pings.image))
     found, said = measured(empty, DirectHeight())
     assert [one.valid for one in said] == [True, False, True]
+    assert found.height_m is not None
     np.testing.assert_array_equal(np.isfinite(found.height_m), [True, False, True])
 
 
@@ -198,9 +200,11 @@ def test_frames_that_tell_no_height_are_bridged() -> None:
 class Told:
     """An estimator that needs a height, and says nothing else."""
 
+    consumes = SonarFrames
     inputs = "height"
+    digest = ""
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames, /) -> Estimate:
         assert frames.height_m is not None
         assert np.isfinite(frames.height_m).any()
         return Estimate(Motion(0.0, 0.0, 0.0))
@@ -271,10 +275,10 @@ class TestNetworks:
         assert "vectors of whole, c2" in done.stdout
         for answer, believed in ((0.5, True), (1.05, True), (1.2, False), (-0.2, False)):
             far = HeightNetwork(kept)
-            far._network = lambda inputs, place=answer: self.torch.tensor([[20.0 * place - 10.0]])
-            said = far.height(source.read([0]))
-            assert said.valid is believed
-            assert ("beyond the heights of training" in said.reason) is not believed
+            vars(far)["_network"] = lambda inputs, place=answer: self.torch.tensor([[20.0 * place - 10.0]])
+            one = far.height(source.read([0]))
+            assert one.valid is believed
+            assert ("beyond the heights of training" in one.reason) is not believed
         level = source.read([0])
         assert level.poses is not None
         tilted = replace(level, poses=level.poses - [0, 0, 0, 0.2, 0, 0])
@@ -282,7 +286,7 @@ class TestNetworks:
         blank = replace(level, values={view: 0 * one for view, one in level.values.items()})
         assert "nothing in the frame" in estimator.height(blank).reason
         motions = self.trained(heights, tmp_path / "motions", input={"kind": "vector", "views": ["c1"]})
-        with pytest.raises(MitsonarError, match="tells motions of 2 frames, not heights"):
+        with pytest.raises(MitsonarError, match="estimates motions of 2 frames, not heights"):
             HeightNetwork(motions)
 
     def test_the_network_trained_nearest_to_the_height_answers(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -30,7 +32,7 @@ def ground(seed: int) -> NDArray[np.float64]:
     """Reflectivity of 20 x 20 m, even in 0.2..0.5, correlated over some 4 cm; x = y = 0 is the middle of the array."""
     values = np.random.default_rng(seed).uniform(0, 1, (1000, 1000))
     smooth = ndimage.gaussian_filter(values, 2)
-    return 0.2 + 0.3 * special.ndtr((smooth - smooth.mean()) / smooth.std())
+    return np.asarray(0.2 + 0.3 * special.ndtr((smooth - smooth.mean()) / smooth.std()))
 
 
 def painted(motion: Motion, sonar: Sonar, seeds: tuple[int, int] = (1, 1), pose: Pose = START) -> SonarFrames:
@@ -76,7 +78,9 @@ def test_sign_and_size_of_each_axis(axis: int, sign: int, size: float) -> None:
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 @pytest.mark.parametrize("match", ["map", "vector"])
 @pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, -1), (1, -1, -1)])
-def test_all_three_at_once_for_both_bearings_and_matches(bearing: str, match: str, signs: tuple[int, int, int]) -> None:
+def test_all_three_at_once_for_both_bearings_and_matches(
+    bearing: str, match: Literal["map", "vector"], signs: tuple[int, int, int]
+) -> None:
     motion = np.array(signs) * [0.1, 0.1, np.radians(2)]
     sonar = Sonar.create(bearing=bearing, beam_layout="sine" if bearing == "cone" else "even")
     found = Flow(match=match, relief_m=0).estimate(painted(Motion(*motion), sonar))
@@ -138,7 +142,7 @@ def test_nothing_to_match_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize("geometry", [{"height_m": 1.2}, {"height_m": 6.0}, {"pitch_rad": 0.2}, {"pitch_rad": 1.1}])
-def test_badly_wrong_geometry_is_not_believed(geometry: dict[str, float]) -> None:
+def test_badly_wrong_geometry_is_not_believed(geometry: dict[str, Any]) -> None:
     found = Flow(**geometry).estimate(painted(Motion(0.01, 0.02, 0.005), Sonar()))
     assert not found.valid
 
@@ -150,7 +154,7 @@ def test_what_is_missing_or_wrong_is_said() -> None:
     with pytest.raises(MitsonarError, match="height must be above 0: got -1 m"):
         Flow(height_m=-1)
     with pytest.raises(MitsonarError, match="match must be map or vector: got 'grid'"):
-        Flow(match="grid")
+        Flow(match="grid")  # type: ignore[arg-type]  # what the type forbids is tested
     with pytest.raises(MitsonarError, match="height_std must be 0 or more"):
         Flow(height_std=-0.1)
     with pytest.raises(MitsonarError, match="takes two frames: got 1"):

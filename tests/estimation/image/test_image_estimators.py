@@ -35,7 +35,7 @@ pytestmark = [
 
 START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
 UNITS = np.array([1e3, 1e3, 180 / np.pi])
-CLASSICAL = [name for name, made in ESTIMATORS.items() if made.consumes is SonarFrames]
+CLASSICAL = [name for name in ESTIMATORS if create_estimator(name).consumes is SonarFrames]
 METHODS = [*CLASSICAL, *(pytest.param(name, marks=pytest.mark.learn) for name in SHIPPED)]
 
 ALLOWED = {
@@ -89,7 +89,7 @@ def two(simulator: Simulator, motion: Motion, noise: str = "none", start: Pose =
 
 def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
     """The frames with some fields replaced."""
-    return SonarFrames(**{**vars(frames), **fields})  # type: ignore[arg-type]
+    return SonarFrames(**{**vars(frames), **fields})
 
 
 # ---------------------------------------------------------------- signs and sizes

@@ -131,7 +131,8 @@ ROWS = ((256, 32), (128, 64), (64, 128), (32, 256), (16, 512), (8, 512), (4, 512
 def test_the_layers_are_those_of_the_table(columns: int) -> None:
     network = create_network("posenetvec", size=[512, columns]).eval()
     shapes: list[tuple[str, tuple[int, ...]]] = []
-    for layer in network.layers:
+    layers = network.get_submodule("layers")
+    for layer in layers.children():
         layer.register_forward_hook(lambda one, _, out: shapes.append((type(one).__name__, tuple(out.shape[1:]))))
     with torch.no_grad():
         assert network(torch.rand(2, 1, 512, columns)).shape == (2, 3)
@@ -139,7 +140,9 @@ def test_the_layers_are_those_of_the_table(columns: int) -> None:
     names = [name for name, _ in shapes]
     assert names.count("BatchNorm2d") == names.count("ReLU") == 8
     assert names[-1] == "SameAverage"
-    kernels = [tuple(part.weight.shape[-2:]) for part in network.layers if type(part).__name__ == "SameConv2d"]
+    kernels = [
+        tuple(part.get_parameter("weight").shape[-2:]) for part in layers.children() if type(part).__name__ == "SameConv2d"
+    ]
     assert kernels == [(7, 2), (5, 2), *[(3, 2)] * 7]
     assert sum(part.numel() for part in network.parameters()) == 13_649_283 + (columns - 2) * 3072  # docs/guides/networks.md
 
@@ -319,7 +322,7 @@ def test_recipes_of_the_chapter(name: str) -> None:
 
 
 def test_samples_dealt_out_one_by_one_are_on_both_sides(portions: Path) -> None:
-    """The thesis's shuffle: half of what is validated shares a sequence, and so its motion, with what was learnt."""
+    """Almanza-Medina's shuffle: half of what is validated shares a sequence, and so its motion, with what was learnt."""
     split = {"by": "sample", "train": 0.75, "validation": 0.25}
     parts = [SonarPairs(portions, part=part, split=split) for part in ("train", "validation")]
     firsts = [set(pairs.first.tolist()) for pairs in parts]
@@ -382,6 +385,8 @@ def test_a_network_of_views_doubts_what_does_not_belong_together(portions: Path,
     assert "correlate by" in _rejection_of_profiles(strangers)
     blank = replace(pair, values={view: np.zeros_like(one) for view, one in pair.values.items()})
     assert network.estimate(blank).reason == "nothing in the frames to match"
+    assert pair.height_m is not None
+    assert pair.poses is not None
     high = network.estimate(replace(pair, height_m=pair.height_m * 3, poses=pair.poses * [1, 1, 3, 1, 1, 1]))
     assert "the sonar stood at" in high.reason
     with pytest.raises(MitsonarError, match="two pings of c2, c1, c3, c4 are needed: got 3"):

@@ -1,0 +1,172 @@
+"""An estimator over all pairs of consecutive frames of a run, in this process or in several."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record, rejected
+from mitsonar.mapping.measured_heights import without_height
+from mitsonar.mapping.open_source import Source
+
+__all__ = ["estimate_motions"]
+
+Index = NDArray[np.intp]
+
+PAIRS_A_BATCH = 8
+"""Pairs that a worker gets at a time, and that a kill may cost."""
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def estimate_motions(
+    source: Source,
+    estimator: AnyEstimator,
+    frames: ArrayLike,
+    *,
+    workers: int = 1,
+    known: Mapping[int, Estimate] | None = None,
+    keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
+    progress: Callable[[int], None] = lambda pairs: None,
+) -> list[Estimate]:
+    """Estimate the motion of each pair of consecutive frames; only a few frames are in memory at a time.
+
+    Args:
+        source: of the frames.
+        estimator: estimates the motion between two frames.
+        frames: numbers of the frames ``(n,)``; pair k holds the k-th and the next of them.
+        workers: processes beside this one, with one thread each; 1: none.
+        known: estimates of an earlier run, by the number of their pair.
+        keep: called with the number and the estimate of each new pair, in order.
+        progress: called with the number of pairs that were added.
+
+    Raises:
+        MitsonarError: frames that cannot be read, or that lack what the estimator needs; a worker that was lost.
+    """
+    numbers = np.asarray(frames, dtype=np.intp)
+    estimates = {pair: estimate for pair, estimate in (known or {}).items() if pair < len(numbers) - 1}
+    if estimates:
+        progress(len(estimates))
+    batches = _batches([pair for pair in range(len(numbers) - 1) if pair not in estimates])
+    made = _made_here if workers <= 1 else _made_beside
+    with closing(made(source, estimator, numbers, batches, workers)) as found:
+        for batch, answers in found:
+            for pair, answer in zip(batch, answers, strict=True):
+                estimates[pair] = answer
+                keep(pair, answer)
+            progress(len(batch))
+    return [estimates[pair] for pair in range(len(numbers) - 1)]
+
+
+def _batches(pairs: list[int]) -> list[range]:
+    """Group consecutive pairs, a few at a time."""
+    batches: list[range] = []
+    for pair in pairs:
+        if batches and batches[-1].stop == pair and len(batches[-1]) < PAIRS_A_BATCH:
+            batches[-1] = range(batches[-1].start, pair + 1)
+        else:
+            batches.append(range(pair, pair + 1))
+    return batches
+
+
+def _made_here(
+    source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
+) -> Generator[tuple[range, list[Estimate]]]:
+    """Estimate in this process."""
+    with _one_opencv_thread():
+        for batch in batches:
+            yield batch, _estimates(estimator, source.read(numbers[batch.start : batch.stop + 1]))
+
+
+def _made_beside(
+    source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
+) -> Generator[tuple[range, list[Estimate]]]:
+    """Estimate in new processes; this one reads the frames."""
+    with _one_thread_each():
+        pool = ProcessPoolExecutor(
+            min(workers, max(1, len(batches))), multiprocessing.get_context("spawn"), _begin_worker, (estimator,)
+        )
+        waiting: deque[tuple[range, Future[list[Estimate]]]] = deque()
+        try:
+            for batch in batches:
+                waiting.append((batch, pool.submit(_in_worker, source.read(numbers[batch.start : batch.stop + 1]))))
+                if len(waiting) > 2 * workers:
+                    first, answers = waiting.popleft()
+                    yield first, answers.result()
+            while waiting:
+                first, answers = waiting.popleft()
+                yield first, answers.result()
+        except BrokenProcessPool:
+            raise MitsonarError(
+                "a worker was lost: it was killed, or the memory did not suffice; go on with fewer workers"
+            ) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _estimates(estimator: AnyEstimator, frames: Record) -> list[Estimate]:
+    """Estimate each pair of consecutive frames or pings."""
+    pairs = [frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)]
+    return [rejected("no height was found in the frames") if without_height(p) else estimator.estimate(p) for p in pairs]
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    had = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(had)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Make new processes compute with one thread: libraries read these variables when they are loaded."""
+    had = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        yield
+    finally:
+        for name, value in had.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+_worker: AnyEstimator
+"""The estimator of this process, where it is a worker."""
+
+
+def _begin_worker(estimator: AnyEstimator) -> None:
+    global _worker
+    _worker = estimator
+    cv2.setNumThreads(1)
+    # Ctrl-C reaches all processes of a terminal: the first one stops the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent was killed; it would wait forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _in_worker(frames: Record) -> list[Estimate]:
+    return _estimates(_worker, frames)
