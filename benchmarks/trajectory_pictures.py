@@ -10,7 +10,8 @@ import numpy as np
 from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 
 from mitsonar.io.whole_files import write_whole
-from mitsonar.mapping.mosaic import ILLUMINATION_FRAMES, Mosaic, build_mosaic, illumination
+from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
+from mitsonar.mapping.mosaic import Mosaic, build_mosaic
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import GAMMA
 from mitsonar.records.sonar_frames import SonarFrames

@@ -42,7 +42,7 @@ def presets(
 
 
 def _accuracy(names: list[str]) -> list[str]:
-    """The measured errors of each quality, preset by preset."""
+    """Return the measured errors of each quality, preset by preset."""
     from mitsonar.instruments.quality import measured_errors
 
     about, measured = measured_errors()

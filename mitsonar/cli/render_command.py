@@ -86,7 +86,7 @@ def render(
 
 
 def scene_parameters(pairs: list[str]) -> dict[str, str]:
-    """What -D says."""
+    """Return what -D says, by name."""
     wrong = [pair for pair in pairs if "=" not in pair]
     if wrong:
         raise MitsonarError(f"-D takes NAME=VALUE: got {wrong[0]!r}")
@@ -94,7 +94,7 @@ def scene_parameters(pairs: list[str]) -> dict[str, str]:
 
 
 def sonar_changes(pairs: list[str], quality: str | None) -> dict[str, Any]:
-    """What --set and --quality change of a sonar."""
+    """Return what --set and --quality change of a sonar."""
     wrong = [pair for pair in pairs if "=" not in pair]
     if wrong:
         raise MitsonarError(f"--set takes KEY=VALUE: got {wrong[0]!r}")
@@ -109,7 +109,7 @@ def sonar_changes(pairs: list[str], quality: str | None) -> dict[str, Any]:
 def _instrument(
     scene: Any, name: str | None, model: str | None, seed: int | None, changes: dict[str, Any] | None = None
 ) -> tuple[Sonar, Pose | None]:
-    """The sonar to use and the pose that the scene gives it."""
+    """Return the sonar to use and the pose that the scene gives it."""
     from mitsonar.instruments.named_sonars import load_sonar
     from mitsonar.simulation.scene import sonar_in
 
@@ -141,7 +141,7 @@ def _path(
     file: Path | None,
     frame: str,
 ) -> Trajectory:
-    """The poses that the options say."""
+    """Return the poses that the options say."""
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import shipped_trajectory

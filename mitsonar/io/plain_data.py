@@ -135,7 +135,7 @@ def whole_number(value: object, name: str, low: int = 0, high: int = LARGEST_COU
 
 
 def finite_number(value: Any, name: str, above: float = -math.inf, below: float = math.inf) -> float:
-    """A number of a file as a float.
+    """Check that a value of a file is a finite number, and return it as a float.
 
     Raises:
         MitsonarError: it is none, not finite, or not between ``above`` and ``below``.

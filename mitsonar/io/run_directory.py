@@ -150,7 +150,7 @@ class RunDirectory:
         self.note(**notes)
 
     def count(self, name: str, most: int) -> int:
-        """A note that counts, 0 where there is none.
+        """Return a note that counts, 0 where there is none.
 
         Raises:
             MitsonarError: it exceeds ``most``.
@@ -161,7 +161,7 @@ class RunDirectory:
             raise self.damage(error) from None
 
     def amount(self, name: str) -> float | None:
-        """A note that is a number above 0, None where there is none.
+        """Return a note that is a number above 0, None where there is none.
 
         Raises:
             MitsonarError: it is 0 or less.
@@ -172,7 +172,7 @@ class RunDirectory:
             raise self.damage(error) from None
 
     def damage(self, said: object) -> MitsonarError:
-        """The error that says of what is wrong with the run's file what can be done."""
+        """Return the error that says of what is wrong with the run's file what can be done."""
         do = "begin anew with --overwrite" if self.kind.replaced else "remove the folder"
         return MitsonarError(f"{self.path / RUN_FILE} is damaged ({said}): {do}, or choose another -o")
 
@@ -212,7 +212,7 @@ def _holds_a_run(path: Path) -> bool:
 
 
 def _read(path: Path, kind: RunKind, *, damaged_will_do: bool = False) -> RunDirectory:
-    """The run in a folder, every value of its type; of a damaged one that will be replaced, only the kind."""
+    """Read the run in a folder, every value of its type; of a damaged one that will be replaced, only the kind."""
     told = read_json(path / RUN_FILE, check=False)
     if told.get("kind") != kind.name:
         raise MitsonarError(f"{path} holds no {kind.name} of mitsonar and is kept as it is: choose another -o")
@@ -236,7 +236,7 @@ NAMES: dict[type, str] = {bool: "true or false", str: "a text", dict: "an object
 
 
 def _check(told: dict[str, Any], kind: RunKind) -> None:
-    """That a file's keys are those of a kind of run, and its values what they must be.
+    """Check that a file's keys are those of a kind of run, and its values what they must be.
 
     Raises:
         MitsonarError: one is not.
@@ -253,7 +253,7 @@ def _check(told: dict[str, Any], kind: RunKind) -> None:
 
 
 def _check_value(value: Any, name: str, expected: type | UnionType) -> None:
-    """That a value of the file is what is expected."""
+    """Check that a value of the file is what is expected."""
     if isinstance(expected, UnionType):
         known, _ = get_args(expected)
         if value is not None:

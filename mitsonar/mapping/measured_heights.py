@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["measured", "without_height"]
 
-Framed = TypeVar("Framed", "SonarFrames", "ViewFrames")
+Framed = TypeVar("Framed", bound="SonarFrames | ViewFrames")
 
 
 def measured(

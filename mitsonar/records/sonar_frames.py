@@ -105,7 +105,7 @@ class SonarFrames:
         return None if self.poses is None else self.poses[:, 3]
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
-        """Some of the frames."""
+        """Return some of the frames."""
         picked = {name: getattr(self, name)[index] for name in PER_FRAME if getattr(self, name) is not None}
         rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
         return SonarFrames(**picked, **rest)
@@ -200,7 +200,7 @@ def _texts(names: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
 
 
 def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:
-    """The arrays of frames against each other and against what they may be.
+    """Check the arrays of frames against each other and against what they may be.
 
     Raises:
         MitsonarError: types, shapes or values that cannot be.

@@ -118,7 +118,10 @@ class Simulator:
         return looks
 
     def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
-        """The fused launch, traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python."""
+        """Compile the fused launch.
+
+        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python.
+        """
         import drjit as dr
 
         from mitsonar.simulation.binning import accumulate, develop, strongest

@@ -288,7 +288,7 @@ class StoredEchoes:
             yield RenderedPings(number, levels, counts, self.height_m[number : number + 1])
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
-        """The echoes of one frame's EXR."""
+        """Read the echoes of one frame's EXR."""
         return load_exr(self.folder / "echoes" / f"{ping:06d}.exr", self.traced)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
@@ -308,7 +308,7 @@ def _frames_of(
     gain: float,
     names: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
-    """A batch as frames, and its images before noise."""
+    """Return a batch as frames, and its images before noise."""
     image = to_image(pings, gain)
     numbers = np.arange(pings.first, pings.first + len(pings))
     frames = SonarFrames(

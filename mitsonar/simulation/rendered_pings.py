@@ -42,7 +42,7 @@ class RenderedPings:
 
 
 def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[RenderedPings]]:
-    """The gain that lifts the 99.9th percentile of all pixels of the first 20 frames to 0.9, and all the batches again.
+    """Find the gain that lifts the 99.9th percentile of all pixels of the first 20 frames to 0.9, and all the batches again.
 
     Where that percentile is empty the largest pixel takes its place; where all pixels are, the gain is 1.
     """
@@ -56,5 +56,6 @@ def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[Ren
 
 
 def to_image(pings: RenderedPings, gain: float) -> NDArray[np.float32]:
-    """Levels times gain, clipped to 0..1."""
-    return np.clip(pings.levels * np.float32(gain), 0, 1)
+    """Return levels times gain, clipped to 0..1."""
+    image: NDArray[np.float32] = np.clip(pings.levels * np.float32(gain), 0, 1)
+    return image

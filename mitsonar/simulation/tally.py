@@ -52,11 +52,11 @@ class Tally:
             self.worst = int(outside.max()), pings.first + int(outside.argmax())
 
     def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
-        """A sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
+        """Return a sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
         return list(self.findings(source, poses).values())
 
     def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0) -> dict[str, str]:
-        """The sentences of :meth:`warnings`, each by the name of what it is about.
+        """Return the sentences of :meth:`warnings`, each by the name of what it is about.
 
         Args:
             source: finds the ranges of the worst frame.
@@ -100,7 +100,7 @@ class Tally:
 
     @classmethod
     def restore(cls, sonar: Sonar, state: dict[str, Any]) -> Tally:
-        """The tally of a run that was broken off, as JSON gives it back.
+        """Restore the tally of a run that was broken off, as JSON gives it back.
 
         Raises:
             MitsonarError: the state is damaged.

@@ -83,7 +83,7 @@ def test_the_command_line_says_so(mitsonar: Command, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "frames are empty" in done.stderr
     checked = mitsonar("dataset", "check", tmp_path / "x.zarr")
-    refused(checked, "1 faults", "empty frames stay until the recipe is another")
+    refused(checked, "1 faults", "empty frames stay until the recipe changes")
     assert "frames are empty, without a single echo" in checked.stdout
     small = {**yaml.safe_load((tmp_path / "mine.yaml").read_text())}
     small["world"]["size_m"] = 60.0

@@ -17,7 +17,8 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
-from mitsonar.simulation.imaging import RenderedPings, Simulator
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.rendered_pings import RenderedPings
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -12,7 +12,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_subject import Subject
 from mitsonar.estimation.crlb.image_crlb import LAWS, Bound, bounds_at, overall, varied
 from mitsonar.estimation.estimator import PlainTable
-from mitsonar.simulation.imaging import CALIBRATION_FRAMES, RenderedPings, Simulator, constant_gain
+from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 
 __all__ = ["Table", "Value", "bounds_of_subject", "report_lines", "report_of"]
