@@ -18,7 +18,7 @@ from mitsonar.records.sonar_frames import SonarFrames
 __all__ = [
     "LONGEST_SIDE",
     "RAYS",
-    "Fan",
+    "FrameFan",
     "band_limited",
     "checked_heights",
     "checked_poses",
@@ -42,7 +42,7 @@ LONGEST_SIDE = 32_766
 
 
 @dataclass(frozen=True)
-class Fan:
+class FrameFan:
     """The geometry of one frame over the ground, and half of its elevation field of view [rad]."""
 
     ground: GroundGeometry
@@ -128,14 +128,14 @@ def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
 # ---------------------------------------------------------------- geometry of one frame
 
 
-def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> Fan:
+def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> FrameFan:
     """Return the geometry of a frame at a pose and a height [m] over the ground."""
     at = Pose(*pose)
     ground = GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, float(height), at.pitch, at.roll)
-    return Fan(ground, math.radians(frames.sonar.elevation_fov_deg) / 2)
+    return FrameFan(ground, math.radians(frames.sonar.elevation_fov_deg) / 2)
 
 
-def middle_beams(fan: Fan, image: Floats, beams: int) -> tuple[Fan, Floats]:
+def middle_beams(fan: FrameFan, image: Floats, beams: int) -> tuple[FrameFan, Floats]:
     """Return the fan and the image ``(bins, beams)`` of the beams in the middle alone."""
     first = max(0, (image.shape[1] - beams) // 2)
     middle = slice(first, first + beams)
@@ -143,7 +143,7 @@ def middle_beams(fan: Fan, image: Floats, beams: int) -> tuple[Fan, Floats]:
     return replace(fan, ground=ground), np.ascontiguousarray(image[:, middle])
 
 
-def ground_outline(fan: Fan) -> NDArray[np.float64] | None:
+def ground_outline(fan: FrameFan) -> NDArray[np.float64] | None:
     """Return ground points ``(n, 2)`` in heading axes around all that a frame can show; None where it shows no ground.
 
     Rays that meet the ground beyond the far end of the window, or never, end where the window ends.

@@ -19,7 +19,7 @@ from mitsonar.geometry.ground_plane import moved
 from mitsonar.mapping.frame_footprint import (
     LONGEST_SIDE,
     RAYS,
-    Fan,
+    FrameFan,
     band_limited,
     checked_heights,
     checked_poses,
@@ -171,7 +171,7 @@ class Mosaic:
             )
         return np.asarray(images / self.illumination.astype(np.float32))
 
-    def _lay(self, image: Floats, fan: Fan, pose: Array) -> bool:
+    def _lay(self, image: Floats, fan: FrameFan, pose: Array) -> bool:
         """Add one image ``(bins, beams)``; return whether it showed any ground."""
         box = self._footprint(fan, pose)
         if box is None:
@@ -195,7 +195,7 @@ class Mosaic:
         about = np.stack(np.meshgrid(x.astype(np.float32), y.astype(np.float32)), axis=-1)
         return np.asarray(moved(about, (0.0, 0.0, pose[5])))
 
-    def _weights(self, fan: Fan, points: Floats, radius: Floats, bearing: Floats) -> Floats:
+    def _weights(self, fan: FrameFan, points: Floats, radius: Floats, bearing: Floats) -> Floats:
         """Return the weight of each cell ``(rows, columns)``; 0 where the frame does not show it."""
         across = from_middle(bearing, *fan.sector)
         elevation = from_middle(fan.ground.elevation(points), -fan.half_elevation, fan.half_elevation)
@@ -207,7 +207,7 @@ class Mosaic:
         taper = np.square(np.cos(quarter * across) * np.cos(quarter * along))
         return np.asarray(np.where(inside & (taper > LEAST_WEIGHT), taper, np.float32(0)))
 
-    def _footprint(self, fan: Fan, pose: Array) -> Box | None:
+    def _footprint(self, fan: FrameFan, pose: Array) -> Box | None:
         """Return the box around the ground that a frame can show; None where there is none."""
         reach = ground_outline(fan)
         if reach is None:

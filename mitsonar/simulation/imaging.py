@@ -209,22 +209,33 @@ class Simulator:
             images.append(image if noise is None else noise.apply(image, seed=seed, frames=frames))
             heights.append(pings.height_m)
             truth.append(labels_above(pings, image, label_floor))
-        names = self.label_names(labels)
         labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
         for sentence in [*self.notes, *tally.warnings(self, trajectory.poses)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
+        return self._frames(np.concatenate(images), trajectory, np.concatenate(heights), gain, labelled)
+
+    def _frames(
+        self,
+        image: NDArray[np.float32],
+        trajectory: Trajectory,
+        height_m: NDArray[np.float64],
+        gain: float,
+        labelled: dict[str, Any],
+    ) -> SonarFrames:
+        """Return images and labels as frames of the sonar; with labels go the names that these refer to."""
+        shapes, objects = self.label_names(bool(labelled))
         return SonarFrames(
-            image=np.concatenate(images),
+            image=image,
             range_m=self.sonar.range_m,
             bearing_rad=self.sonar.bearing_rad,
             time_s=trajectory.time_s,
             sonar=self.sonar,
             poses=trajectory.poses,
-            height_m=np.concatenate(heights),
+            height_m=height_m,
             level_scale=1 / gain,
+            shape_names=shapes,
+            object_names=objects,
             **labelled,
-            shape_names=names[0],
-            object_names=names[1],
         )
 
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -248,9 +259,8 @@ class Simulator:
         """Render the next ping of a closed loop, in which each pose follows from the frame before it.
 
         The simulator counts its pings, so that each draws its own jitter and noise, and keeps one gain. Stepping over poses
-        gives the images that ``render(poses, gain=simulator.gain)`` gives afterwards, bit for bit. Where no gain is given,
-        the first frame with echoes sets it (:meth:`render` uses 20 frames); frames before that one are black, with a gain of
-        1. Each warning of :meth:`render` is given once in a loop. :meth:`reset` begins a new loop.
+        gives the images of ``render(poses, gain=simulator.gain)``, bit for bit. Without a gain the first frame with echoes
+        sets it. Each warning is given once in a loop. :meth:`reset` begins a new loop.
 
         Args:
             pose: of the sonar: x, y, z [m], pitch, roll, heading [rad].
@@ -260,9 +270,6 @@ class Simulator:
             labels: per-pixel truth as well.
             gain: the constant that levels are multiplied by; default: set on the first frame with echoes.
             label_floor: part of full scale above which a pixel is labelled; 0: every echo.
-
-        Returns:
-            One frame.
 
         Raises:
             MitsonarError: not one pose; a gain other than that of the steps before.
@@ -281,22 +288,12 @@ class Simulator:
             self.gain = constant_gain([pings])[0] if gain is None else gain
         kept = 1.0 if self.gain is None else self.gain
         self._stepped = number + 1
-        names = self.label_names(labels)
         image = to_image(pings, kept)
         self._warn_once(pings, image, table)
-        return SonarFrames(
-            image=image if noise is None else noise.apply(image, seed=seed, frames=np.array([number])),
-            range_m=self.sonar.range_m,
-            bearing_rad=self.sonar.bearing_rad,
-            time_s=np.array([number / self.sonar.frame_rate_hz if time_s is None else time_s]),
-            sonar=self.sonar,
-            poses=table,
-            height_m=pings.height_m,
-            level_scale=1 / kept,
-            **labels_above(pings, image, label_floor),
-            shape_names=names[0],
-            object_names=names[1],
-        )
+        time = np.array([number / self.sonar.frame_rate_hz if time_s is None else time_s])
+        noisy = image if noise is None else noise.apply(image, seed=seed, frames=np.array([number]))
+        labelled = labels_above(pings, image, label_floor)
+        return self._frames(noisy, Trajectory(table, time), pings.height_m, kept, labelled)
 
     def reset(self) -> None:
         """Begin a new loop: the next :meth:`step` is ping 0, sets the gain anew, and may warn again."""
