@@ -271,6 +271,18 @@ def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:
     run_python(script, block=("torch",))
 
 
+def test_a_stored_set_is_read_without_a_simulator(tiny_data: Path) -> None:
+    """Configuration stands below the simulation: who only reads enters no simulator and loads no Mitsuba."""
+    run_python(f"""
+        import sys
+        import mitsonar
+        store = mitsonar.DataStore.open({str(tiny_data)!r})
+        assert store.read("image").any()
+        entered = [name for name in sys.modules if name.startswith("mitsonar.simulation") or name in ("mitsuba", "drjit")]
+        assert not entered, entered
+    """)
+
+
 # ---------------------------------------------------------------- what is packaged
 
 
