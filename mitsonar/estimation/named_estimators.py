@@ -28,6 +28,7 @@ __all__ = [
     "NAMES",
     "create_estimator",
     "estimator_from",
+    "estimators_for",
     "load_checkpoint",
     "names_checkpoint",
     "options_from",
@@ -48,6 +49,11 @@ Options = dict[str, Any]
 """Options of an estimator by name: numbers, or yes and no."""
 
 NAMES = (*ESTIMATORS, *SHIPPED)
+
+
+def estimators_for(record: type) -> tuple[str, ...]:
+    """Return the names of the estimators that consume a class of records, such as ``SonarFrames``; no trained ones."""
+    return tuple(name for name, made in ESTIMATORS.items() if made.consumes in (record, object))
 
 
 def create_estimator(name: str, **options: object) -> AnyEstimator:

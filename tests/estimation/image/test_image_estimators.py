@@ -13,7 +13,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.ground_view import GroundView
-from mitsonar.estimation.named_estimators import ESTIMATORS, create_estimator, estimator_from
+from mitsonar.estimation.named_estimators import create_estimator, estimator_from, estimators_for
 from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
@@ -35,7 +35,7 @@ pytestmark = [
 
 START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
 UNITS = np.array([1e3, 1e3, 180 / np.pi])
-CLASSICAL = [name for name in ESTIMATORS if create_estimator(name).consumes is SonarFrames]
+CLASSICAL = [name for name in estimators_for(SonarFrames) if name != "zero"]
 METHODS = [*CLASSICAL, *(pytest.param(name, marks=pytest.mark.learn) for name in SHIPPED)]
 
 ALLOWED = {
