@@ -78,7 +78,7 @@ class Tally:
             ends = source.window_range(poses[frame - first], frame)
             where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""
             found["window"] = (
-                f"{outside:,} of {hits:,} returns ({100 * outside / hits:.2g} %) lie outside the window "
+                f"{outside:,} of {hits:,} returns ({_percent(outside / hits)} %) lie outside the window "
                 f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen the window if they matter"
             )
         if self.saturated > 0.01 * self.pixels:
@@ -122,3 +122,8 @@ class Tally:
             whole_number(number, "a frame of the tally", 0, max(0, frames - 1))
         tuples = {name: tuple(state[name]) for name in ("worst", "first_empty")}
         return cls(sonar, **{**state, "rays": dict(state["rays"]), **tuples})
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent to two digits, without an exponent."""
+    return "100" if share >= 0.995 else f"{100 * share:.2g}"
