@@ -77,7 +77,8 @@ class ChannelSensor(mi.Sensor):
         matrix = to_world_matrices(self.pose)[0]
         ray = dr.zeros(mi.Ray3f, dr.width(sample2))
         ray.o, ray.d = mi.Point3f(*map(float, matrix[:3, 3])), mi.Vector3f(*map(float, matrix[:3, 2]))
-        ray.maxt, ray.time = dr.largest(mi.Float)  # type: ignore[no-untyped-call]  # Dr.Jit gives it no types, time
+        ray.maxt = dr.largest(mi.Float)  # type: ignore[no-untyped-call]  # Dr.Jit gives it no types
+        ray.time = time
         return ray, mi.Spectrum(1.0)
 
     def sample_ray_differential(

@@ -164,3 +164,18 @@ def test_defaults_of_the_sensor_are_the_thesis() -> None:
 def test_mistakes_in_xml_are_answered(properties: str, said: str) -> None:
     with pytest.raises(RuntimeError, match=said):
         from_xml(properties)
+
+
+@pytest.mark.usefixtures("variant")
+def test_as_a_camera_it_sends_one_ray_forward() -> None:
+    import mitsuba as mi
+
+    scene = mi.load_string(XML.format(""), parallel=False)
+    half = mi.Point2f(0.5)
+    for method in ("sample_ray", "sample_ray_differential"):
+        ray, weight = getattr(scene.sensors()[0], method)(mi.Float(0.25), mi.Float(0.5), half, half)
+        np.testing.assert_allclose(np.ravel(ray.o), [1, 2, 10], atol=1e-6)
+        np.testing.assert_allclose(np.ravel(ray.d), [1, 0, 0], atol=1e-6)
+        assert float(np.ravel(ray.time)[0]) == 0.25
+        assert float(np.ravel(ray.maxt)[0]) > 1e30
+        assert (np.ravel(weight) == 1).all()
