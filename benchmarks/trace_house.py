@@ -3,8 +3,9 @@
     python benchmarks/trace_house.py [--house FOLDER] [--quick]
 
 Runs five commands on small inputs, each in a process of its own with `sys.settrace`, and counts the files of mitsonar that
-were entered and the distinct lines that were run. Lines of imports and class bodies do not count. The code is only reached
-through `python -m mitsonar`, so that a checkout of another version can be traced (`--house`). `--quick` traces two commands.
+were entered and the distinct lines that were run. A file of which fewer than MUCH lines run is entered in passing. Lines of
+imports and class bodies do not count. The code is only reached through `python -m mitsonar`, so that a checkout of another
+version can be traced (`--house`). `--quick` traces two commands.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
+MUCH = 20
 PACKAGE, EVERYTHING = ("mitsonar", "plugins"), ("mitsonar", "plugins", "scenes", "tests", "benchmarks", "docs")
 
 RECIPE = """\
@@ -58,9 +60,10 @@ def main() -> None:
     house = asked.house.resolve()
     if asked.child:
         return traced(house, Path(asked.child[0]), asked.child[1:])
-    print("| way | files entered | lines run |\n|---|---|---|")
+    print(f"| way | files entered | of these {MUCH} lines or more | lines run |\n|---|---|---|---|")
     for name, lines in ways(house, 2 if asked.quick else len(WAYS)):
-        print(f"| {name} | {len(lines)} | {sum(lines.values()):,} |", flush=True)
+        much = sum(count >= MUCH for count in lines.values())
+        print(f"| {name} | {len(lines)} | {much} | {sum(lines.values()):,} |", flush=True)
     print("\n| code | count |\n|---|---|")
     for name, count in counts(house):
         print(f"| {name} | {count} |")

@@ -64,6 +64,8 @@ def render(
     from mitsonar.simulation.render_run import Outputs, run
     from mitsonar.simulation.scene import find_scene, load_scene
 
+    if label_floor and not labels:
+        raise MitsonarError(f"--label-floor {label_floor:g} needs --labels: without labels nothing is labelled")
     named = convention_named(frame).name
     outputs = Outputs(
         load_noise(noise), labels=labels, cartesian=cartesian, exr=exr, frame=named, fan=fan, label_floor=label_floor

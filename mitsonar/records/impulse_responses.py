@@ -129,6 +129,8 @@ class ImpulseResponses:
         path = Path(path)
         if path.is_dir() and path.suffix != ".zarr":
             path = path / "responses.npz"
+        if not path.exists():
+            raise MitsonarError(f"there are no responses at {path}: give what `mitsonar impulse` wrote")
         try:
             if path.is_dir():
                 table, _ = open_group(path, COLUMNS, "time_s")

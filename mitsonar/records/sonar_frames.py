@@ -173,6 +173,8 @@ class SonarFrames:
             if not found:
                 raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
             path = found[0]
+        if not path.exists():
+            raise MitsonarError(f"there are no frames at {path}: give frames.npz or a run's folder")
         try:
             if path.is_dir():
                 table, done = open_group(path, COLUMNS, "time_s", "frames_done")

@@ -38,6 +38,8 @@ SLIPS = [
     ("dataset make rocky-field --set labels=[shadwo]", "did you mean shadow?"),
     ("dataset make rocky-field --set world.family=pattrn", "did you mean pattern?"),
     ("dataset make rocky-field --set split.by=scenes", "did you mean scene?"),
+    ("render flat_floor --label-floor 0.1", "--label-floor 0.1 needs --labels"),
+    ("odometry none.npz", "there are no frames at none.npz"),
     ("height none.npz --by drect", "got 'drect'; did you mean direct?"),
     ("mosaic none.npz treu", "or `true`; did you mean true?"),
     (f"world mesh {AMPHORA} --reflectivity luminence", "--reflectivity must be", "did you mean luminance?"),
