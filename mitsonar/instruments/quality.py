@@ -58,8 +58,8 @@ QUALITIES: dict[str, RayCounts] = {
 
 
 def _known(name: object) -> object:
-    if name not in QUALITIES:
-        raise ValueError(f"unknown quality {name!r}: {nearest_names(str(name), QUALITIES)}")
+    if not isinstance(name, str) or name not in QUALITIES:
+        raise ValueError(f"unknown quality {name!r}: {nearest_names(str(name)[:40], QUALITIES)}")
     return name
 
 
