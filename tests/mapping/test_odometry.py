@@ -448,7 +448,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     numbered(sway(4)).save(tmp_path / "frames.npz")
     for name, message in (
         ("empty", "holds no frames.npz"),
-        ("none.npz", "cannot read frames"),
+        ("none.npz", "there are no frames"),
         ("wrong.npz", "cannot read frames"),
         ("other.npz", "lacks image"),
         ("damaged.zarr", "cannot read frames"),
