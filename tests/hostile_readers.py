@@ -227,6 +227,24 @@ def spoil_sonar(rng: Rng, folder: Path) -> None:
     spoil_yaml(str(rng.choice(["sonar.yaml", "noise.yaml", "training.yaml"])))(rng, folder)
 
 
+def make_materials(folder: Path) -> None:
+    table = {"law": "table", "strength_db": [-40.0 + k / 4 for k in range(91)], "frequency_max_hz": 2e6}
+    plate = {"mu": 0.1, "reflection": 0.9, "roughness_m": 1e-4, "about": "a plate"}
+    for name, fields in {"table": table, "plate": plate, "floor": {"material": "sand", "loss": 0.02}}.items():
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(fields))
+
+
+def read_materials(folder: Path) -> None:
+    from mitsonar.acoustics.backscatter import material, sigma_table
+
+    for name in ("table", "plate", "floor"):
+        assert np.isfinite(sigma_table(material(folder / f"{name}.yaml"), 80e3)).all()
+
+
+def spoil_materials(rng: Rng, folder: Path) -> None:
+    spoil_yaml(str(rng.choice(["table.yaml", "plate.yaml", "floor.yaml"])))(rng, folder)
+
+
 # ---------------------------------------------------------------- runs
 
 
@@ -444,6 +462,7 @@ READERS: dict[str, Reader] = {
     "data set, checked": Reader(make_store, spoil_tree, check_store),
     "recipe": Reader(make_recipe, spoil_recipe, read_recipe),
     "sonar, noise, training": Reader(make_sonar, spoil_sonar, read_sonar),
+    "material": Reader(make_materials, spoil_materials, read_materials),
     "run.json": Reader(make_run, spoil_file("run.json", changed_json), read_run),
     "odometry": Reader(make_odometry, spoil_odometry, read_odometry),
     "checkpoint": Reader(make_checkpoint, spoil_checkpoint, read_checkpoint),

@@ -1,0 +1,251 @@
+"""Sea water and fresh water: absorption and speed of sound, and where their formulas hold.
+
+Absorption is in dB per metre of path, one way. Above 1 MHz both formulas extrapolate; what remains there is the viscosity of
+pure water, which grows with the square of the frequency.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mitsonar.arrays import AnyArray
+from mitsonar.errors import MitsonarError, complaint, meant, shortened
+
+__all__ = [
+    "FORMULAS",
+    "Formula",
+    "Water",
+    "absorption_db_per_m",
+    "absorption_warning",
+    "sound_speed_m_s",
+    "sound_speed_warning",
+]
+
+Formula = Literal["francois-garrison", "ainslie-mccolm"]
+
+FORMULAS = ("francois-garrison", "ainslie-mccolm")
+"""Formulas of the absorption, the default first."""
+
+SALTY_PSU = 1.0
+"""Salinity below which water counts as fresh: salts then add little to the absorption [psu]."""
+
+
+class Water(BaseModel):
+    """The water that sound travels in. The default is a cool sea at its surface; ``salinity_psu`` 0 is a lake or a tank."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    temperature_c: float = Field(10.0, ge=-6, le=40, description="temperature [deg C]")
+    salinity_psu: float = Field(35.0, ge=0, le=50, description="salinity [psu]; 0 is fresh water")
+    depth_m: float = Field(0.0, ge=0, le=12_000, description="depth below the surface [m]")
+    ph: float = Field(8.0, ge=5, le=10, description="pH; it matters below 10 kHz only")
+
+    @classmethod
+    def create(cls, **fields: float) -> Self:
+        """Create water with these fields.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits.
+        """
+        try:
+            return cls(**fields)
+        except ValidationError as error:
+            raise MitsonarError(complaint(error, cls, "water")) from None
+
+
+# ---------------------------------------------------------------- absorption
+
+
+def absorption_db_per_m(frequency_hz: AnyArray, water: Water, formula: Formula = "francois-garrison") -> AnyArray:
+    """Compute the absorption of sound in water [dB/m], one way.
+
+    The frequency enters by ``+ * /`` only, so NumPy, torch and Dr.Jit give the same bits. :func:`absorption_warning` says
+    whether the formula holds.
+
+    Args:
+        frequency_hz: above 0, a number or an array ``(...)`` of any library.
+        water: the water.
+        formula: ``francois-garrison``: Francois and Garrison, Sound absorption based on ocean measurements, parts I and II,
+            J. Acoust. Soc. Am. 72 (1982), 896-907 and 1879-1890. ``ainslie-mccolm``: Ainslie and McColm, A simplified
+            formula for viscous and chemical absorption in sea water, J. Acoust. Soc. Am. 103 (1998), 1671-1672.
+
+    Returns:
+        Like ``frequency_hz``.
+
+    Raises:
+        MitsonarError: unknown formula, or a number that is no frequency.
+    """
+    _check_frequency(frequency_hz)
+    match formula:
+        case "francois-garrison":
+            relaxations, viscous = _francois_garrison(water)
+        case "ainslie-mccolm":
+            relaxations, viscous = _ainslie_mccolm(water)
+        case _:
+            raise _unknown(formula)
+    khz = frequency_hz * 1e-3
+    square = khz * khz
+    total = viscous * square
+    for strength, relaxation_khz in relaxations:
+        if strength > 0:  # fresh water has no salts
+            total = total + strength * relaxation_khz * square / (square + relaxation_khz * relaxation_khz)
+    return total * 1e-3
+
+
+def _francois_garrison(water: Water) -> tuple[list[tuple[float, float]], float]:
+    """Return strength [dB/km/kHz] and frequency [kHz] of both relaxations, and the viscous term [dB/km/kHz^2]."""
+    t, s, d = water.temperature_c, water.salinity_psu, water.depth_m
+    speed = 1412 + 3.21 * t + 1.19 * s + 0.0167 * d
+    boric = 8.86 / speed * 10 ** (0.78 * water.ph - 5) if s > 0 else 0.0
+    boric_khz = 2.8 * math.sqrt(s / 35) * 10 ** (4 - 1245 / (t + 273))
+    magnesium = 21.44 * s / speed * (1 + 0.025 * t) * (1 - 1.37e-4 * d + 6.2e-9 * d * d)
+    magnesium_khz = 8.17 * 10 ** (8 - 1990 / (t + 273)) / (1 + 0.0018 * (s - 35))
+    if t <= 20:
+        viscous = 4.937e-4 - 2.59e-5 * t + 9.11e-7 * t * t - 1.50e-8 * t**3
+    else:
+        viscous = 3.964e-4 - 1.146e-5 * t + 1.45e-7 * t * t - 6.5e-10 * t**3
+    viscous *= 1 - 3.83e-5 * d + 4.9e-10 * d * d
+    return [(boric, boric_khz), (magnesium, magnesium_khz)], viscous
+
+
+def _ainslie_mccolm(water: Water) -> tuple[list[tuple[float, float]], float]:
+    """Return strength [dB/km/kHz] and frequency [kHz] of both relaxations, and the viscous term [dB/km/kHz^2]."""
+    t, s, z = water.temperature_c, water.salinity_psu, water.depth_m / 1000
+    boric = 0.106 * math.exp((water.ph - 8) / 0.56) if s > 0 else 0.0
+    boric_khz = 0.78 * math.sqrt(s / 35) * math.exp(t / 26)
+    magnesium = 0.52 * (1 + t / 43) * (s / 35) * math.exp(-z / 6)
+    magnesium_khz = 42 * math.exp(t / 17)
+    return [(boric, boric_khz), (magnesium, magnesium_khz)], 0.00049 * math.exp(-(t / 27 + z / 17))
+
+
+def absorption_warning(frequency_hz: float, water: Water, formula: Formula = "francois-garrison") -> str | None:
+    """Say in one sentence where the absorption lies outside the band of its formula; None where it holds.
+
+    Bands of Francois and Garrison, 5 % in error: 10 to 500 kHz at -2..22 deg C, 30..35 psu, to 3,500 m; above 500 kHz at
+    0..30 deg C, 0..40 psu, to 10,000 m; from 0.2 kHz to 1 MHz as a whole. Ainslie and McColm stay within 10 % of them from
+    0.1 kHz to 1 MHz at -6..35 deg C, 5..50 psu, pH 7.7..8.3, to 7,000 m. Both as quoted by the National Physical Laboratory,
+    Underlying physics and mechanisms for the absorption of sound in seawater (second hand).
+
+    Raises:
+        MitsonarError: unknown formula, or a number that is no frequency.
+    """
+    _check_frequency(frequency_hz)
+    if formula not in FORMULAS:
+        raise _unknown(formula)
+    khz = frequency_hz / 1000
+    garrison = formula == "francois-garrison"
+    name = "Francois and Garrison" if garrison else "Ainslie and McColm"
+    if khz > 1000:
+        return f"absorption at {khz:,.4g} kHz is extrapolated: {name} hold to 1,000 kHz, beyond by pure water's f^2"
+    lowest = 0.2 if garrison else 0.1
+    if khz < lowest:
+        return f"absorption at {khz:,.4g} kHz is extrapolated: {name} hold from {lowest} kHz"
+    if water.salinity_psu < SALTY_PSU and khz < 500:
+        return f"absorption at {khz:,.4g} kHz in fresh water is that of pure water alone: {name} measured the sea"
+    bands: dict[str, tuple[float, float]]
+    if not garrison:
+        bands = {"temperature_c": (-6, 35), "salinity_psu": (5, 50), "depth_m": (0, 7000), "ph": (7.7, 8.3)}
+        if khz > 10:
+            del bands["ph"]
+        if water.salinity_psu < SALTY_PSU:
+            del bands["salinity_psu"]
+    elif khz > 500:
+        bands = {"temperature_c": (0, 30), "salinity_psu": (0, 40), "depth_m": (0, 10_000)}
+    else:
+        bands = {"temperature_c": (-2, 22), "salinity_psu": (30, 35), "depth_m": (0, 3500)}
+    return _outside(water, bands, f"absorption by {name} at {khz:,.4g} kHz")
+
+
+# ---------------------------------------------------------------- speed
+
+PURE = (1402.388, 5.03711, -5.80852e-2, 3.3420e-4, -1.47800e-6, 3.1464e-9)
+PURE_1 = (0.153563, 6.8982e-4, -8.1788e-6, 1.3621e-7, -6.1185e-10)
+PURE_2 = (3.1260e-5, -1.7107e-6, 2.5974e-8, -2.5335e-10, 1.0405e-12)
+PURE_3 = (-9.7729e-9, 3.8504e-10, -2.3643e-12)
+SALT = (1.389, -1.262e-2, 7.164e-5, 2.006e-6, -3.21e-8)
+SALT_1 = (9.4742e-5, -1.2580e-5, -6.4885e-8, 1.0507e-8, -2.0122e-10)
+SALT_2 = (-3.9064e-7, 9.1041e-9, -1.6002e-10, 7.988e-12)
+SALT_3 = (1.100e-10, 6.649e-12, -3.389e-13)
+ROOT, ROOT_1 = (-1.922e-2, -4.42e-5), (7.3637e-5, 1.7945e-7)
+SQUARE, SQUARE_1 = (1.727e-3,), (-7.9836e-6,)
+"""Polynomials of the temperature; ``_k`` multiplies the pressure's k-th power (Fofonoff and Millard, 1983)."""
+
+
+def sound_speed_m_s(water: Water) -> float:
+    """Compute the speed of sound [m/s], in the sea and in fresh water.
+
+    The formula is that of Chen and Millero, J. Acoust. Soc. Am. 62 (1977), 1129-1135, as UNESCO took it over: Fofonoff and
+    Millard, Algorithms for computation of fundamental properties of seawater, UNESCO technical papers in marine science 44
+    (1983). Its temperature is on the scale of 1968, 1.00024 times that of 1990. The pressure follows from the depth by
+    Saunders, J. Phys. Oceanogr. 11 (1981), 573-574, at 45 deg latitude.
+
+    Args:
+        water: the water; its pH has no effect. :func:`sound_speed_warning` says whether the formula holds.
+    """
+    return unesco_speed_m_s(1.00024 * water.temperature_c, water.salinity_psu, pressure_bar(water.depth_m))
+
+
+def unesco_speed_m_s(temperature_68_c: float, salinity_psu: float, pressure_bar: float) -> float:
+    """Compute the speed of sound by Chen and Millero [m/s].
+
+    Args:
+        temperature_68_c: on the scale of 1968 [deg C].
+        salinity_psu: practical salinity [psu].
+        pressure_bar: above that of the air [bar].
+    """
+    t, s, p = temperature_68_c, salinity_psu, pressure_bar
+    pure = _polynomial((_polynomial(one, t) for one in (PURE, PURE_1, PURE_2, PURE_3)), p)
+    salt = _polynomial((_polynomial(one, t) for one in (SALT, SALT_1, SALT_2, SALT_3)), p)
+    root = _polynomial((_polynomial(one, t) for one in (ROOT, ROOT_1)), p)
+    square = _polynomial((_polynomial(one, t) for one in (SQUARE, SQUARE_1)), p)
+    return pure + salt * s + root * s * math.sqrt(s) + square * s * s
+
+
+def pressure_bar(depth_m: float, latitude_deg: float = 45.0) -> float:
+    """Compute the pressure above that of the air [bar] at a depth in the sea, by Saunders (1981)."""
+    linear = 1 - (5.92e-3 + 5.25e-3 * math.sin(math.radians(latitude_deg)) ** 2)
+    return (linear - math.sqrt(linear * linear - 8.84e-6 * depth_m)) / 4.42e-6 / 10
+
+
+def sound_speed_warning(water: Water) -> str | None:
+    """Say in one sentence where the speed of sound lies outside the band of its formula; None where it holds.
+
+    The band is 0..40 deg C, 0..40 psu and 0..1,000 bar, which is 9,700 m (Fofonoff and Millard, 1983).
+    """
+    bands: dict[str, tuple[float, float]] = {"temperature_c": (0, 40), "salinity_psu": (0, 40), "depth_m": (0, 9700)}
+    return _outside(water, bands, "speed of sound by Chen and Millero")
+
+
+# ---------------------------------------------------------------- helpers
+
+
+def _polynomial(coefficients: Iterable[float], x: float) -> float:
+    """Evaluate a polynomial, the constant first."""
+    total = 0.0
+    for one in reversed(tuple(coefficients)):
+        total = total * x + one
+    return total
+
+
+def _outside(water: Water, bands: dict[str, tuple[float, float]], what: str) -> str | None:
+    """Name the first field of the water that lies outside its band."""
+    for key, (low, high) in bands.items():
+        value = getattr(water, key)
+        if not low <= value <= high:
+            return f"{what} is extrapolated: {key} {value:g} lies outside {low:g}..{high:g}"
+    return None
+
+
+def _check_frequency(frequency_hz: AnyArray) -> None:
+    """Refuse a number that is no frequency; arrays are taken as they are."""
+    if isinstance(frequency_hz, int | float) and not 0 < frequency_hz < math.inf:
+        raise MitsonarError(f"a frequency must be a finite number of Hz above 0: got {shortened(frequency_hz)}")
+
+
+def _unknown(formula: object) -> MitsonarError:
+    known = ", ".join(FORMULAS)
+    return MitsonarError(f"unknown formula of absorption {shortened(formula)}: known: {known}{meant(formula, FORMULAS)}")
