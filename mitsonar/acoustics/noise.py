@@ -16,9 +16,19 @@ from scipy.special import ndtr
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_yaml
 
-__all__ = ["NOISE_MODELS", "Information", "NoiseModel", "information", "information_of_sums", "load_noise", "uniform"]
+__all__ = [
+    "NOISE_MODELS",
+    "Information",
+    "NoiseModel",
+    "information",
+    "information_of_sums",
+    "load_noise",
+    "refuse_noise",
+    "uniform",
+]
 
 MASK = 0xFFFFFFFF
 
@@ -192,6 +202,19 @@ def _grey_edges(greys: int) -> NDArray[np.float64]:
     edges = (np.arange(1, greys + 1) - 0.5) / greys
     edges[0] = 0.0
     return edges
+
+
+def refuse_noise(noise: NoiseModel | None, sonar: Sonar) -> None:
+    """Refuse a noise of pixels for a sonar that has its own, in its field.
+
+    Raises:
+        MitsonarError: noise of pixels in the model ``coherent``.
+    """
+    if noise is not None and not noise.is_none and sonar.model == "coherent":
+        raise MitsonarError(
+            "the model coherent has noise of its own: got a noise of pixels; leave noise out and give the sonar "
+            "noise_level_db, such as --set noise_level_db=60"
+        )
 
 
 class Information(NamedTuple):

@@ -18,7 +18,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
-from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
+from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, to_image
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import release_memory
 
@@ -86,7 +86,7 @@ class SceneRenderer:
             outside = (pings.counts.nearer + pings.counts.farther).sum(axis=1).astype(np.uint32)
             np.maximum(values["dropped"], outside, out=values["dropped"])  # portions overlap
             for number, levels in enumerate(pings.levels):  # one by one: a frame fits the cache, a batch does not
-                image = np.minimum(levels * np.float32(gain), np.float32(1))
+                image = to_image(levels, gain, view.sonar)
                 values["saturated"][number] += np.count_nonzero(image >= 1)
                 if f"image{suffix}" in values:
                     values[f"image{suffix}"][number] = to_uint8(image) if self.recipe.pixel == "uint8" else image

@@ -10,18 +10,27 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.errors import MitsonarError, complaint
+from mitsonar.instruments.aperture import Aperture, Pattern, Shading
+from mitsonar.instruments.pulse import Pulse
 from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
 
-__all__ = ["RAYS", "Bearing", "FieldValue", "Instrument", "Model", "Sonar"]
+__all__ = ["RAYS", "Bearing", "Coding", "FieldValue", "Instrument", "Model", "Sonar"]
 
 FieldValue: TypeAlias = Any
 """The value of an instrument's field, before pydantic checks it."""
 
-Model = Literal["physical", "thesis"]
+Model = Literal["coherent", "physical", "thesis"]
+Coding = Literal["linear", "dB", "gamma"]
 Bearing = Literal["azimuth", "cone"]
 SEE = " (see `mitsonar presets --help` and docs/guides/sonars.md)"
 RAYS = ("rays_per_beam", "rays_across")
 """Fields that follow from ``quality`` where they are not given."""
+
+LEAST_APERTURE = 0.5
+"""Shortest aperture of the model coherent [wavelengths]."""
+
+MOST_COHERENT_DEG = 170
+"""Largest field of view of the model coherent: its fan is even in the sine and the tangent of angles [deg]."""
 
 THESIS_ACROSS = 4
 """Value of ``rays_across`` in the model ``thesis``, which traces one ray."""
@@ -112,7 +121,10 @@ class Sonar(Instrument):
         None, description="rays move at random within their cells, anew each ping; default: physical yes, thesis no"
     )
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
-    model: Model = Field("physical", description="physical, or thesis with its artefacts")
+    model: Model = Field(
+        "physical",
+        description="coherent: speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's, artefacts included",
+    )
     gain_exponent: int = Field(
         0, ge=0, le=4, description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading"
     )
@@ -133,6 +145,52 @@ class Sonar(Instrument):
         le=4096,
         description="rays across a beam's width (thesis: one, on the axis); default: from quality",
     )
+    frequency_hz: float | None = Field(None, gt=0, le=1e8, description="carrier [Hz]; the model coherent needs it")
+    bandwidth_hz: float | None = Field(None, gt=0, le=1e8, description="band of the pulse [Hz], instead of pulse_m")
+    pulse_m: float | None = Field(
+        None, gt=0, le=1e3, description="range resolution, half-power width of the compressed pulse [m]; default: one bin"
+    )
+    pattern: Pattern | None = Field(
+        None, description="of the beams: box, receive or two_way; default: two_way in the model coherent, else box"
+    )
+    shading: Shading = Field("hann", description="of the aperture: uniform, hann, hamming or taylor (-30 dB)")
+    elevation_pattern: Pattern | None = Field(
+        None, description="over elevation, of a uniform aperture: box, receive or two_way; default: pattern"
+    )
+    focus_m: float | None = Field(
+        None, gt=0, le=1e5, description="range at which the array is focused [m] (coherent); default: at every range"
+    )
+    scatterers_per_cell: float = Field(
+        6.0, gt=0, le=1e4, description="points a beam width by resolution at mid range (coherent); speckle needs 4"
+    )
+    scatterer_spacing_m: float | None = Field(
+        None, gt=0, le=10, description="pitch of the points on surfaces [m]; default: from scatterers_per_cell"
+    )
+    speckle_nu: float | None = Field(
+        None, gt=0.05, le=100, description="shape of the K law of speckle; default: none, exponential intensities"
+    )
+    speckle_patch_m: float = Field(0.1, gt=0, le=100, description="side of the patches that speckle_nu varies over [m]")
+    source_level_db: float = Field(0.0, ge=-200, le=300, description="source level [dB re 1 uPa at 1 m]; 0: relative")
+    noise_level_db: float | None = Field(
+        None, ge=-300, le=300, description="noise in a beam and bin [dB re 1 uPa] (coherent); default: none"
+    )
+    absorption_db_per_m: float | None = Field(
+        None, ge=0, le=1e3, description="one way [dB/m]; default: coherent by frequency and water, else 0"
+    )
+    temperature_c: float = Field(10.0, ge=-2, le=40, description="of the water [deg C]")
+    salinity_psu: float = Field(35.0, ge=0, le=45, description="of the water [parts per thousand]")
+    water_depth_m: float = Field(10.0, ge=0, le=12_000, description="depth of the sonar in the water [m]")
+    ph: float = Field(8.0, ge=6, le=9, description="acidity of the water")
+    gain_absorption: bool = Field(False, description="the gain undoes absorption there and back too")
+    crosstalk_db: float | None = Field(
+        None, ge=-120, le=0, description="every beam leaks into all others at this level [dB] (coherent); default: none"
+    )
+    stripes_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' gains, by the seed [dB] (coherent)")
+    coding: Coding | None = Field(
+        None, description="how values stand for levels: linear, dB or gamma; default: dB in the model coherent, else linear"
+    )
+    coding_db: float = Field(80.0, gt=0, le=300, description="span of the coding dB, from value 0 to 1 [dB]")
+    coding_gamma: float = Field(0.5, gt=0, le=4, description="of the coding gamma: value = amplitude^gamma")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -157,10 +215,31 @@ class Sonar(Instrument):
             raise ValueError(
                 f"an image has at most {2**28:,} cells: got {self.beams * self.range_bins:,}; lower beams or range_bins"
             )
+        if self.pulse_m is not None and self.bandwidth_hz is not None:
+            raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
+        if self.model == "coherent":
+            self._check_coherent()
         rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
         if rays > 2**28:
             raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower quality, beams or numbers of rays")
         return self
+
+    def _check_coherent(self) -> None:
+        if self.frequency_hz is None:
+            raise ValueError("the model coherent needs the carrier: give frequency_hz, 1.8e6 for example")
+        if self.azimuth_fov_deg > MOST_COHERENT_DEG or self.elevation_fov_deg > MOST_COHERENT_DEG:
+            raise ValueError(
+                f"the model coherent covers at most {MOST_COHERENT_DEG} x {MOST_COHERENT_DEG} deg: got "
+                f"{self.azimuth_fov_deg:g} x {self.elevation_fov_deg:g}; use the model physical"
+            )
+        if self.beam_pattern == "box":
+            raise ValueError("the model coherent needs a pattern of the beams: give pattern receive or two_way")
+        if self.aperture.length < LEAST_APERTURE:
+            raise ValueError(
+                f"an aperture is at least half a wavelength: a beam of {math.degrees(self.beam_width_rad):.3g} deg takes "
+                f"{self.aperture.length:.2g}; give beam_width_deg below "
+                f"{math.degrees(self.aperture.length * self.beam_width_rad / LEAST_APERTURE):.3g}"
+            )
 
     def replace(self, **fields: FieldValue) -> Self:
         """Return a copy with some fields changed; all fields are checked.
@@ -179,6 +258,35 @@ class Sonar(Instrument):
         return math.degrees(self.bearing_rad[-1] + self.beam_width_rad / 2)
 
     @property
+    def beam_pattern(self) -> Pattern:
+        """Return the pattern of the beams."""
+        if self.model == "thesis":
+            return "box"
+        return self.pattern or ("two_way" if self.model == "coherent" else "box")
+
+    @property
+    def vertical_pattern(self) -> Pattern:
+        """Return the pattern over elevation."""
+        return "box" if self.model == "thesis" else self.elevation_pattern or self.beam_pattern
+
+    @property
+    def aperture(self) -> Aperture:
+        """Return the array across the beams."""
+        return Aperture(self.beam_width_rad, self.shading, self.beam_pattern != "receive")
+
+    @property
+    def resolution_m(self) -> float:
+        """Return the range resolution [m]."""
+        if self.bandwidth_hz is not None:
+            return Pulse.of_band(self.bandwidth_hz, self.sound_speed).resolution_m
+        return self.bin_m if self.pulse_m is None else self.pulse_m
+
+    @property
+    def value_coding(self) -> Coding:
+        """Return how values stand for levels."""
+        return self.coding or ("dB" if self.model == "coherent" else "linear")
+
+    @property
     def across(self) -> int:
         """Return the rays across a beam that are traced: ``rays_across``, or one in the model ``thesis``."""
         return 1 if self.model == "thesis" else self.rays_across
@@ -186,7 +294,7 @@ class Sonar(Instrument):
     @property
     def jittered(self) -> bool:
         """Return whether rays move within their cells."""
-        return self.model == "physical" if self.jitter is None else self.jitter
+        return self.model != "thesis" if self.jitter is None else self.jitter
 
     @property
     def columns(self) -> int:

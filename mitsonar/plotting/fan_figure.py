@@ -21,7 +21,7 @@ GAMMA = 0.6
 
 def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figure:
     """One frame as a fan with metre axes: forward up, starboard to the right."""
-    from matplotlib.colors import PowerNorm
+    from matplotlib.colors import Normalize, PowerNorm
     from matplotlib.figure import Figure
 
     fan = to_cartesian(frames.image[index], frames.range_m, frames.bearing_rad)
@@ -30,11 +30,17 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figur
     width = float(np.clip(height * (right - left) / (high - low), 3.0, 14.0))
     figure = Figure(figsize=(width + 1.6, height), layout="constrained")
     axes = figure.add_subplot(facecolor="black")
-    norm = PowerNorm(GAMMA, vmin=0, vmax=1)
-    scale = 255 if frames.image.dtype == np.uint8 else 1
-    shown = axes.imshow(fan.image / scale, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
+    values = fan.image / (255 if frames.image.dtype == np.uint8 else 1)
+    if frames.level == "dB":
+        low, high = frames.decibels_of(0.0), frames.decibels_of(1.0)
+        values, norm = low + values * (high - low), Normalize(low, high)
+        label = "level (dB re 1 uPa)" if frames.sonar.source_level_db else "level (dB re the source at 1 m)"
+        label += " with gain" if frames.sonar.gain_exponent or frames.sonar.gain_absorption else ""
+    else:
+        norm, label = PowerNorm(GAMMA, vmin=0, vmax=1), f"level (1 = full scale; shown with gamma {GAMMA:g})"
+    shown = axes.imshow(values, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
     axes.set(xlabel="starboard (m)", ylabel="forward (m)", title=title)
-    figure.colorbar(shown, ax=axes, label=f"level (1 = full scale; shown with gamma {GAMMA:g})", fraction=0.04)
+    figure.colorbar(shown, ax=axes, label=label, fraction=0.04)
     return figure
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.coding import decoded
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_npz, refuse_beyond_memory
@@ -103,6 +104,15 @@ class SonarFrames:
     def pitch_rad(self) -> NDArray[np.float64] | None:
         """Pitch of each frame ``(frames,)`` [rad], where poses are known."""
         return None if self.poses is None else self.poses[:, 3]
+
+    def decibels_of(self, value: float) -> float:
+        """Return the level that a value 0..1 of the image stands for [dB re 1 uPa], with the gain of the sonar.
+
+        Relative to the source where the sonar has no ``source_level_db``. A value of 0 of a linear image is -inf.
+        """
+        with np.errstate(divide="ignore"):
+            level = 10 * np.log10(decoded(value, self.sonar) * self.level_scale)
+        return float(level) + self.sonar.source_level_db
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
         """Return some of the frames."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
@@ -55,6 +55,7 @@ class Simulator:
     ) -> None:
         self.variant = ensure_variant()
         from mitsonar.instruments.views import Whole
+        from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.scene import sonar_in
         from mitsonar.simulation.tracing import Tracer
         from mitsonar.simulation.view_tracers import view_tracers
@@ -68,7 +69,8 @@ class Simulator:
             sonar = found[0]
         self.sonar = sonar
         self.tracer = Tracer(scene, sonar)
-        self.notes = self.tracer.notes
+        self.coherent = coherent_imager(scene, sonar, views)
+        self.notes = self.tracer.notes if self.coherent is None else self.coherent.notes
         self.views: Sequence[View] = [Whole(sonar)] if views is None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
@@ -95,8 +97,23 @@ class Simulator:
         table = np.atleast_2d(np.asarray(poses, dtype=float))
         if table.ndim != 2 or table.shape[1] != 6 or not len(table) or not np.isfinite(table).all():
             raise MitsonarError(f"poses must be finite numbers (frames, 6): got {table.shape}; give m and rad")
+        if self.coherent is not None:
+            for place, pose in enumerate(table):
+                yield [self._coherent_ping(pose, first + place, labels)]
+            return
         for start in range(0, len(table), self.pings_per_launch):
             yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
+
+    def _coherent_ping(self, pose: NDArray[np.float64], number: int, labels: bool) -> RenderedPings:
+        """Render one coherent ping. Labels are those of the expected levels, from the same surfaces."""
+        assert self.coherent is not None
+        levels, counts = self.coherent.levels(pose, number)
+        if labels:
+            pings = self._launch(pose[None], number, True)[0]
+            pings.levels, pings.expected = levels[None], pings.levels
+            return pings
+        height_m = self.tracer.height_m(self.tracer.scene, self.tracer.inputs(pose[None], number)[0])
+        return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float))
 
     def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[RenderedPings]:
         from mitsonar.simulation import binning
@@ -193,6 +210,7 @@ class Simulator:
             MitsonarWarning: nothing hit, returns outside the window, saturated pixels, too few rays a bin, BSDFs
                 without a diffuse reflectance.
         """
+        refuse_noise(noise, self.sonar)
         if not isinstance(trajectory, Trajectory):
             poses = np.atleast_2d(np.asarray(trajectory, dtype=float))
             trajectory = Trajectory(poses, np.arange(len(poses)) / self.sonar.frame_rate_hz)
@@ -203,12 +221,12 @@ class Simulator:
         tally = Tally(self.sonar) if calibrated else Tally(self.sonar, "as given")
         images, heights, truth = [], [], []
         for pings in batches:
-            image = to_image(pings, gain)
+            image = to_image(pings.levels, gain, self.sonar)
             tally.add(pings, image)
             frames = np.arange(pings.first, pings.first + len(pings))
             images.append(image if noise is None else noise.apply(image, seed=seed, frames=frames))
             heights.append(pings.height_m)
-            truth.append(labels_above(pings, image, label_floor))
+            truth.append(labels_above(pings, gain, label_floor))
         labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
         for sentence in [*self.notes, *tally.warnings(self, trajectory.poses)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
@@ -232,6 +250,7 @@ class Simulator:
             sonar=self.sonar,
             poses=trajectory.poses,
             height_m=height_m,
+            level=self.sonar.value_coding,
             level_scale=1 / gain,
             shape_names=shapes,
             object_names=objects,
@@ -274,6 +293,7 @@ class Simulator:
         Raises:
             MitsonarError: not one pose; a gain other than that of the steps before.
         """
+        refuse_noise(noise, self.sonar)
         table = np.atleast_2d(np.asarray(pose, dtype=float))
         if table.shape != (1, 6):
             raise MitsonarError(f"a step takes one pose x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
@@ -288,11 +308,11 @@ class Simulator:
             self.gain = constant_gain([pings])[0] if gain is None else gain
         kept = 1.0 if self.gain is None else self.gain
         self._stepped = number + 1
-        image = to_image(pings, kept)
+        image = to_image(pings.levels, kept, self.sonar)
         self._warn_once(pings, image, table)
         time = np.array([number / self.sonar.frame_rate_hz if time_s is None else time_s])
         noisy = image if noise is None else noise.apply(image, seed=seed, frames=np.array([number]))
-        labelled = labels_above(pings, image, label_floor)
+        labelled = labels_above(pings, kept, label_floor)
         return self._frames(noisy, Trajectory(table, time), pings.height_m, kept, labelled)
 
     def reset(self) -> None:

@@ -20,7 +20,7 @@ def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[
     best, elevation, shape_id, object_id = truth
     frames, bins, beams = pings.levels.shape
     winner = np.array(best).reshape(frames, beams, bins).transpose(0, 2, 1)
-    filled = (winner > 0) & (pings.levels > 0)
+    filled = (winner > 0) & (pings.echoes > 0)
     ray = (winner & 0xFFFFFFFF).astype(np.int64) + np.arange(frames)[:, None, None] * rays
     ray = np.where(filled, ray, 0)
     return {
@@ -31,17 +31,17 @@ def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[
     }
 
 
-def labels_above(pings: RenderedPings, image: NDArray[np.float32], floor: float) -> dict[str, Any]:
+def labels_above(pings: RenderedPings, gain: float, floor: float) -> dict[str, Any]:
     """Return the label maps of a batch without the pixels whose level is at most ``floor``.
 
     Args:
         pings: with labels, or without.
-        image: their levels times the gain, before noise ``(frames, bins, beams)``, 0..1.
+        gain: that lifts levels to full scale, 1.
         floor: part of full scale; 0: every echo is labelled, however faint.
     """
     if floor <= 0 or not pings.labels:
         return pings.labels
-    bright = image > floor
+    bright = pings.echoes * np.float32(gain) > floor
     empty = {"elevation_rad": np.float32(np.nan), "shape_id": np.int32(-1), "object_id": np.int32(-1)}
     kept = {name: np.where(bright, pings.labels[name], nothing) for name, nothing in empty.items()}
     return {**kept, "shadow": shadow(pings, bright)}
@@ -56,7 +56,7 @@ def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArr
         pings: of a batch.
         echo: which pixels count as echoes; default: all that are not 0.
     """
-    echo = pings.levels > 0 if echo is None else echo
+    echo = pings.echoes > 0 if echo is None else echo
     nearer = np.logical_or.accumulate(echo, axis=1) | (pings.counts.nearer > 0)[:, None]
     still = np.logical_or.accumulate(echo[:, ::-1], axis=1)[:, ::-1]
     still = still | ((pings.counts.farther > 0) | (pings.counts.missed > 0))[:, None]

@@ -309,7 +309,7 @@ def _frames_of(
     names: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
     """Return a batch as frames, and its images before noise."""
-    image = to_image(pings, gain)
+    image = to_image(pings.levels, gain, sonar)
     numbers = np.arange(pings.first, pings.first + len(pings))
     frames = SonarFrames(
         image=np.ascontiguousarray(outputs.noise.apply(image, seed=sonar.seed, frames=numbers)),
@@ -319,8 +319,9 @@ def _frames_of(
         sonar=sonar,
         poses=trajectory.poses[numbers],
         height_m=pings.height_m,
+        level=sonar.value_coding,
         level_scale=1 / gain,
-        **labels_above(pings, image, outputs.label_floor),
+        **labels_above(pings, gain, outputs.label_floor),
         shape_names=names[0],
         object_names=names[1],
     )

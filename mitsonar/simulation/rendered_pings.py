@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.coding import coded
+
 if TYPE_CHECKING:
+    from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.simulation.binning import Counts
 
 __all__ = ["RenderedPings", "constant_gain", "to_image"]
@@ -29,6 +32,8 @@ class RenderedPings:
         counts: what became of the rays.
         height_m: ``(pings,)``.
         labels: ``elevation_rad``, ``shape_id``, ``object_id``, ``shadow``, like ``levels``, where asked for.
+        expected: levels without speckle, noise and patterns, like ``levels``, that labels of the model ``coherent`` go by;
+            None: the levels themselves.
     """
 
     first: int
@@ -36,9 +41,15 @@ class RenderedPings:
     counts: Counts
     height_m: NDArray[np.float64]
     labels: dict[str, Any] = field(default_factory=dict)
+    expected: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.levels)
+
+    @property
+    def echoes(self) -> NDArray[np.float32]:
+        """Return the levels that tell where echoes are ``(pings, bins, beams)``."""
+        return self.levels if self.expected is None else self.expected
 
 
 def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[RenderedPings]]:
@@ -55,7 +66,6 @@ def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[Ren
     return (0.9 / bright if bright > 0 else 1.0), chain(head, batches)
 
 
-def to_image(pings: RenderedPings, gain: float) -> NDArray[np.float32]:
-    """Return levels times gain, clipped to 0..1."""
-    image: NDArray[np.float32] = np.clip(pings.levels * np.float32(gain), 0, 1)
-    return image
+def to_image(levels: NDArray[np.float32], gain: float, sonar: Sonar) -> NDArray[np.float32]:
+    """Return values 0..1 of levels times the gain, in the sonar's coding, of the same shape."""
+    return coded(levels * np.float32(gain), sonar)

@@ -37,6 +37,8 @@ class Tally:
         """Count a batch; ``image`` before noise."""
         self.frames += len(pings)
         filled = np.count_nonzero(image, axis=(1, 2))
+        if self.sonar.model == "coherent":  # noise and side lobes fill every pixel
+            filled = np.where(pings.counts.inside.sum(axis=1) > 0, filled, 0)
         empty = np.flatnonzero(filled < NEARLY_EMPTY * image[0].size)
         if len(empty) and not self.empty:
             rays = (int(getattr(pings.counts, name)[empty[0]].sum()) for name in self.rays)

@@ -32,6 +32,30 @@ DEFAULTS = {
     "thesis_rays": 700,
     "rays_per_beam": 120,  # 14 deg / (tan(asin 0.2) 0.01), the next even number
     "rays_across": 4,
+    "frequency_hz": None,
+    "bandwidth_hz": None,
+    "pulse_m": None,
+    "pattern": None,
+    "shading": "hann",
+    "elevation_pattern": None,
+    "focus_m": None,
+    "scatterers_per_cell": 6.0,
+    "scatterer_spacing_m": None,
+    "speckle_nu": None,
+    "speckle_patch_m": 0.1,
+    "source_level_db": 0.0,
+    "noise_level_db": None,
+    "absorption_db_per_m": None,
+    "temperature_c": 10.0,
+    "salinity_psu": 35.0,
+    "water_depth_m": 10.0,
+    "ph": 8.0,
+    "gain_absorption": False,
+    "crosstalk_db": None,
+    "stripes_db": 0.0,
+    "coding": None,
+    "coding_db": 80.0,
+    "coding_gamma": 0.5,
 }
 
 
@@ -128,3 +152,29 @@ def test_replace_checks_again_and_leaves_the_original() -> None:
 def test_a_cone_ends_at_ninety_degrees(fields: dict[str, float]) -> None:
     with pytest.raises(MitsonarError, match="beams end at 90 deg"):
         Sonar.create(bearing="cone", **fields)
+
+
+def test_patterns_and_coding_follow_from_the_model() -> None:
+    coherent = Sonar.create(model="coherent", frequency_hz=1.8e6)
+    assert (coherent.beam_pattern, coherent.vertical_pattern, coherent.value_coding) == ("two_way", "two_way", "dB")
+    assert (Sonar().beam_pattern, Sonar().vertical_pattern, Sonar().value_coding) == ("box", "box", "linear")
+    thesis = Sonar.create(model="thesis", pattern="two_way")
+    assert (thesis.beam_pattern, thesis.vertical_pattern) == ("box", "box")
+    assert Sonar().resolution_m == Sonar().bin_m
+    assert Sonar(pulse_m=0.02).resolution_m == 0.02
+    assert Sonar(bandwidth_hz=50e3).resolution_m == pytest.approx(1.44 * 1500 / 2 / 50e3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({}, "needs the carrier"),
+        ({"frequency_hz": 1e6, "azimuth_fov_deg": 180}, "at most 170 x 170 deg"),
+        ({"frequency_hz": 1e6, "pattern": "box"}, "give pattern receive or two_way"),
+        ({"frequency_hz": 1e6, "azimuth_fov_deg": 160, "beams": 1}, "at least half a wavelength"),
+        ({"frequency_hz": 1e6, "pulse_m": 0.1, "bandwidth_hz": 1e4}, "give one of them"),
+    ],
+)
+def test_a_coherent_sonar_that_cannot_be_is_refused(fields: dict[str, Any], words: str) -> None:
+    with pytest.raises(MitsonarError, match=words):
+        Sonar.create(model="coherent", **fields)

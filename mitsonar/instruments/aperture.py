@@ -1,0 +1,134 @@
+"""Line apertures: amplitude pattern over the sine of the angle, by shading, one way or both ways, focused or not.
+
+A shading that is a cosine series over the aperture has a pattern that is a sum of shifted sincs (Harris 1978, Proc. IEEE
+66:51; Taylor 1955, IRE Trans. AP-3:16). One list of coefficients makes each of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["SHADINGS", "Aperture", "Pattern", "Shading", "half_power", "series", "shaded_sinc"]
+
+Shading = Literal["uniform", "hann", "hamming", "taylor"]
+Pattern = Literal["box", "receive", "two_way"]
+"""Hard edges; the pattern of the receiving array; that of an array that sends and receives."""
+
+SHADINGS: tuple[str, ...] = get_args(Shading)
+
+TAYLOR_LOBES, TAYLOR_DB = 4, 30.0
+"""Taylor's shading here: three side lobes beside the main lobe at about -30 dB."""
+
+FOCUS_PARTS = 257
+"""Elements of the sum that stands for an aperture out of focus."""
+
+
+@cache
+def series(shading: Shading) -> tuple[float, ...]:
+    """Return the coefficients F_m, m = 1, 2 ..., of sinc(x - m) + sinc(x + m) beside sinc(x)."""
+    match shading:
+        case "uniform":
+            return ()
+        case "hann":
+            return (0.5,)
+        case "hamming":
+            return (0.23 / 0.54,)
+        case "taylor":
+            return _taylor(TAYLOR_LOBES, TAYLOR_DB)
+
+
+def _taylor(lobes: int, side_db: float) -> tuple[float, ...]:
+    """Compute Taylor's coefficients, for ``lobes`` - 1 side lobes at ``-side_db``."""
+    a = math.acosh(10 ** (side_db / 20)) / math.pi
+    stretch = lobes**2 / (a * a + (lobes - 0.5) ** 2)
+    found = []
+    for m in range(1, lobes):
+        top = math.prod(1 - m * m / (stretch * (a * a + (n - 0.5) ** 2)) for n in range(1, lobes))
+        bottom = 2 * math.prod(1 - m * m / (n * n) for n in range(1, lobes) if n != m)
+        found.append(-((-1) ** m) * top / bottom)
+    return tuple(found)
+
+
+def shaded_sinc(x: ArrayLike, coefficients: tuple[float, ...]) -> NDArray[np.float64]:
+    """Evaluate sinc(x) + sum F_m (sinc(x - m) + sinc(x + m)); 1 at x = 0."""
+    x = np.asarray(x, dtype=float)
+    total = np.sinc(x)
+    for m, part in enumerate(coefficients, 1):
+        total = total + part * (np.sinc(x - m) + np.sinc(x + m))
+    return np.asarray(total, dtype=np.float64)
+
+
+@cache
+def half_power(coefficients: tuple[float, ...], power: int) -> float:
+    """Find x where the pattern to the ``power``-th is one half; 2 is one way, 4 both ways."""
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        if abs(float(shaded_sinc(middle, coefficients))) ** power > 0.5:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """A line aperture, by the width of its beam.
+
+    Attributes:
+        width: full width of the beam where its power is one half, as a difference of sines of the angle.
+        shading: weights over the aperture.
+        two_way: whether the array both sends and receives: the pattern is squared.
+    """
+
+    width: float
+    shading: Shading = "hann"
+    two_way: bool = True
+
+    @cached_property
+    def length(self) -> float:
+        """Return the length of the aperture [wavelengths]."""
+        return 2 * half_power(series(self.shading), 4 if self.two_way else 2) / self.width
+
+    def pattern(self, u: ArrayLike) -> NDArray[np.float64]:
+        """Return the amplitude at a sine of the angle ``u`` from the axis, 1 on it, of the same shape."""
+        one_way = shaded_sinc(np.asarray(u, dtype=float) * self.length, series(self.shading))
+        return one_way * one_way if self.two_way else one_way
+
+    def defocused(self, u: ArrayLike, curvature: float, wavelength: float) -> NDArray[np.complex128]:
+        """Return the complex pattern of an aperture focused elsewhere (Fresnel's approximation).
+
+        Args:
+            u: sine of the angle from the axis ``(...)``.
+            curvature: 1 / range - 1 / range of the focus [1/m].
+            wavelength: [m].
+
+        Returns:
+            Amplitude ``(...)``; at a curvature of 0 the pattern itself.
+        """
+        x = (np.arange(FOCUS_PARTS) + 0.5) / FOCUS_PARTS - 0.5  # along the aperture, in its length
+        weight = 1 + sum(2 * part * np.cos(2 * math.pi * m * x) for m, part in enumerate(series(self.shading), 1))
+        weight = weight / FOCUS_PARTS
+        bend = math.pi * (self.length * x) ** 2 * wavelength * curvature
+        u = np.asarray(u, dtype=float)
+        steer = np.exp(-2j * math.pi * self.length * u[..., None] * x)
+        one_way = (steer * (weight * np.exp(-1j * bend))).sum(axis=-1)
+        return np.asarray(one_way * one_way if self.two_way else one_way, dtype=np.complex128)
+
+    @cached_property
+    def equivalent_width(self) -> float:
+        """Return the integral of the squared amplitude over u: the width of a box of the same energy."""
+        u = np.linspace(-40, 40, 400_001) / self.length
+        return float(np.trapezoid(self.pattern(u) ** 2, u))
+
+    def reach(self, below_db: float) -> float:
+        """Return the least u beyond which no lobe exceeds ``below_db`` under the axis; at most 40 / length."""
+        u = np.linspace(0, 40, 40_001) / self.length
+        loud = np.flatnonzero(np.abs(self.pattern(u)) > 10 ** (-below_db / 20))
+        return float(u[loud[-1]])

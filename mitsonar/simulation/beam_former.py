@@ -1,0 +1,173 @@
+"""The grid on which a coherent ping is summed, and the matrices that turn it into beams and bins.
+
+A line array's response depends on the difference of sines of the bearings only. So one grid over (sine, range) serves all
+beams: a banded matrix over range applies the pulse, a dense one over the sine the pattern.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from mitsonar.instruments.aperture import Aperture
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.pulse import Pulse
+from mitsonar.instruments.quality import rays_over_elevation
+
+__all__ = ["BeamFormer", "CommonFan"]
+
+SINES_A_LOBE, RANGES_A_PULSE = 8, 4
+"""Lines of the grid a wavelength over the aperture, and a resolution."""
+
+SIDE_LOBES_DB, MOST_LOBES = 45.0, 8
+"""Echoes beside the fan are kept where side lobes reach this level, at most so many wavelengths over the aperture."""
+
+PULSE_LENGTHS = 4
+"""Echoes beside the window are kept this many resolutions away."""
+
+ELEVATION_END = {"receive": 1.0, "two_way": 0.845}
+"""End of the fan over elevation in x of sinc(x): its first zero one way, -30 dB both ways."""
+
+ELEVATION_HALF = {"receive": 0.442946, "two_way": 0.318883}
+"""x of sinc(x) where the power is one half."""
+
+COLUMNS_A_BEAM = {"draft": 2, "standard": 4, "fine": 8}
+"""Rays across the width of a beam."""
+
+STEEPEST_DEG = 85.0
+"""Largest elevation of the fan."""
+
+FOCUS_BLOCKS = 24
+"""Blocks of range with a pattern each, where the array is focused at one range."""
+
+
+@dataclass(frozen=True)
+class CommonFan:
+    """Rays of a coherent ping, even in the sine of the bearing and the tangent of the elevation.
+
+    Attributes:
+        columns, rows: number of rays across and over elevation.
+        sine: largest sine of a bearing.
+        tangent: largest tangent of an elevation.
+    """
+
+    columns: int
+    rows: int
+    sine: float
+    tangent: float
+
+    @classmethod
+    def of(cls, sonar: Sonar) -> CommonFan:
+        """Derive the fan of a sonar; its density follows from the sonar's quality."""
+        half = math.radians(sonar.elevation_fov_deg) / 2
+        end = half
+        if sonar.vertical_pattern != "box":
+            stretched = math.sin(half) * ELEVATION_END[sonar.vertical_pattern] / ELEVATION_HALF[sonar.vertical_pattern]
+            end = max(half, min(math.radians(STEEPEST_DEG), math.asin(min(1.0, stretched))))
+        sine = min(0.999, math.sin(math.radians(sonar.azimuth_fov_deg) / 2) + side_lobes(sonar.aperture))
+        columns = math.ceil(2 * sine / sonar.beam_width_rad * COLUMNS_A_BEAM[sonar.quality])
+        rows = 2 * rays_over_elevation(sonar.quality, 2 * end)
+        return cls(8 * math.ceil(columns / 8), rows, sine, math.tan(end))
+
+    @property
+    def rays(self) -> int:
+        """Return the number of rays."""
+        return self.columns * self.rows
+
+
+def side_lobes(aperture: Aperture) -> float:
+    """Return how far beside a beam's axis its side lobes count, as a difference of sines."""
+    return min(aperture.reach(SIDE_LOBES_DB), MOST_LOBES / aperture.length)
+
+
+class BeamFormer:
+    """Turn fields over (sine of the bearing, range) into beams and bins.
+
+    The level of an even ground is that of a box as wide as the beam and as long as a bin, so that energies equal those of
+    the model ``physical``. What linear deposit on the grid loses of the power is divided out.
+
+    Attributes:
+        sines, ranges: number of lines of the grid.
+        first_sine, sine_step, first_range, range_step: where its lines lie.
+    """
+
+    def __init__(self, sonar: Sonar) -> None:
+        self.sonar, self.aperture, self.pulse = sonar, sonar.aperture, Pulse(sonar.resolution_m)
+        fan = CommonFan.of(sonar)
+        self.sine_step = 1 / (SINES_A_LOBE * self.aperture.length)
+        self.first_sine = -fan.sine - self.sine_step
+        self.sines = math.ceil(2 * fan.sine / self.sine_step) + 4
+        self.range_step = min(sonar.bin_m, self.pulse.resolution_m) / RANGES_A_PULSE
+        guard = PULSE_LENGTHS * self.pulse.resolution_m
+        self.first_range = max(sonar.range_min - guard, self.range_step)
+        self.ranges = math.ceil((sonar.range_max + guard - self.first_range) / self.range_step) + 2
+
+    @cached_property
+    def over_range(self) -> csr_array[Any, Any]:
+        """Return the matrix of the pulse ``(bins, ranges)`` float32."""
+        sonar, pulse = self.sonar, self.pulse
+        reach = math.ceil(PULSE_LENGTHS * pulse.resolution_m / self.range_step)
+        middle = np.round((sonar.range_m - self.first_range) / self.range_step).astype(int)
+        column = middle[:, None] + np.arange(-reach, reach + 1)
+        inside = (column >= 0) & (column < self.ranges)
+        away = sonar.range_m[:, None] - (self.first_range + column * self.range_step)
+        lost = _kept_power(pulse.shape, self.range_step, 20 * pulse.resolution_m)
+        value = pulse.shape(away) * math.sqrt(sonar.bin_m / (pulse.equivalent_m * lost))
+        row = np.broadcast_to(np.arange(sonar.range_bins)[:, None], column.shape)
+        entries = (value[inside].astype(np.float32), (row[inside], column[inside]))
+        return csr_array(entries, shape=(sonar.range_bins, self.ranges))
+
+    @cached_property
+    def _gain(self) -> float:
+        """Return the factor that gives a beam the level of a box of its width."""
+        kept = _kept_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
+        return math.sqrt(self.sonar.beam_width_rad / (self.aperture.equivalent_width * kept))
+
+    @cached_property
+    def _away(self) -> NDArray[np.float64]:
+        """Return the sine of each beam's axis less that of each line ``(beams, sines)``."""
+        line = self.first_sine + np.arange(self.sines) * self.sine_step
+        return np.asarray(np.sin(self.sonar.bearing_rad)[:, None] - line, dtype=np.float64)
+
+    @cached_property
+    def over_sine(self) -> NDArray[np.float32]:
+        """Return the matrix of the pattern ``(beams, sines)``, focused at every range."""
+        return np.asarray(self.aperture.pattern(self._away) * self._gain, dtype=np.float32)
+
+    @cached_property
+    def focused(self) -> list[tuple[slice, NDArray[np.complex64]]]:
+        """Return blocks of bins and their matrices ``(beams, sines)``, of an array focused at one range."""
+        sonar = self.sonar
+        assert sonar.focus_m is not None and sonar.frequency_hz is not None
+        wavelength = sonar.sound_speed / sonar.frequency_hz
+        found = []
+        for part in np.array_split(np.arange(sonar.range_bins), min(FOCUS_BLOCKS, sonar.range_bins)):
+            curvature = float(np.mean(1 / sonar.range_m[part])) - 1 / sonar.focus_m
+            matrix = np.stack([self.aperture.defocused(row, curvature, wavelength) for row in self._away]) * self._gain
+            found.append((slice(int(part[0]), int(part[-1]) + 1), matrix.astype(np.complex64)))
+        return found
+
+    def beams(self, field: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return the image ``(bins, beams)`` of a field ``(sines, ranges)``."""
+        parts = self.over_range @ np.concatenate([field.real, field.imag]).T  # (bins, 2 sines)
+        real, imag = parts[:, : self.sines], parts[:, self.sines :]
+        if self.sonar.focus_m is None:
+            turned = self.over_sine.T
+            image: NDArray[np.complex64] = np.ascontiguousarray(real) @ turned + 1j * (np.ascontiguousarray(imag) @ turned)
+            return image
+        sums = real + 1j * imag
+        return np.concatenate([sums[bins] @ matrix.T for bins, matrix in self.focused])
+
+
+def _kept_power(shape: Any, step: float, reach: float) -> float:
+    """Return the part of the power that linear deposit on a grid keeps, mean over places between its lines."""
+    x = np.linspace(-reach, reach, 40_001)
+    places = (np.arange(32) + 0.5) / 32
+    power = [np.trapezoid(((1 - part) * shape(x) + part * shape(x - step)) ** 2, x) for part in places]
+    return float(np.mean(power) / np.trapezoid(shape(x) ** 2, x))

@@ -1,0 +1,167 @@
+"""Coherent pings: field, beams, losses, leaks, noise, and levels after the gain, in the order of the instrument."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.noise import uniform
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.aperture import series, shaded_sinc
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.views import View, Whole
+from mitsonar.simulation.beam_former import BeamFormer
+from mitsonar.simulation.binning import Counts
+from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["CoherentImager", "coherent_imager"]
+
+FEWEST_A_CELL = 4.0
+"""Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
+
+STRIPES = 0x57121
+"""Keeps the draws of the stripes apart from those of the noise."""
+
+
+class CoherentImager:
+    """Render the complex images of a sonar: amplitudes relative to the source's at 1 m, without the gain.
+
+    Args:
+        scene: any Mitsuba scene.
+        sonar: of the model ``coherent``.
+        absorption_db_per_m: of the water, one way [dB/m].
+
+    Attributes:
+        notes: what a user should know about scene and sonar.
+    """
+
+    def __init__(self, scene: mi.Scene, sonar: Sonar, absorption_db_per_m: float) -> None:
+        self.sonar, self.former = sonar, BeamFormer(sonar)
+        self.tracer = CoherentTracer(scene, sonar, self.former)
+        self.absorption_db_per_m = absorption_db_per_m
+        self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar)]
+
+    def image(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.complex64], FieldCounts]:
+        """Return the complex image of one ping ``(bins, beams)`` with its noise, and the counts of its rays.
+
+        Args:
+            pose: of the sonar ``(6,)`` [m, rad].
+            ping: its number, of which the noise is a function.
+        """
+        field, counts = self.tracer.field(pose)
+        image = self.former.beams(field) * self._loss[:, None]
+        if self.sonar.crosstalk_db is not None:
+            image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
+        if self.sonar.noise_level_db is not None:
+            image = image + self.noise(ping)
+        if self.sonar.stripes_db > 0:
+            image = image * self._stripes
+        return np.asarray(image, dtype=np.complex64), counts
+
+    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts]:
+        """Return the levels of one ping after the gain ``(bins, beams)`` float32, and the counts of its rays."""
+        image, found = self.image(pose, ping)
+        power = image.real * image.real + image.imag * image.imag
+        rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
+        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays)
+
+    @cached_property
+    def gain(self) -> NDArray[np.float32]:
+        """Return the time-varying gain of levels ``(bins,)``: spreading, and absorption where the sonar undoes it."""
+        range_m = self.sonar.range_m
+        exponent = range_m**self.sonar.gain_exponent
+        undone = 2 * self.absorption_db_per_m * range_m if self.sonar.gain_absorption else 0.0
+        return np.asarray(exponent * 10 ** (np.asarray(undone) / 10), dtype=np.float32)
+
+    @cached_property
+    def _loss(self) -> NDArray[np.float32]:
+        """Return the amplitude that absorption leaves, there and back ``(bins,)``."""
+        return np.asarray(10 ** (-2 * self.absorption_db_per_m * self.sonar.range_m / 20), dtype=np.float32)
+
+    @cached_property
+    def _stripes(self) -> NDArray[np.float32]:
+        """Return the gain of each beam's amplitude ``(beams,)``, from the seed."""
+        rng = np.random.default_rng([abs(self.sonar.seed), STRIPES])
+        return np.asarray(10 ** (rng.normal(0, self.sonar.stripes_db, self.sonar.beams) / 20), dtype=np.float32)
+
+    # ---------------------------------------------------------------- noise
+
+    def noise(self, ping: int) -> NDArray[np.complex64]:
+        """Return the receiver's noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
+
+        White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
+        matched filter. Each number is a function of (seed, ping, cell).
+        """
+        sonar = self.sonar
+        assert sonar.noise_level_db is not None
+        waves, beams = self._noise_beams
+        first, second = uniform(
+            (1, self.former.ranges, waves), seed=sonar.seed ^ 0x6E6F6973, frames=np.array([ping]), like=np.empty(0)
+        )
+        radius = np.sqrt(-np.log(first[0]))
+        white = np.stack([radius * np.cos(2 * math.pi * second[0]), radius * np.sin(2 * math.pi * second[0])])
+        filtered = self._noise_ranges @ white.astype(np.float32).transpose(1, 0, 2).reshape(self.former.ranges, 2 * waves)
+        amplitude = np.float32(10 ** ((sonar.noise_level_db - sonar.source_level_db) / 20))
+        real, imag = (np.ascontiguousarray(filtered[:, half * waves : (half + 1) * waves]) for half in (0, 1))
+        made: NDArray[np.complex64] = amplitude * (real @ beams) + 1j * amplitude * (imag @ beams)
+        return made
+
+    @cached_property
+    def _noise_beams(self) -> tuple[int, NDArray[np.float32]]:
+        """Return how many plane waves of noise there are, and their amplitude in each beam ``(waves, beams)``.
+
+        Waves are a wavelength over the aperture apart, by the receiving pattern alone. Each beam has unit power.
+        """
+        length = self.former.aperture.length
+        reach = math.sin(math.radians(self.sonar.azimuth_fov_deg) / 2) + 4 / length
+        wave = np.arange(-reach, reach, 1 / length)
+        away = np.sin(self.sonar.bearing_rad)[:, None] - wave
+        amplitude = shaded_sinc(away * length, series(self.sonar.shading))
+        amplitude /= np.sqrt(np.square(amplitude).sum(axis=1, keepdims=True))
+        return len(wave), np.ascontiguousarray(amplitude.T, dtype=np.float32)
+
+    @cached_property
+    def _noise_ranges(self) -> object:
+        """Return the matrix of the matched filter with rows of unit power ``(bins, ranges)``."""
+        rows = self.former.over_range
+        power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
+        return rows.multiply(1 / np.sqrt(power)[:, None]).tocsr().astype(np.float32)
+
+
+def point_notes(sonar: Sonar) -> list[str]:
+    """Return a sentence where points are too few for speckle: a resolution cell should hold four."""
+    pitch = point_pitch(sonar)
+    nearest = max(sonar.range_min, sonar.bin_m)
+    held = nearest * sonar.beam_width_rad * sonar.resolution_m / pitch**2
+    needed = math.sqrt(nearest * sonar.beam_width_rad * sonar.resolution_m / FEWEST_A_CELL)
+    enough = FEWEST_A_CELL * pitch**2 / (sonar.beam_width_rad * sonar.resolution_m)
+    if held >= FEWEST_A_CELL or sonar.scatterer_spacing_m is None and enough <= sonar.range_max / 2:
+        return []
+    return [
+        f"a resolution cell holds {held:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
+        f"intensities vary more than speckle does; a scatterer_spacing_m of {needed:.2g} m would do everywhere"
+    ]
+
+
+def coherent_imager(scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None) -> CoherentImager | None:
+    """Return what renders pings of the model ``coherent``; None for other models.
+
+    Raises:
+        MitsonarError: portions of the field of view, or receivers elsewhere.
+    """
+    if sonar.model != "coherent":
+        return None
+    if views is not None and any(not isinstance(view, Whole) for view in views):
+        raise MitsonarError(
+            "the model coherent has no portions of the field of view and no receivers elsewhere: render the whole view, "
+            "or use the model physical"
+        )
+    return CoherentImager(scene, sonar, sonar.absorption_db_per_m or 0.0)

@@ -1,0 +1,278 @@
+"""One ping's complex field over (sine of the bearing, range), summed over hash-anchored scatterers in one launch.
+
+Each ray looks through the lattice cells (:mod:`mitsonar.simulation.hashed_points`) of its own cell of the surface. A point
+counts where its own direction lies in that ray's cell, so on a plane each point counts exactly once, whatever the rays.
+Its echo is zeta sqrt(C cos^2 dA) / R^2 times the elevation's pattern and exp(-2 j k R). Sums are 64-bit fixed point.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.speckle import patch_amplitudes
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import to_world_matrices
+from mitsonar.plugins.surfaces import Hit, Surfaces
+from mitsonar.simulation.beam_former import ELEVATION_HALF, BeamFormer, CommonFan
+from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point, pick
+from mitsonar.simulation.variant import garbage_stays
+
+__all__ = ["CoherentTracer", "FieldCounts"]
+
+ADD = dr.ReduceMode.Local
+"""Mode of the additions: Dr.Jit's default assumes that the number of threads is the same when a launch is replayed."""
+
+STRIP = 8
+"""Columns of a strip: rays that are traced together are neighbours."""
+
+MOST_IN_A_CELL = 2.0**16
+"""Points that one cell of the grid is sure to hold without overflow."""
+
+LARGEST_WEIGHT = 4.2
+"""Largest amplitude of a weight: the root of -log 2^-25."""
+
+COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points")
+
+
+@dataclass(frozen=True)
+class FieldCounts:
+    """Numbers of rays inside the window, nearer, farther, missed, cut short, and of points summed."""
+
+    inside: int
+    nearer: int
+    farther: int
+    missed: int
+    cut: int
+    points: int
+
+
+class CoherentTracer:
+    """Sum the echoes of hash-anchored scatterers.
+
+    Args:
+        scene: to trace.
+        sonar: of the model ``coherent``.
+        former: gives the grid.
+
+    Attributes:
+        pitch: of the lattice [m].
+    """
+
+    def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer) -> None:
+        assert sonar.frequency_hz is not None
+        self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.of(sonar)
+        self.surfaces = Surfaces.of(scene)
+        self.wavelength = sonar.sound_speed / sonar.frequency_hz
+        self.pitch = point_pitch(sonar)
+        table = patch_amplitudes(sonar.speckle_nu)
+        self.patch_entries, self.patches = len(table), mi.Float(np.resize(table, max(2, len(table))))
+        nearest = max(former.first_range, sonar.bin_m)
+        loudest = LARGEST_WEIGHT * float(table.max()) * self.pitch / nearest**2
+        self.bits = 62 - math.ceil(math.log2(loudest * MOST_IN_A_CELL))
+        self.index = dr.arange(mi.UInt32, self.fan.rays)
+        dr.make_opaque(self.index)
+        dr.eval(self.patches)
+        self.launch = self._compile()
+
+    def field(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.complex64], FieldCounts]:
+        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad], and its counts."""
+        rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
+        with garbage_stays():
+            real, imag, counts = self.launch(self.index, self.scene, rows, self.surfaces.arrays(), self.patches)
+        shape = self.former.sines, self.former.ranges
+        field = np.empty(shape, np.complex64)
+        field.real, field.imag = (np.array(part, copy=False).reshape(shape) for part in (real, imag))
+        return field, FieldCounts(*map(int, np.array(counts)))
+
+    def _compile(self) -> Callable[..., Any]:
+        @dr.freeze
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any) -> Any:
+            lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
+            rays = FanRays(self.fan, self.sonar, index, lines)
+            hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+            return self._sums(rays, hit, patches)
+
+        return launch
+
+    def _sums(self, rays: FanRays, hit: Hit, patches: mi.Float) -> tuple[Any, ...]:
+        """Sum the points of all rays: real and imaginary part ``(sines * ranges,)``, and the counts."""
+        former = self.former
+        place: DeviceArray = rays.origin + rays.d * hit.t
+        last = former.first_range + (former.ranges - 1) * former.range_step
+        points = HashedPoints(
+            replace(hit, valid=hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)),
+            place,
+            *rays.steps_on(hit),
+            pitch=self.pitch,
+            patch=self.sonar.speckle_patch_m,
+            seed=self.sonar.seed,
+        )
+        real, imag = (dr.zeros(mi.UInt64, former.sines * former.ranges) for _ in range(2))
+        counts = dr.zeros(mi.UInt32, len(COUNTED))
+        self._count(counts, hit, points)
+
+        def step(number: mi.Int32) -> tuple[mi.Int32]:
+            self._deposit(rays, points, number, patches, (real, imag), counts)
+            return (number + 1,)
+
+        begin = mi.Int32(0) + dr.zeros(mi.Int32, self.fan.rays)
+        dr.while_loop((begin,), lambda number: number < points.count, step)
+        dr.eval(real, imag, counts)
+        return *(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in (real, imag)), counts
+
+    def _count(self, counts: mi.UInt32, hit: Hit, points: HashedPoints) -> None:
+        """Count what becomes of the rays."""
+        near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
+        for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), found, mode=ADD)
+
+    def _deposit(
+        self,
+        rays: FanRays,
+        points: HashedPoints,
+        number: mi.Int32,
+        patches: mi.Float,
+        sums: tuple[mi.UInt64, mi.UInt64],
+        counts: mi.UInt32,
+    ) -> None:
+        """Add one point of each ray to the four cells of the grid around it."""
+        former = self.former
+        point = points.point(number, patches, self.patch_entries)
+        seen = rays.seen(points, point)
+        turns = seen.range_m * (2 / self.wavelength)
+        sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + point.turn) * (2 * math.pi))
+        level = points.strength * seen.cosine * point.amplitude / dr.square(mi.Float(seen.range_m))
+        level = level * elevation_gain(self.sonar, seen.tangent)
+        at_sine = (seen.sine - former.first_sine) * (1 / former.sine_step)
+        at_range = mi.Float(seen.range_m - former.first_range) * (1 / former.range_step)
+        line, cell = dr.floor(at_sine), dr.floor(at_range)
+        kept = seen.mine & (number < points.count) & (cell >= 0) & (cell < former.ranges - 1)
+        kept &= (line >= 0) & (line < former.sines - 1)
+        begin = mi.UInt32(dr.select(kept, line, 0)) * former.ranges + mi.UInt32(dr.select(kept, cell, 0))
+        part = at_sine - line, at_range - cell
+        for over_sine in (0, 1):
+            for over_range in (0, 1):
+                share = (part[0] if over_sine else 1 - part[0]) * (part[1] if over_range else 1 - part[1])
+                for total, wave in zip(sums, (cos, sin), strict=True):
+                    value = mi.UInt64(mi.Int64(mi.Float64(level * share * wave) * 2.0**self.bits))
+                    where = begin + over_sine * former.ranges + over_range
+                    dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, kept, mode=ADD)
+        dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), kept, mode=ADD)
+
+
+@dataclass
+class SeenPoint:
+    """A point as the sonar sees it: exact range [m], sine of the bearing, tangent of the elevation, cosine, its ray."""
+
+    range_m: DeviceArray
+    sine: DeviceArray
+    tangent: DeviceArray
+    cosine: DeviceArray
+    mine: DeviceArray
+
+
+class FanRays:
+    """The rays of a common fan in the world.
+
+    Bearing ``cone``: (sin b, cos b cos e, cos b sin e) as (starboard, forward, up); ``azimuth``: (cos e sin b,
+    cos e cos b, sin e).
+
+    Args:
+        fan: of the sonar.
+        sonar: tells the bearing.
+        index: number of each ray.
+        lines: first three rows of ``to_world`` in double precision.
+    """
+
+    def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]]) -> None:
+        self.fan, self.cone, self.lines = fan, sonar.bearing == "cone", lines
+        strip, place = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
+        self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
+        self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
+        u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
+        t = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
+        cos_b, cos_e = dr.sqrt(1 - u * u), dr.rsqrt(1 + t * t)
+        sin_e, zero = cos_e * t, mi.Float(0)
+        if self.cone:
+            self.d = self._world(u, cos_b * cos_e, cos_b * sin_e)
+            by_sine = (mi.Float(1), -u / cos_b * cos_e, -u / cos_b * sin_e)
+            by_tangent = (zero, -cos_b * cos_e * cos_e * sin_e, cos_b * cos_e * cos_e * cos_e)
+        else:
+            self.d = self._world(cos_e * u, cos_e * cos_b, sin_e)
+            by_sine = (cos_e, -cos_e * u / cos_b, zero)
+            by_tangent = (-cos_e * cos_e * sin_e * u, -cos_e * cos_e * sin_e * cos_b, cos_e * cos_e * cos_e)
+        self.by_sine, self.by_tangent = self._world(*by_sine), self._world(*by_tangent)
+        self.origin = mi.Point3f(*(mi.Float(line[3]) for line in lines))
+
+    def _world(self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray) -> mi.Vector3f:
+        """Turn (starboard, forward, up) into the world's axes."""
+        rows = [[mi.Float(value) for value in line[:3]] for line in self.lines]
+        return mi.Vector3f(*(row[0] * -starboard + row[1] * up + row[2] * forward for row in rows))
+
+    def _steep(self, hit: Hit) -> DeviceArray:
+        """Return the cosine between normal and ray, kept away from 0."""
+        along = dr.dot(hit.n, self.d)
+        return dr.select(dr.abs(along) > LEAST_COSINE, along, dr.select(along > 0, LEAST_COSINE, -LEAST_COSINE))
+
+    def steps_on(self, hit: Hit) -> tuple[DeviceArray, DeviceArray]:
+        """Return how the hit moves on its tangent plane by one column and by one row [m]."""
+        steep = self._steep(hit)
+        across: DeviceArray = hit.t * (self.by_sine - self.d * (dr.dot(hit.n, self.by_sine) / steep))
+        down: DeviceArray = hit.t * (self.by_tangent - self.d * (dr.dot(hit.n, self.by_tangent) / steep))
+        return across * self.sine_step, down * self.tangent_step
+
+    def may_reach(self, hit: Hit, first: float, last: float) -> DeviceArray:
+        """Test whether a ray's cell of the surface may lie in a window of ranges [m]."""
+        down = dr.abs(dr.dot(hit.n, self.by_tangent) / self._steep(hit)) * hit.t * self.tangent_step
+        across = dr.abs(dr.dot(hit.n, self.by_sine) / self._steep(hit)) * hit.t * self.sine_step
+        return (hit.t + down + across > first) & (hit.t - down - across < last)
+
+    def seen(self, points: HashedPoints, point: Point) -> SeenPoint:
+        """Return range, direction and cosine of points, and whether their direction lies in the ray's own cell."""
+        origin = pick(points.axis, mi.Vector3d(*(line[3] for line in self.lines)))
+        exact = [mi.Float64(own) - begin for own, begin in zip((point.p, point.q, point.a), origin, strict=True)]
+        range_m = dr.sqrt(sum(value * value for value in exact))
+        way = [mi.Float(value) for value in exact]
+        starboard, up, forward = (self._along(points, way, column) for column in (0, 1, 2))
+        starboard, radius = -starboard, mi.Float(range_m)
+        level = dr.sqrt(starboard * starboard + forward * forward)
+        sine = starboard / (radius if self.cone else level)
+        tangent = up / (forward if self.cone else level)
+        cosine = dr.abs(sum(n * v for n, v in zip(points.normal, way, strict=True))) / radius
+        column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
+        row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
+        mine = (column == self.column) & (row == self.row) & (forward > 0)
+        return SeenPoint(range_m, sine, tangent, cosine, mine)
+
+    def _along(self, points: HashedPoints, way: list[DeviceArray], column: int) -> DeviceArray:
+        """Return the component of vectors along one axis of the sensor."""
+        axis = pick(points.axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
+        return sum(own * part for own, part in zip(axis, way, strict=True))
+
+
+def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
+    """Return the amplitude of the elevation's pattern at a tangent of the elevation: a uniform aperture's, or 1."""
+    pattern = sonar.vertical_pattern
+    if pattern == "box":
+        return mi.Float(1)
+    half = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
+    x = tangent * dr.rsqrt(1 + tangent * tangent) * (ELEVATION_HALF[pattern] * math.pi / half)
+    one_way = dr.select(dr.abs(x) > 1e-4, dr.sin(x) / x, 1)
+    return one_way * one_way if pattern == "two_way" else one_way
+
+
+def point_pitch(sonar: Sonar) -> float:
+    """Return the pitch of the lattice [m]: as given, or for the wanted points a resolution cell at mid range."""
+    if sonar.scatterer_spacing_m is not None:
+        return sonar.scatterer_spacing_m
+    middle = max(sonar.range_min, sonar.range_max / 2)
+    return math.sqrt(middle * sonar.beam_width_rad * sonar.resolution_m / sonar.scatterers_per_cell)

@@ -1,0 +1,147 @@
+"""Scatterers that no memory holds: points on a lattice of the world, placed and weighted by a hash of their cell.
+
+A surface is divided by a lattice over the two axes of the world that its normal leans on least. Cell (i, j) of shape, axis
+and side holds one point. A hash of these gives its place in the cell and its complex Gaussian weight of mean power 1, so
+the point is the same from everywhere, in every ping, for any rays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsonar.plugins.surfaces import Hit
+from mitsonar.simulation.device_arrays import DeviceArray
+
+__all__ = ["HashedPoints", "Point", "pick"]
+
+LEAST_COSINE = 4e-3
+"""Grazing cosine below which a ray's cell is no longer stretched along the surface."""
+
+MOST_CANDIDATES = 4096
+"""Lattice cells that one ray may look through."""
+
+
+@dataclass
+class Point:
+    """A point of the lattice: coordinates ``p``, ``q``, ``a`` in the order of :func:`pick`, weight and turn of phase.
+
+    Attributes:
+        p, q, a: position [m].
+        amplitude: of the weight.
+        turn: phase of the weight, in turns 0..1.
+    """
+
+    p: DeviceArray
+    q: DeviceArray
+    a: DeviceArray
+    amplitude: DeviceArray
+    turn: DeviceArray
+
+
+def pick(axis: DeviceArray, v: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Return the components of a vector along the lattice's two axes, and along the third, ``axis``."""
+    along_x, along_z = axis == 0, axis == 2
+    p = dr.select(along_z, v.x, dr.select(along_x, v.y, v.z))
+    q = dr.select(along_z, v.y, dr.select(along_x, v.z, v.x))
+    a = dr.select(along_z, v.z, dr.select(along_x, v.x, v.y))
+    return p, q, a
+
+
+class HashedPoints:
+    """The lattice cells around the points where rays hit surfaces.
+
+    Args:
+        hit: where the rays end.
+        place: these points [m].
+        over_column, over_row: change of the point by one step to the next ray, on the tangent plane [m].
+        pitch: of the lattice [m].
+        patch: side of a patch of equal mean strength [m].
+        seed: of the hash.
+
+    Attributes:
+        axis: the axis of the world nearest to each normal, 0 to 2.
+        count: lattice cells that may hold a point of the ray.
+        cut: rays with more cells than are looked through.
+        strength: root of reflectivity times the area of a lattice cell [m].
+    """
+
+    def __init__(
+        self,
+        hit: Hit,
+        place: DeviceArray,
+        over_column: DeviceArray,
+        over_row: DeviceArray,
+        *,
+        pitch: float,
+        patch: float,
+        seed: int,
+    ) -> None:
+        leans: DeviceArray = dr.abs(hit.n)
+        self.pitch, self.patch = pitch, patch
+        self.axis = dr.select(
+            (leans.z >= leans.x) & (leans.z >= leans.y),
+            mi.UInt32(2),
+            dr.select(leans.x >= leans.y, mi.UInt32(0), mi.UInt32(1)),
+        )
+        self.normal = pick(self.axis, hit.n)
+        self.middle = pick(self.axis, place)
+        across, down = pick(self.axis, over_column), pick(self.axis, over_row)
+        low, high = [], []
+        for k in range(2):  # half a step each way, and a little for rounding
+            half = (dr.abs(across[k]) + dr.abs(down[k])) * 0.55
+            low.append(mi.Int32(dr.floor((self.middle[k] - half) * (1 / pitch))))
+            high.append(mi.Int32(dr.floor((self.middle[k] + half) * (1 / pitch))))
+        self.low = low
+        self.wide = high[0] - low[0] + 1
+        wanted = mi.Float(self.wide) * mi.Float(high[1] - low[1] + 1)
+        self.cut = hit.valid & (wanted > MOST_CANDIDATES)
+        self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, wanted)), 0)
+        side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))
+        self.key = _mixed(mi.UInt32(hit.shape_id) * 8 + self.axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
+        self.strength = dr.sqrt(hit.reflectivity * (pitch * pitch) / dr.abs(self.normal[2]))
+
+    def point(self, number: DeviceArray, patches: mi.Float, many: int) -> Point:
+        """Return the point in one of each ray's cells.
+
+        Args:
+            number: of the cell, 0 to ``count`` - 1.
+            patches: amplitudes of patches by equal probabilities, of :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
+            many: entries of that table.
+        """
+        i, j = self.low[0] + number % self.wide, self.low[1] + number // self.wide
+        place = _hash(i, j, self.key)
+        p = (mi.Float(i) + (mi.Float(place & 0xFFFF) + 0.5) * 2.0**-16) * self.pitch
+        q = (mi.Float(j) + (mi.Float(place >> 16) + 0.5) * 2.0**-16) * self.pitch
+        slope = 1 / self.normal[2]
+        a = self.middle[2] - slope * (self.normal[0] * (p - self.middle[0]) + self.normal[1] * (q - self.middle[1]))
+        first = _mixed(place ^ mi.UInt32(0x68BC21EB))
+        amplitude = dr.sqrt(-dr.log(_unit(first)))
+        if many > 1:
+            patch_i, patch_j = (mi.Int32(dr.floor(v * (1 / self.patch))) for v in (p, q))
+            patch = _hash(patch_i, patch_j, self.key + 17)
+            amplitude = amplitude * dr.gather(mi.Float, patches, patch >> (32 - int(math.log2(many))))
+        return Point(p, q, a, amplitude, _unit(_mixed(first + mi.UInt32(0x2545F491))))
+
+
+def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:
+    """Return 32 bits of a cell."""
+    one, other = (dr.reinterpret_array(mi.UInt32, value) for value in (i, j))
+    return _mixed(one * mi.UInt32(0x9E3779B1) ^ _mixed(other ^ key))
+
+
+def _mixed(x: DeviceArray) -> DeviceArray:
+    """Mix 32 bits by Chris Wellons's integer hash `lowbias32`."""
+    x = x ^ (x >> 16)
+    x = x * mi.UInt32(0x7FEB352D)
+    x = x ^ (x >> 15)
+    x = x * mi.UInt32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def _unit(bits: DeviceArray) -> DeviceArray:
+    """Return a number in 0..1, neither 0 nor 1."""
+    return (mi.Float(bits >> 8) + 0.5) * 2.0**-24

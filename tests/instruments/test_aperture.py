@@ -1,0 +1,61 @@
+"""Beam patterns against the literature's side lobes, against SciPy's windows, and against sums over the aperture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal.windows import taylor
+
+from mitsonar.instruments.aperture import SHADINGS, Aperture, Shading, series
+
+LOBES_DB = {"uniform": -13.26, "hann": -31.47, "hamming": -42.68, "taylor": -30.3}
+"""Highest side lobe of each shading (Harris 1978, table 1; Taylor by design)."""
+
+
+@pytest.mark.parametrize("two_way", [False, True])
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_side_lobes_and_width(shading: Shading, two_way: bool) -> None:
+    aperture = Aperture(0.01, shading, two_way)
+    assert aperture.pattern(0.005) ** 2 == pytest.approx(0.5, abs=1e-9)  # half power at half the width
+    u = np.linspace(0, 8 / aperture.length, 80_001)
+    level = 20 * np.log10(np.abs(aperture.pattern(u)) + 1e-12)
+    null = int(np.flatnonzero(np.diff(level) > 0)[0])
+    assert level[null:].max() == pytest.approx(LOBES_DB[shading] * (1 + two_way), abs=0.02 * (1 + two_way))
+
+
+def test_taylor_is_scipys() -> None:
+    x = (np.arange(4096) + 0.5) / 4096 - 0.5
+    own = 1 + sum(2 * part * np.cos(2 * np.pi * m * x) for m, part in enumerate(series("taylor"), 1))
+    window = taylor(4096, 4, 30, norm=False)
+    np.testing.assert_allclose(own, window / window.mean(), atol=1e-9)
+
+
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_the_pattern_is_the_sum_over_the_aperture(shading: Shading) -> None:
+    aperture = Aperture(0.02, shading, two_way=False)
+    u = np.linspace(-0.1, 0.1, 201)
+    np.testing.assert_allclose(aperture.defocused(u, 0.0, 1e-3), aperture.pattern(u), atol=2e-4)
+
+
+def test_an_array_out_of_focus_is_wider_and_lower() -> None:
+    aperture = Aperture(0.005)
+    sharp, blurred = (np.abs(aperture.defocused(np.linspace(-0.05, 0.05, 4001), bend, 8e-4)) for bend in (0.0, 0.4))
+    assert blurred[2000] < 0.9 * sharp[2000]
+    assert (blurred > blurred.max() / 2).sum() > 1.05 * (sharp > sharp.max() / 2).sum()
+    near = Aperture(0.005).defocused(0.0, 0.01, 8e-4)
+    assert abs(abs(near) - 1) < 2e-3  # far from the near field's edge nothing changes
+
+
+def test_equivalent_width_is_the_integral() -> None:
+    # of sinc(x)^2, both ways sinc(x)^4: 1 and 2/3 of a wavelength over the aperture
+    assert Aperture(0.01, "uniform", False).equivalent_width * Aperture(0.01, "uniform", False).length == pytest.approx(
+        1, abs=0.004
+    )
+    both = Aperture(0.01, "uniform", True)
+    assert both.equivalent_width * both.length == pytest.approx(2 / 3, abs=1e-5)
+
+
+def test_reach_ends_the_side_lobes() -> None:
+    aperture = Aperture(0.01, "hann", False)
+    beyond = np.linspace(aperture.reach(40), 30 / aperture.length, 10_000)
+    assert 20 * np.log10(np.abs(aperture.pattern(beyond[1:])).max()) <= -40

@@ -1,0 +1,395 @@
+"""The coherent model: energy, speckle, correlation under motion, point spread, losses, noise; closed forms and integrals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import pytest
+from helpers import Array, diffuse, floor, plate, scene
+from scipy import stats
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.acoustics.speckle import contrast
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.aperture import series, shaded_sinc
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.pulse import Pulse
+from mitsonar.motion.pose import Pose, to_world_matrices
+from mitsonar.simulation.imaging import Simulator
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsonar.simulation.coherent_imaging import CoherentImager
+
+pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
+
+Shape: TypeAlias = Callable[[Array], Array]
+
+HEIGHT, PITCH = 2.5, math.radians(35)
+SONAR = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=48, azimuth_fov_deg=14.5, beam_width_deg=0.3, range_min=4.0,
+                     range_max=4.9, range_bins=192, bearing="cone", elevation_pattern="box", quality="standard",
+                     absorption_db_per_m=0.0)  # fmt: skip
+"""Half the field of view of a DIDSON, its window within the lit floor."""
+
+POSE = np.array([0, 0, HEIGHT, PITCH, 0, 0])
+
+
+@pytest.fixture(scope="module")
+def flat(variant: str) -> mi.Scene:
+    return scene(floor=floor(diffuse(0.5)))
+
+
+def imager(loaded: mi.Scene, sonar: Sonar = SONAR) -> CoherentImager:
+    from mitsonar.simulation.coherent_imaging import CoherentImager
+
+    return CoherentImager(loaded, sonar, sonar.absorption_db_per_m or 0.0)
+
+
+def images(source: CoherentImager, count: int, apart: float = 0.7) -> Array:
+    """Complex images of places far apart: speckle of each is its own ``(count, bins, beams)``."""
+    shifts = np.arange(count)[:, None] * np.array([apart, 0.31 * apart, 0, 0, 0, 0])
+    return np.stack([source.image(POSE + shift, 0)[0] for shift in shifts])
+
+
+def expected(sonar: Sonar, reflectivity: float = 0.5) -> Array:
+    """Level of each bin of a floor ``(bins,)``: C cos dOmega / R^2 for a box as wide as the beam, on the axis.
+
+    On a cone of bearing b at height h: sin(grazing) = h / R, and dOmega = width dR h / R^2 / |d elevation's cosine|.
+    """
+    r = sonar.range_m
+    grazing = HEIGHT / r
+    area = r * sonar.beam_width_rad * sonar.bin_m / np.sqrt(1 - grazing**2)
+    return np.asarray(reflectivity * grazing**2 * area / r**4)
+
+
+# ---------------------------------------------------------------- energy and statistics
+
+
+def test_energy_is_that_of_the_physical_model(flat: mi.Scene) -> None:
+    """16 places: 0.1 dB."""
+    made = np.abs(images(imager(flat), 16)) ** 2
+    box = SONAR.replace(model="physical", coding="linear", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
+    truth = next(iter(Simulator(flat, box).pings(POSE))).levels[0]
+    assert 10 * np.log10(made.sum(axis=(1, 2)).mean() / truth.sum()) == pytest.approx(0, abs=0.1)
+    middle = made[:, :, 20:28].mean(axis=(0, 2)).reshape(-1, 16).mean(axis=1)
+    wanted = expected(SONAR).reshape(-1, 16).mean(axis=1)
+    assert np.abs(10 * np.log10(middle / wanted)).max() < 0.6  # of some 500 independent cells each: 0.2 dB
+
+
+def test_speckle_is_exponential(flat: mi.Scene) -> None:
+    """Complex Gaussian: contrast 1, skewness 2, and Kolmogorov and Smirnov's test of thinned pixels."""
+    made = np.abs(images(imager(flat), 12)) ** 2 / expected(SONAR)[:, None]
+    assert made.std() / made.mean() == pytest.approx(1, abs=0.03)
+    assert stats.skew(made.ravel()) == pytest.approx(2, abs=0.25)
+    thinned = made[:, ::4, ::4].ravel()
+    assert len(thinned) > 5000
+    assert stats.kstest(thinned / thinned.mean(), "expon").pvalue > 0.01
+
+
+@pytest.mark.parametrize("nu", [1.0, 4.0])
+def test_patches_make_speckle_heavier(flat: mi.Scene, nu: float) -> None:
+    source = imager(flat, SONAR.replace(speckle_nu=nu, speckle_patch_m=0.15))
+    made = np.abs(images(source, 40, apart=1.3)) ** 2 / expected(SONAR)[:, None]
+    assert made.std() / made.mean() == pytest.approx(contrast(nu), rel=0.1)
+    assert made.mean() == pytest.approx(1, abs=0.12)
+
+
+def test_density_changes_nothing(flat: mi.Scene) -> None:
+    """Four times the points: the same energy within 0.1 dB, the same contrast."""
+    made = [np.abs(images(imager(flat, SONAR.replace(scatterers_per_cell=n)), 16)) ** 2 for n in (6, 24)]
+    assert 10 * np.log10(made[1].mean() / made[0].mean()) == pytest.approx(0, abs=0.1)
+
+
+def test_rays_change_nothing_on_a_plane(flat: mi.Scene) -> None:
+    """Each point counts once, whatever the rays; their rounding turns phases by 0.02."""
+    one, other = (imager(flat, SONAR.replace(quality=name)).image(POSE, 0)[0] for name in ("standard", "fine"))
+    assert np.linalg.norm(one - other) < 0.03 * np.linalg.norm(one)
+    assert np.corrcoef((np.abs(one) ** 2).ravel(), (np.abs(other) ** 2).ravel())[0, 1] > 0.999
+
+
+def test_neighbours_correlate_as_pattern_and_pulse_say(flat: mi.Scene) -> None:
+    """The field's correlation is the pattern's autocorrelation over beams and the pulse's over bins."""
+    made = images(imager(flat), 12)
+    u = np.linspace(-0.1, 0.1, 200_001)
+    r = np.linspace(-0.1, 0.1, 200_001)
+    pattern, pulse = SONAR.aperture.pattern, imager(flat).former.pulse.shape
+    for lag in (1, 2):
+        over = [(made[:, :, lag:], made[:, :, :-lag]), (made[:, lag:], made[:, :-lag])]
+        away = lag * SONAR.beam_spacing_rad, lag * SONAR.bin_m
+        shape = (pattern, u, away[0]), (pulse, r, away[1])
+        for (a, b), (f, x, step) in zip(over, shape, strict=True):
+            truth = np.trapezoid(f(x) * f(x - step), x) / np.trapezoid(f(x) ** 2, x)
+            got = np.abs(intensity_correlation(a, b))
+            assert got == pytest.approx(truth**2, abs=0.03)
+
+
+def intensity_correlation(a: Array, b: Array) -> float:
+    """Correlation of the intensities, each less its mean over the places."""
+    x, y = (np.abs(v) ** 2 for v in (a, b))
+    x, y = (v - v.mean(axis=0) for v in (x, y))
+    return float((x * y).sum() / np.sqrt((x * x).sum() * (y * y).sum()))
+
+
+# ---------------------------------------------------------------- motion
+
+
+def coherence(sonar: Sonar, pose: Array, moved: Array, beam: int, bin_: int) -> complex:
+    """Correlation of one pixel's field before and after a motion, by integration over the floor around it."""
+    assert sonar.frequency_hz is not None
+    k = 2 * np.pi * sonar.frequency_hz / sonar.sound_speed
+    pulse = Pulse(sonar.resolution_m).shape
+    u0, r0 = np.sin(sonar.bearing_rad[beam]), sonar.range_m[bin_]
+    u = u0 + np.linspace(-2.5, 2.5, 81) / sonar.aperture.length
+    r = r0 + np.linspace(-2, 2, 161) * sonar.resolution_m
+    u, r = (v.ravel() for v in np.meshgrid(u, r))
+    # direction of sine u on the cone that meets the floor at range r: forward f and up l with f^2 + l^2 = 1 - u^2
+    point = floor_points(pose, u, r)
+    s1 = seen(sonar, pose, point, u0, r0, k, pulse)
+    s2 = seen(sonar, moved, point, u0, r0, k, pulse)
+    return complex((s1 * np.conj(s2)).sum() / np.sqrt((np.abs(s1) ** 2).sum() * (np.abs(s2) ** 2).sum()))
+
+
+def floor_points(pose: Array, u: Array, r: Array) -> Array:
+    """Points of the floor at sines ``u`` and ranges ``r`` of a sonar without roll: (n, 3)."""
+    world = to_world_matrices(pose[None])[0]
+    starboard, up, forward = -world[:3, 0], world[:3, 1], world[:3, 2]
+    # z: up.z l + forward.z f + starboard.z u = -h / r
+    down = -pose[2] / r - starboard[2] * u
+    norm = np.hypot(up[2], forward[2])
+    base, rest = np.arctan2(up[2], forward[2]), np.arccos(np.clip(down / (norm * np.sqrt(1 - u * u)), -1, 1))
+    angle = base - rest  # elevation below the axis' own zero
+    if np.cos(angle).mean() < 0:
+        angle = base + rest
+    f, lift = np.sqrt(1 - u * u) * np.cos(angle), np.sqrt(1 - u * u) * np.sin(angle)
+    return np.asarray(pose[:3] + r[:, None] * (u[:, None] * starboard + f[:, None] * forward + lift[:, None] * up))
+
+
+def seen(sonar: Sonar, pose: Array, point: Array, u0: float, r0: float, k: float, pulse: Shape) -> Array:
+    world = to_world_matrices(pose[None])[0]
+    way = point - pose[:3]
+    r = np.linalg.norm(way, axis=1)
+    u = way @ -world[:3, 0] / r
+    return np.asarray(sonar.aperture.pattern(u0 - u) * pulse(r0 - r) * np.exp(-2j * k * r) * (pose[2] / r) / r**1.5)
+
+
+MOTIONS = {
+    "side 1 mm": (0.001, 0, 0, 0, 0, 0),
+    "side 5 mm": (0.005, 0, 0, 0, 0, 0),
+    "side 10 mm": (0.01, 0, 0, 0, 0, 0),
+    "side 20 mm": (0.02, 0, 0, 0, 0, 0),
+    "side 40 mm": (0.04, 0, 0, 0, 0, 0),
+    "forward 0.5 mm": (0, 0.0005, 0, 0, 0, 0),
+    "forward 2 mm": (0, 0.002, 0, 0, 0, 0),
+    "forward 4 mm": (0, 0.004, 0, 0, 0, 0),
+    "forward 8 mm": (0, 0.008, 0, 0, 0, 0),
+    "up 2 mm": (0, 0, 0.002, 0, 0, 0),
+    "up 5 mm": (0, 0, 0.005, 0, 0, 0),
+    "yaw 0.05 deg": (0, 0, 0, 0, 0, math.radians(0.05)),
+    "yaw 0.1 deg": (0, 0, 0, 0, 0, math.radians(0.1)),
+    "yaw 0.3 deg": (0, 0, 0, 0, 0, math.radians(0.3)),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_speckle_follows_a_motion_as_theory_says(flat: mi.Scene, name: str) -> None:
+    """Fields before and after, weighted by the predicted phase of each pixel: the coherence within 0.03 of the integral."""
+    source, motion = imager(flat), np.array(MOTIONS[name])
+    bins, beams = np.arange(24, 168, 8), np.arange(4, 44, 3)
+    truth = np.array([[coherence(SONAR, POSE, POSE + motion, beam, bin_) for beam in beams] for bin_ in bins])
+    top = bottom = 0.0
+    power = [0.0, 0.0]
+    for shift in np.arange(14)[:, None] * np.array([0.7, 0.2, 0, 0, 0, 0]):
+        one, other = (source.image(POSE + shift + move, 0)[0][np.ix_(bins, beams)] for move in (0, motion))
+        phase = np.exp(-1j * np.angle(truth))
+        top += float((one * np.conj(other) * phase).sum().real)
+        power = [power[0] + float((np.abs(one) ** 2).sum()), power[1] + float((np.abs(other) ** 2).sum())]
+    bottom = math.sqrt(power[0] * power[1])
+    assert top / bottom == pytest.approx(np.abs(truth).mean(), abs=0.03)
+
+
+def test_a_still_sonar_sees_the_same_speckle(flat: mi.Scene) -> None:
+    """Bit for bit, in any order of pings, and in another simulator."""
+    simulator = Simulator(flat, SONAR)
+    one = simulator.render([POSE, POSE + [0.1, 0, 0, 0, 0, 0], POSE], gain=1e6).image
+    np.testing.assert_array_equal(one[0], one[2])
+    assert not np.array_equal(one[0], one[1])
+    np.testing.assert_array_equal(Simulator(flat, SONAR).render([POSE], gain=1e6).image[0], one[0])
+
+
+def test_threads_do_not_change_bits(flat: mi.Scene) -> None:
+    import drjit as dr
+
+    before = dr.thread_count()
+    try:
+        fields = []
+        for count in (1, 2, 3):
+            dr.set_thread_count(count)
+            fields.append(imager(flat).image(POSE, 0)[0])
+    finally:
+        dr.set_thread_count(before)
+    np.testing.assert_array_equal(fields[0], fields[1])
+    np.testing.assert_array_equal(fields[0], fields[2])
+
+
+# ---------------------------------------------------------------- one point
+
+
+def one_point(sonar: Sonar) -> tuple[CoherentImager, Array]:
+    """A small plate across the axis that carries one lattice point, and the sonar's pose.
+
+    Seeds are tried until exactly one point lies on the plate.
+    """
+    at = np.array([0, 4.4, 0])
+    loaded = scene(target=plate(at, (0, -1, 0), half=0.01, bsdf=diffuse(0.5)))
+    for seed in range(200):
+        source = imager(loaded, sonar.replace(scatterer_spacing_m=0.03, seed=seed))
+        if source.tracer.field(np.zeros(6))[1].points == 1:
+            return source, np.zeros(6)
+    raise AssertionError("no seed puts one point on the plate")
+
+
+@pytest.mark.parametrize(("shading", "pattern"), [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")])
+def test_point_spread(shading: str, pattern: str) -> None:
+    """Across beams and over range: 0.5 dB down to -35 dB, and the tops of the first two side lobes."""
+    narrow = {"beams": 256, "azimuth_fov_deg": 10.0, "beam_width_deg": 0.4, "range_min": 4.2, "range_max": 4.6}
+    sonar = SONAR.replace(shading=shading, pattern=pattern, range_bins=256, pulse_m=0.02, elevation_pattern="box", **narrow)
+    source, pose = one_point(sonar)
+    made = np.abs(source.image(pose, 0)[0]).astype(float)
+    range_m = sonar.range_m
+    bin_, beam = np.unravel_index(made.argmax(), made.shape)
+    for line, axis, shape in (
+        (made[bin_], np.sin(sonar.bearing_rad), sonar.aperture.pattern),
+        (made[:, beam], range_m, source.former.pulse.shape),
+    ):
+        truth = best_fit(line, axis, shape)
+        level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / truth.max()) for v in (line, truth))
+        main = wanted > -35 if shading != "uniform" else wanted > -25
+        inner = main & (np.abs(np.arange(len(line)) - line.argmax()) < first_null(wanted))
+        assert np.abs(level - wanted)[inner].max() < 0.5
+        tops = side_lobes(wanted)[:2]
+        assert len(tops) == (2 if pattern == "receive" or axis is range_m else 1)
+        for part in (slice(max(0, top - 2), top + 3) for top in tops):
+            assert level[part].max() == pytest.approx(wanted[part].max(), abs=1.0)
+
+
+def best_fit(line: Array, axis: Array, shape: Shape) -> Array:
+    """The shape at the place between samples where it fits best."""
+    step = axis[1] - axis[0]
+    places = axis[line.argmax()] + np.linspace(-1, 1, 401) * abs(step)
+    fits = [np.abs(shape(axis - place)) for place in places]
+    scale = [float(line @ fit / (fit @ fit)) for fit in fits]
+    errors = [float(((line - a * fit) ** 2).sum()) for a, fit in zip(scale, fits, strict=True)]
+    best = int(np.argmin(errors))
+    return np.asarray(scale[best] * fits[best])
+
+
+def first_null(level: Array) -> int:
+    """Samples from the top to the first minimum on its right."""
+    top = int(level.argmax())
+    return int(np.flatnonzero(np.diff(level[top:]) > 0)[0])
+
+
+def side_lobes(level: Array) -> list[int]:
+    """Indices of the maxima right of the main lobe."""
+    begin = int(level.argmax()) + first_null(level)
+    part = level[begin:]
+    return [begin + i for i in range(1, len(part) - 1) if part[i - 1] < part[i] >= part[i + 1] and part[i] > -75]
+
+
+# ---------------------------------------------------------------- levels
+
+
+def test_absorption_and_gain(flat: mi.Scene) -> None:
+    lossy = SONAR.replace(absorption_db_per_m=0.6, gain_exponent=4)
+    clear, dimmed = (imager(flat, one).levels(POSE, 0)[0] for one in (SONAR, lossy))
+    change = 10 * np.log10(dimmed / clear)
+    wanted = 40 * np.log10(SONAR.range_m) - 2 * 0.6 * SONAR.range_m
+    np.testing.assert_allclose(change, np.broadcast_to(wanted[:, None], change.shape), atol=1e-3)
+    undone = imager(flat, lossy.replace(gain_absorption=True)).levels(POSE, 0)[0]
+    np.testing.assert_allclose(10 * np.log10(undone / clear), 40 * np.log10(SONAR.range_m)[:, None] + 0 * change, atol=1e-3)
+
+
+def test_noise_has_its_level_and_is_a_function_of_the_ping(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(source_level_db=200.0, noise_level_db=80.0)
+    source = imager(flat, sonar)
+    draws = np.stack([source.noise(ping) for ping in range(12)])
+    assert 10 * np.log10((np.abs(draws) ** 2).mean()) == pytest.approx(-120, abs=0.1)
+    np.testing.assert_array_equal(draws[3], source.noise(3))
+    across = np.abs((draws[:, :, 1:] * draws[:, :, :-1].conj()).mean()) / (np.abs(draws) ** 2).mean()
+    u = np.linspace(-0.2, 0.2, 100_001)
+    length = sonar.aperture.length
+    receive = [shaded_sinc((u - away) * length, series("hann")) for away in (0, sonar.beam_spacing_rad)]
+    assert across == pytest.approx((receive[0] * receive[1]).sum() / (receive[0] ** 2).sum(), abs=0.03)
+    assert np.abs((draws[0] * draws[1].conj()).mean()) / (np.abs(draws) ** 2).mean() < 0.05
+
+
+def test_bright_speckle_stays_and_noise_changes(flat: mi.Scene) -> None:
+    """A still sonar: pixels far above the noise keep their grain, pixels at its level do not."""
+    level = 10 * math.log10(float(expected(SONAR).mean()))
+    for above, low, high in ((30.0, 0.98, 1.0), (0.0, 0.15, 0.35)):
+        source = imager(flat, SONAR.replace(noise_level_db=level - above))
+        one, other = (np.log10(np.abs(source.image(POSE, ping)[0]) ** 2) for ping in (0, 1))
+        assert low <= np.corrcoef(one.ravel(), other.ravel())[0, 1] <= high
+
+
+def test_crosstalk_and_stripes(flat: mi.Scene) -> None:
+    plain = imager(flat).image(POSE, 0)[0]
+    leaky = imager(flat, SONAR.replace(crosstalk_db=-30.0)).image(POSE, 0)[0]
+    np.testing.assert_allclose(leaky - plain, np.repeat(plain.sum(axis=1, keepdims=True), 48, axis=1) * 10**-1.5, atol=1e-9)
+    striped = np.abs(imager(flat, SONAR.replace(stripes_db=0.5)).image(POSE, 0)[0] / plain)
+    np.testing.assert_allclose(striped, striped[:1] + 0 * striped, rtol=1e-5)
+    assert 0.3 < (20 * np.log10(striped[0])).std() < 0.8
+
+
+def test_elevation_pattern_is_three_db_down_at_the_field_of_view(flat: mi.Scene) -> None:
+    """Skirts instead of edges: the level at the upper edge's range is 3 dB below that without pattern."""
+    wide = {"range_min": 3.2, "range_max": 6.4, "range_bins": 512, "elevation_fov_deg": 14.0}
+    box, skirt = (
+        (np.abs(images(imager(flat, SONAR.replace(elevation_pattern=name, **wide)), 8)) ** 2).mean(axis=(0, 2))
+        for name in ("box", "two_way")
+    )
+    r = SONAR.replace(**wide).range_m
+    edges = [HEIGHT / math.sin(PITCH + sign * math.radians(7)) for sign in (1, -1)]
+    for edge, inside in zip(edges, (1, -1), strict=True):
+        near = np.abs(r - (edge + inside * 0.12)) < 0.1
+        angle = np.abs(np.arcsin(HEIGHT / r[near]) - PITCH)
+        x = 0.318883 / math.sin(math.radians(7)) * np.sin(angle)
+        assert 10 * np.log10(skirt[near].mean() / box[near].mean()) == pytest.approx(
+            10 * math.log10(float((np.sinc(x) ** 4).mean())), abs=0.5
+        )
+    beyond = r > edges[1] + 0.3
+    assert box[beyond].mean() < 1e-3 * skirt[beyond].mean()
+
+
+def test_frames_carry_decibels(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(source_level_db=200.0, gain_exponent=0, coding_db=70.0)
+    frames = Simulator(flat, sonar).render([POSE])
+    assert frames.level == "dB"
+    level = frames.decibels_of(0) + frames.image[0] * (frames.decibels_of(1) - frames.decibels_of(0))
+    truth = 200 + 10 * np.log10(imager(flat, sonar).levels(POSE, 0)[0])
+    kept = (frames.image[0] > 0.01) & (frames.image[0] < 1)
+    np.testing.assert_allclose(level[kept], truth[kept], atol=1e-3)
+    assert frames.decibels_of(1) - frames.decibels_of(0) == pytest.approx(70)
+
+
+def test_labels_come_with_speckle(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(noise_level_db=-150.0)
+    frames = Simulator(flat, sonar).render([POSE], labels=True)
+    assert frames.shape_id is not None and frames.shadow is not None
+    assert (frames.shape_id[0, 10:-10] == 0).all()
+    assert not frames.shadow[0, 10:-10].any()
+
+
+def test_what_it_cannot_do_is_refused(flat: mi.Scene) -> None:
+    from mitsonar.instruments.views import Segment
+
+    with pytest.raises(MitsonarError, match="give the sonar noise_level_db"):
+        Simulator(flat, SONAR).render([Pose(*POSE)], noise=NOISE_MODELS["low"])
+    with pytest.raises(MitsonarError, match="no portions"):
+        Simulator(flat, SONAR, views=[Segment(SONAR, "starboard")])
+    sparse = imager(flat, SONAR.replace(scatterer_spacing_m=0.02))
+    assert "fewer" in sparse.notes[0] or "holds" in sparse.notes[0]
