@@ -114,7 +114,10 @@ class Sonar(Instrument):
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
     model: Model = Field("physical", description="physical, or thesis with its artefacts")
     gain_exponent: int = Field(
-        0, ge=0, le=4, description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading"
+        0,
+        ge=0,
+        le=4,
+        description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading of one way, 4 of both",
     )
     frame_rate_hz: float = Field(10.0, gt=0, le=1e6, description="pings a second [Hz]")
     quality: Quality = Field(
