@@ -5,7 +5,9 @@
 The ground is a plane. The sonar is above it by a fifth of the window's far end, and its highest rays meet it there.
 `plain`: one reflectivity. `textured`: cells of 15 mm with reflectivities spread evenly over 0..1. Twelve beams over the
 preset's field of view are compared, ping by ping, with the mean of many pings of many rays. Errors are rms, in % of the
-level of plain ground of the same mean. Bins where the field of view ends within a beam's width are left out. Times are of
+level of plain ground of the same mean. Bins where the field of view ends within a beam's width are left out.
+`still`: how far a sonar at rest sees the same from ping to ping over textured ground, the correlation of the levels of two
+pings, each over that of plain ground; what it lacks to 1 is the jitter of the rays, and no speckle. Times are of
 the whole sonar over the textured ground, the fastest of 15 single pings, since others may use the machine; they are printed
 and not kept. `--law` prints errors against rays for three presets in place of the table.
 """
@@ -70,12 +72,13 @@ def qualities(name: str, pings: int, reference_pings: int, repeats: int) -> dict
     rows: dict[str, dict[str, float]] = {}
     for quality in QUALITIES:
         sonar = preset(name).replace(quality=quality)
-        plain, textured = ground.errors(sonar.rays_per_beam, sonar.rays_across, pings)
+        plain, textured, still = ground.errors(sonar.rays_per_beam, sonar.rays_across, pings)
         rows[quality] = {
             "rays_per_beam": sonar.rays_per_beam,
             "rays_across": sonar.rays_across,
             "plain_percent": two_digits_up(100 * plain),
             "textured_percent": two_digits_up(100 * textured),
+            "still_correlation": round(still, 2),
         }
         ms = 1000 * ground.seconds(sonar, repeats)
         print(f"{name:22} {quality:9} {rows[quality]} {ms:.2g} ms a ping", flush=True)
@@ -84,15 +87,16 @@ def qualities(name: str, pings: int, reference_pings: int, repeats: int) -> dict
 
 def law(names: tuple[str, ...], pings: int) -> None:
     """Print errors against rays."""
-    print("| preset | rays a beam | plain, % | textured, % | bins an elevation cell covers at the far end |")
-    print("|---" * 5 + "|")
+    print("| preset | rays a beam | plain, % | textured, % | still | bins an elevation cell covers at the far end |")
+    print("|---" * 6 + "|")
     for name in names:
         ground = Ground(name, 3 * pings)
         sonar = ground.sonar
         for over, across in LAW:
-            plain, textured = ground.errors(over, across, pings)
+            plain, textured, still = ground.errors(over, across, pings)
             reach = math.radians(sonar.elevation_fov_deg) / over / math.tan(FAR_GRAZING_RAD) * sonar.range_max / sonar.bin_m
-            print(f"| {name} | {over} x {across} | {100 * plain:.2f} | {100 * textured:.1f} | {reach:.1f} |", flush=True)
+            errors = f"{100 * plain:.2f} | {100 * textured:.1f} | {still:.2f}"
+            print(f"| {name} | {over} x {across} | {errors} | {reach:.1f} |", flush=True)
 
 
 class Ground:
@@ -127,13 +131,15 @@ class Ground:
         """Of the sonar: x, y, z [m], pitch, roll, heading [rad]."""
         return [[0.0, 0.0, self.height, self.pitch, 0.0, 0.0]]
 
-    def errors(self, over: int, across: int, pings: int) -> tuple[float, float]:
-        """Relative rms errors of single pings on plain and on textured ground."""
+    def errors(self, over: int, across: int, pings: int) -> tuple[float, float, float]:
+        """Relative rms errors of single pings on plain and on textured ground; correlation of pings on the textured."""
+        pings = max(pings, 2)
         found = []
         for scene, truth in zip(self.scenes, (self.plain, self.textured), strict=True):
-            wrong = (self.levels(scene, over, across, range(pings)) - truth)[:, self.inside] / self.plain[self.inside]
-            found.append(float(np.sqrt(np.mean(wrong**2))))
-        return found[0], found[1]
+            seen = self.levels(scene, over, across, range(pings))[:, self.inside] / self.plain[self.inside]
+            found.append(float(np.sqrt(np.mean((seen - truth[self.inside] / self.plain[self.inside]) ** 2))))
+        still = np.corrcoef(seen)[np.triu_indices(pings, 1)].mean()
+        return found[0], found[1], float(still)
 
     def seconds(self, sonar: mitsonar.Sonar, repeats: int) -> float:
         """Time of the fastest ping of the whole sonar over textured ground."""

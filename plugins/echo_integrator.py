@@ -10,19 +10,32 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from mitsonar.arrays import DeviceArray
 from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar, is_imaging_sonar
-from mitsonar.plugins.surfaces import Surfaces
+from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.records.echoes import CHANNELS, Echoes
 
-__all__ = ["GRAZING", "Echo", "steep"]
+__all__ = ["GRAZING", "Echo", "edge_direction", "flatter", "steep"]
 
 GRAZING = 0.02
-"""Sine of the flattest angle (1.1 deg) at which a cell's tangent plane is followed: beyond it leaves the object."""
+"""Sine of the flattest angle (1.1 deg) at which a cell follows its tangent plane unasked: flatter, it may leave the body."""
+
+LEVEL = 0.01
+"""Sine of the largest angle between the tangent plane and the line to an edge, on the same surface as the point hit."""
 
 
 def steep(toward: DeviceArray) -> DeviceArray:
     """Return the part of a ray along the normal, kept away from 0 where the ray grazes (see :data:`GRAZING`)."""
     size: DeviceArray = dr.abs(toward)
     return dr.select(size > GRAZING, toward, dr.select(toward > 0, GRAZING, -GRAZING))
+
+
+def edge_direction(fan: Fan, angle: DeviceArray) -> DeviceArray:
+    """Return the unit direction to the middle of a cell's edge, ``angle`` above the ray [rad]; to its first order."""
+    return dr.normalize(fan.d + fan.side * fan.aside + fan.lift * angle)
+
+
+def flatter(normal: DeviceArray, d: DeviceArray, way: DeviceArray) -> DeviceArray:
+    """Return whether a direction meets the tangent plane of the ray ``d`` below :data:`GRAZING`, or does not meet it."""
+    return dr.dot(normal, way) * dr.select(dr.dot(normal, d) > 0, 1, -1) <= GRAZING
 
 
 class Echo(ADIntegrator):
@@ -46,15 +59,16 @@ class Echo(ADIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)  # type: ignore[no-untyped-call]  # Mitsuba's own class has no types
         self._fan: Fan | None = None
+        self._edges = False
         self._origin = mi.Point3f(0)
 
     @staticmethod
-    def measure(scene: mi.Scene, surfaces: Surfaces, ray: mi.Ray3f, fan: Fan, skipped: DeviceArray = 0.0) -> Echoes:
+    def measure(
+        scene: mi.Scene, surfaces: Surfaces, ray: mi.Ray3f, fan: Fan, skipped: DeviceArray = 0.0, *, edges: bool = False
+    ) -> Echoes:
         """Return the echoes of rays, arrays that are not evaluated yet.
 
-        On the tangent plane of the point hit, dR/de = -R (n . dd/de) / (n . d), and the same by bearing. This gives the
-        range interval of the cell's middle line, wherever in its cell the ray is. So on a plane cells join without gap or
-        overlap, also where rays jitter.
+        The cell's range interval is that of its middle line, wherever in its cell the ray is: see :func:`_interval`.
 
         Args:
             scene: is traced.
@@ -62,16 +76,16 @@ class Echo(ADIntegrator):
             ray: one a cell, in world axes.
             fan: the same rays; ``lift`` and ``side`` in world axes.
             skipped: distance from the sonar to where each ray starts [m].
+            edges: whether flat edges of cells are traced (:func:`_meets`), as sums over footprints need it.
         """
         hit = surfaces.hit(scene, ray)
         valid = hit.valid
         toward = dr.dot(hit.n, ray.d)
         cosine = dr.select(dr.abs(toward) < 1, dr.abs(toward), 1)
         range_m = hit.t + skipped
-        per_radian = -range_m / steep(toward)
-        slope = per_radian * dr.dot(hit.n, fan.lift)
-        middle = range_m + per_radian * dr.dot(hit.n, fan.side) * fan.aside
-        low, high = middle + slope * fan.below, middle + slope * fan.above
+        low, high = _interval(fan, hit, range_m)
+        if edges:
+            low, high = _meets(scene, ray, fan, hit, fan.below, low), _meets(scene, ray, fan, hit, fan.above, high)
         point = ray.o + ray.d * hit.t
 
         def kept(value: DeviceArray) -> DeviceArray:
@@ -119,9 +133,10 @@ class Echo(ADIntegrator):
         ray, weight = sensor.sample_ray_differential(time=time, sample1=half, sample2=position, sample3=mi.Point2f(0.5))
         if is_imaging_sonar(sensor):
             sonar = cast(ImagingSonar, sensor)
-            self._fan = sonar.film_fan(position).carried(sonar.lines())
+            self._fan, self._edges = sonar.film_fan(position).carried(sonar.lines()), sonar.sonar.model == "physical"
         else:
             self._fan = Fan(ray.d, mi.Vector3f(0), mi.Vector3f(0), *(mi.Float(0) for _ in range(5)))
+            self._edges = False
         self._origin = mi.Point3f(sensor.world_transform().translation())
         return ray, weight, mi.Vector2f(mi.Vector2u(column, row)) + mi.Vector2f(sensor.film().crop_offset())
 
@@ -135,13 +150,41 @@ class Echo(ADIntegrator):
         assert self._fan is not None
         offset: DeviceArray = ray.o - self._origin
         skipped = dr.dot(offset, ray.d)
-        echoes = self.measure(scene, surfaces, mi.Ray3f(ray), self._fan, skipped)
+        echoes = self.measure(scene, surfaces, mi.Ray3f(ray), self._fan, skipped, edges=self._edges)
         value = mi.Spectrum(echoes.reflectivity * echoes.cosine)
         return value, echoes.hit > 0, [getattr(echoes, name) for name in CHANNELS], None
 
     def to_string(self) -> str:
         """Return one line for Mitsuba's logs."""
         return "Echo[]"
+
+
+def _interval(fan: Fan, hit: Hit, range_m: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+    """Return the ranges of a cell's lower and upper edge on the tangent plane of the point hit [m].
+
+    There dR/de = -R (n . dd/de) / (n . d), and the same by bearing. So on a plane cells join without gap or overlap, also
+    where rays jitter, as long as they are short along range. The slope is that at :data:`GRAZING` at most: beyond the end
+    of a body a cell reaches by R de / GRAZING.
+    """
+    per_radian = -range_m / steep(dr.dot(hit.n, fan.d))
+    slope = per_radian * dr.dot(hit.n, fan.lift)
+    middle = range_m + per_radian * dr.dot(hit.n, fan.side) * fan.aside
+    return middle + slope * fan.below, middle + slope * fan.above
+
+
+def _meets(scene: mi.Scene, ray: mi.Ray3f, fan: Fan, hit: Hit, angle: DeviceArray, otherwise: DeviceArray) -> DeviceArray:
+    """Return where a flat edge of a cell meets the surface that its ray met [m]; elsewhere ``otherwise``.
+
+    The edge's point counts where the line to it lies within :data:`LEVEL` of the tangent plane. An edge is the same ray for
+    both of its cells, so they join.
+    """
+    way = edge_direction(fan, angle)
+    asked = hit.valid & flatter(hit.n, ray.d, way)
+    coherent: DeviceArray = True
+    found = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, way), coherent=coherent, active=asked)
+    along: DeviceArray = way * found.t - ray.d * hit.t
+    level = dr.abs(dr.dot(hit.n, along)) <= LEVEL * dr.norm(along)
+    return dr.select(asked & found.is_valid() & level, found.t, otherwise)
 
 
 mi.register_integrator("echo", Echo)

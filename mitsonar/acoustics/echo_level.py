@@ -1,4 +1,8 @@
-"""Level of an echo: its contribution to its bins."""
+"""Level of an echo: its contribution to its bins.
+
+The reflectivity C is Lambert's mu, what is scattered into a steradian: C = 1 scatters pi times what arrives, and a body that
+reflects all has C = 1 / pi.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +24,9 @@ def level(echoes: Echoes, sonar: Sonar, where: Callable[..., AnyArray]) -> AnyAr
     ``thesis``: C L, reflectivity times cosine (Almanza-Medina, eq. 2.2).
 
     ``physical``, monostatic: C cos(theta) dOmega / R^2 times the gain R^g [sr/m^2]. The factors are spreading 1/R^4 there
-    and back, Lambert's cosine squared, and the lit area dA = R^2 dOmega / cos(theta), which cancels one cosine. R is clamped
-    below to the window's begin or one bin, and above to four times the window's end, where only a footprint's tail reaches.
+    and back, Lambert's law C cos^2(theta), and the lit area dA = R^2 dOmega / cos(theta), which cancels one cosine. C is
+    Lambert's mu [1/sr]. The gain g = 2 undoes the spreading of one way, g = 4 that of both. R is clamped below to the
+    window's begin or one bin, and above to four times the window's end, where only a footprint's tail reaches.
 
     Args:
         echoes: arrays of float64.

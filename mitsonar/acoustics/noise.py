@@ -1,6 +1,7 @@
 """Noise of sonar images (Almanza-Medina, 2.2.3): a function of (seed, frame, cell), the same in NumPy and torch.
 
 The echo is clipped to [0, 1]. Pixels without echo become Gaussian; others get an added Rayleigh value. The sum is clipped.
+It is kept as published, for its tables: a pixel's law depends on whether it holds an echo, so the noise draws the shadows.
 """
 
 from __future__ import annotations
@@ -34,7 +35,12 @@ MASK = 0xFFFFFFFF
 
 
 class NoiseModel(BaseModel):
-    """Gaussian of the empty pixels and Rayleigh of the others, in fractions of the largest pixel value."""
+    """Gaussian of the empty pixels and Rayleigh of the others, in fractions of the largest pixel value.
+
+    This is the noise of the model ``thesis``, and no model of a real sonar's. A real receiver adds noise of one law to every
+    pixel, whether an echo is in it or not. Here the law changes at the border of every shadow, so a network or an estimator
+    can read the exact mask of empty pixels off the noise. Results with it say little about real images.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

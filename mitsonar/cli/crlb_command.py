@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypedDict
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, Frame, _instrument, _path, scene_parameters
+from mitsonar.cli.render_command import NOISE, SIX, Frame, _instrument, _path, scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -35,9 +35,7 @@ def crlb(
     source: Annotated[
         str, typer.Argument(metavar="SCENE|DATA.zarr", help="Mitsuba XML file, a shipped scene's name, or a data set.")
     ],
-    noise: Annotated[
-        str, typer.Option(help="Noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file.")
-    ] = "high",
+    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "high",
     start: Annotated[str | None, typer.Option("--from", help=f"Pose: {SIX}.")] = None,
     end: Annotated[
         str | None, typer.Option("--to", help="Last pose. The --poses are evenly spaced from --from to this one.")

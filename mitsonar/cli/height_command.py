@@ -11,6 +11,7 @@ import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
+from mitsonar.cli.render_command import NOISE
 from mitsonar.errors import MitsonarError
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
@@ -36,7 +37,7 @@ def height(
     view: Annotated[
         str | None, typer.Option(help="View of a data set (default: the first; of portions: whole, or all).")
     ] = None,
-    noise: Annotated[str, typer.Option(help="Noise to add: none, low, high, m,s,g or a YAML file.")] = "none",
+    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import Frame
+from mitsonar.cli.render_command import NOISE, Frame
 from mitsonar.errors import MitsonarError
 
 __all__ = ["image"]
@@ -19,9 +19,7 @@ def image(
     run_folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of a run that was rendered with --exr.")],
     bins: Annotated[int | None, typer.Option(help="Number of range bins (default: as rendered).")] = None,
     window: Annotated[str | None, typer.Option("--range", help="Range window from,to [m] (default: as rendered).")] = None,
-    noise: Annotated[
-        str, typer.Option(help="Noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file.")
-    ] = "none",
+    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: OUT/rebinned).")] = None,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="Draw each frame with axes in metres.")] = False,
     frame: Frame = "mitsonar",

@@ -12,7 +12,7 @@ import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
-from mitsonar.cli.render_command import Frame
+from mitsonar.cli.render_command import NOISE, Frame
 from mitsonar.errors import MitsonarError, meant
 from mitsonar.io.run_directory import refuse_to_replace
 
@@ -54,7 +54,7 @@ def mosaic(
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
-    noise: Annotated[str, typer.Option(help="Noise to add: none, low, high, m,s,g or a YAML file.")] = "none",
+    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:

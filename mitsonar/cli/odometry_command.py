@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, Frame
+from mitsonar.cli.render_command import NOISE, SIX, Frame
 from mitsonar.errors import MitsonarError
 
 __all__ = ["Frames", "odometry"]
@@ -54,9 +54,7 @@ def odometry(
     view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
     noise: Annotated[
         str,
-        typer.Option(
-            help="Noise to add: none, low, high, m,s,g or a YAML file; for impulse responses a ratio such as '20 dB'."
-        ),
+        typer.Option(help=f"{NOISE}; for impulse responses a ratio such as '20 dB'."),
     ] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
     workers: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import typer
@@ -23,7 +24,7 @@ def presets(
         sonar, sources = preset(name), named_sonars()[name].sources
         say(f"{name}: {named_sonars()[name].about}")
         for key, value in sonar.model_dump(exclude={"name"}).items():
-            shown = f"{value:g}" if isinstance(value, float) else str(value)
+            shown = f"{value:g}" if isinstance(value, float) else "-" if value is None else str(value)
             source = sources.get(key, "from quality" if key in RAYS else "default")
             say(f"  {key:18} {shown:10} {source}")
         for line in _accuracy([name]):
@@ -32,7 +33,7 @@ def presets(
     say(f"{'preset':22} {'az x el (deg)':14} {'beams':>5} {'width':>6}  {'window (m)':12} {'bins':>5}  instrument")
     for key, (title, *_) in named_sonars().items():
         sonar = preset(key)
-        width = "-" if sonar.beam_width_deg is None else f"{sonar.beam_width_deg:g}"
+        width = f"{math.degrees(sonar.beam_width_rad):.3g}"
         field = f"{sonar.azimuth_fov_deg:g} x {sonar.elevation_fov_deg:g}"
         window = f"{sonar.range_min:g}..{sonar.range_max:g}"
         say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
@@ -48,15 +49,16 @@ def _accuracy(names: list[str]) -> list[str]:
     about, measured = measured_errors()
     lines = [
         "",
-        "quality: rays a beam (over elevation x across), and rms error of one ping in % on plain ground / on 15 mm cells",
-        f"{'preset':22}" + "".join(f" {quality:26}" for quality in measured[names[0]]).rstrip(),
+        "quality: rays a beam (over elevation x across), rms error of one ping in % on plain ground / on 15 mm cells, and",
+        "correlation of a resting sonar's pings on these cells (below 1: jitter of the rays, not speckle)",
+        f"{'preset':22}" + "".join(f" {quality:30}" for quality in measured[names[0]]).rstrip(),
     ]
     for name in names:
         cells = [
-            f"{f'{row.rays_per_beam} x {row.rays_across}':8} {row.plain_percent:6g} % / {row.textured_percent:g} %"
-            for row in measured[name].values()
+            f"{f'{over} x {across}':8} {plain:6g} % / {textured:g} %  {still:.2f}"
+            for over, across, plain, textured, still in measured[name].values()
         ]
-        lines.append(f"{name:22}" + "".join(f" {cell:26}" for cell in cells).rstrip())
+        lines.append(f"{name:22}" + "".join(f" {cell:30}" for cell in cells).rstrip())
     return [
         *lines,
         f"Physical model; the thesis model keeps its own rays. Ground a fifth of the far range below the sonar. {about}.",

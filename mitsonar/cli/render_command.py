@@ -15,9 +15,13 @@ if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["SIX", "Frame", "render", "scene_parameters"]
+__all__ = ["NOISE", "SIX", "Frame", "render", "scene_parameters"]
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
+NOISE = (
+    "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
+    "pixels are empty"
+)
 
 Frame = Annotated[
     str,
@@ -40,7 +44,7 @@ def render(
         str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
     ] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the sonar: range_max=8.")] = None,
-    noise: Annotated[str, typer.Option(help="none, low, high, m,s,g (fractions of the maximum) or a YAML file.")] = "none",
+    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     labels: Annotated[bool, typer.Option("--labels", help="Per-pixel elevation, shape id and shadow too.")] = False,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter and noise.")] = None,
     label_floor: Annotated[

@@ -126,7 +126,10 @@ class Sonar(Instrument):
         description="coherent: speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's, artefacts included",
     )
     gain_exponent: int = Field(
-        0, ge=0, le=4, description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading"
+        0,
+        ge=0,
+        le=4,
+        description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading of one way, 4 of both",
     )
     frame_rate_hz: float = Field(10.0, gt=0, le=1e6, description="pings a second [Hz]")
     quality: Quality = Field(

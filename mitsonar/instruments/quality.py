@@ -9,7 +9,8 @@ across lower the part of the error that is jitter.
 
 Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random. The error is
 the texture's contrast over the square root of the rays in one bin. These are ``rays_across`` until an elevation cell is
-shorter than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the texture.
+shorter than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the texture. Rays jitter anew
+each ping, so a sonar at rest sees this error change. It looks like speckle, and is none.
 """
 
 from __future__ import annotations
@@ -96,12 +97,14 @@ class Measured(NamedTuple):
         plain_percent: rms error of a ping's bins on plain ground, in % of their level.
         textured_percent: on ground of 15 mm cells with reflectivities spread evenly over 0..1, in % of the level of plain
             ground of the same mean.
+        still_correlation: of the levels of two pings of a sonar at rest over that ground, relative to plain ground.
     """
 
     rays_per_beam: int
     rays_across: int
     plain_percent: float
     textured_percent: float
+    still_correlation: float
 
 
 @cache

@@ -63,7 +63,7 @@ class ReceiverTracer:
         toward = dr.dot(normal, u)
         lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
         active = lit & ~hidden(scene, point, normal, u, distance, lit)
-        return ViewEchoes(self._received(echoes, fan, u, distance, normal), dr.select(active, beam, 0), active, elevation)
+        return ViewEchoes(self._received(echoes, fan, way, distance, normal), dr.select(active, beam, 0), active, elevation)
 
     def _beam(
         self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
@@ -93,8 +93,8 @@ class ReceiverTracer:
             inside &= dr.abs(bearing - dr.gather(mi.Float, axes, beam)) <= sonar.beam_width_rad / 2
         return beam, inside, elevation
 
-    def _received(self, echoes: Echoes, fan: Fan, u: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
-        """Compute range, footprint, cosine and weight of the echoes between transmitter and receiver."""
+    def _received(self, echoes: Echoes, fan: Fan, way: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
+        """Compute range, footprint, cosine and weight of the echoes between transmitter and receiver; ``way`` from it."""
         import drjit as dr
 
         half = (echoes.range_m + distance) * 0.5
@@ -103,16 +103,41 @@ class ReceiverTracer:
         if self.view.sonar.model == "thesis":
             received.near_m = received.far_m = half
             return received
+        u = way / distance
         lift = self._rate(echoes, fan.d, fan.lift, u, normal)
         side = self._rate(echoes, fan.d, fan.side, u, normal)
         middle = half + side * fan.aside
-        low, high = middle + lift * fan.below, middle + lift * fan.above
+        rises = dr.dot(normal, fan.lift) * dr.dot(normal, fan.d) < 0
+        ends = (dr.select(rises, echoes.near_m, echoes.far_m), dr.select(rises, echoes.far_m, echoes.near_m))
+        low, high = (
+            self._edge(echoes, fan, angle, end, way, normal, middle + lift * angle)
+            for angle, end in zip((fan.below, fan.above), ends, strict=True)
+        )
         received.near_m, received.far_m = dr.select(low < high, low, high), dr.select(low < high, high, low)
         cosine = dr.abs(dr.dot(normal, u))
         received.cosine = dr.select(cosine < 1, cosine, 1)
         # spreading is 1/R_B^2, and the sonar equation divides by half the path squared
         received.solid_angle_sr = echoes.solid_angle_sr * (half / distance) ** 2
         return received
+
+    @staticmethod
+    def _edge(
+        echoes: Echoes,
+        fan: Fan,
+        angle: DeviceArray,
+        end: DeviceArray,
+        way: DeviceArray,
+        normal: DeviceArray,
+        otherwise: DeviceArray,
+    ) -> DeviceArray:
+        """Return half the path by way of a flat edge, ``end`` from the transmitter [m]; elsewhere ``otherwise``."""
+        import drjit as dr
+
+        from mitsonar.plugins.echo_integrator import edge_direction, flatter
+
+        toward = edge_direction(fan, angle)
+        back = dr.norm(way + toward * end - fan.d * echoes.range_m)
+        return dr.select(flatter(normal, fan.d, toward), (end + back) * 0.5, otherwise)
 
     @staticmethod
     def _rate(echoes: Echoes, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray) -> DeviceArray:

@@ -99,7 +99,8 @@ class Tracer:
 
     def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: LaunchTables) -> Echoes:
         """Trace the rays of :meth:`rays_of`; the echoes are not evaluated yet."""
-        return echo_integrator.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan)
+        edges = self.sonar.model == "physical"
+        return echo_integrator.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan, edges=edges)
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """Trace one ping and return its echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""

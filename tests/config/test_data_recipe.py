@@ -61,7 +61,7 @@ def test_shipped_recipes_hold_the_thesis_s_numbers(name: str) -> None:
     if physical:
         assert sonar.jittered
         assert sonar.rays_across > 1
-        assert sonar.beam_width_deg == 0.3
+        assert sonar.beam_width_rad == sonar.beam_spacing_rad
         assert sonar.bearing == "cone"
     assert len(Plan.of(recipe, min(recipe.sequences, 20))) > 0
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from helpers import diffuse, floor, floor_levels, scene
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import RAYS, Sonar
 from mitsonar.instruments.named_sonars import load_sonar, named_sonars, preset, sonar_from
+from mitsonar.simulation.imaging import Simulator
 
 
 @pytest.mark.parametrize("name", named_sonars())
@@ -32,6 +35,30 @@ def test_numbers_of_the_reference() -> None:
     assert (preset("aris3000").beams, preset("aris3000").range_bins) == (128, 1344)
     assert (down.azimuth_fov_deg, down.elevation_fov_deg, down.beams, down.range_bins) == (100, 100, 1000, 512)
     assert (down.range_min, down.range_max, down.bearing) == (2.0, 6.1, "azimuth")
+
+
+@pytest.mark.parametrize("name", named_sonars())
+def test_beams_leave_no_direction_unseen(name: str) -> None:
+    """Each beam reaches its neighbours' edges, also where axes lie at equal steps of the sine, and the ends of the fan."""
+    sonar = preset(name)
+    axes, half = sonar.bearing_rad, sonar.beam_width_rad / 2
+    assert np.diff(axes).max() <= sonar.beam_width_rad * (1 + 1e-9)
+    assert axes[-1] + half >= np.radians(sonar.azimuth_fov_deg) / 2 * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("name", ["aris3000", "didson300", "oculus-m1200d-2100khz"])
+def test_beams_receive_width_over_spacing_times_what_arrives(variant: str, name: str) -> None:
+    """Sixteen beams of a preset over a floor: their sum against the integral over the fan, each direction counted once."""
+    whole = preset(name)
+    few = {"beams": 16, "azimuth_fov_deg": 16 * np.degrees(whole.beam_spacing_rad), "beam_layout": "even"}
+    sonar = whole.replace(**few, rays_per_beam=200, rays_across=8)
+    height, pitch = 0.3 * whole.range_max, np.radians(25)
+    once = floor_levels(sonar.replace(beam_width_deg=None), height, pitch, 0.5).sum()
+    simulator = Simulator(scene(floor=floor(diffuse(0.5))), sonar)
+    received = next(simulator.pings([[0, 0, height, pitch, 0, 0]])).levels.sum(dtype=float)
+    share = sonar.beam_width_rad / sonar.beam_spacing_rad
+    assert share > 1 - 1e-9
+    assert received / once == pytest.approx(share, rel=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -86,8 +86,26 @@ def test_each_quality_is_as_good_as_its_word() -> None:
         for better, worse in (("standard", "draft"), ("fine", "standard")):
             assert rows[better].plain_percent < rows[worse].plain_percent / 3
             assert rows[better].textured_percent < rows[worse].textured_percent
+            assert rows[better].still_correlation > rows[worse].still_correlation - 0.05
         assert rows["standard"].textured_percent <= 40
         assert rows["fine"].textured_percent <= 20
+
+
+@pytest.mark.parametrize("quality", ["standard", "fine"])
+def test_pings_of_a_resting_sonar_differ_as_much_as_is_printed(variant: str, quality: str) -> None:
+    """Over 15 mm cells the rays' jitter makes pings differ; without jitter they are the same."""
+    whole = preset("didson300").replace(quality=quality)
+    sonar = whole.replace(beams=BEAMS, beam_width_deg=np.degrees(whole.beam_width_rad))
+    cells = {"type": "cell_noise", "coordinates": "position", "cell_size": 0.015}
+    rough, height = scene(floor=floor(diffuse(cells), 500.0)), sonar.range_max * np.sin(FAR_GRAZING_RAD)
+    pose = [[0, 0, height, FAR_GRAZING_RAD + np.radians(sonar.elevation_fov_deg) / 2, 0, 0]]
+    plain = floor_levels(sonar, height, pose[0][3], 0.5)
+    lit = plain > 0.2 * plain.max()
+    for jitter, wanted in ((True, measured_errors()[1]["didson300"][quality].still_correlation), (False, 1.0)):
+        simulator = Simulator(rough, sonar.replace(jitter=jitter))
+        pings = [next(simulator.pings(pose, first=ping)).levels[0][lit] / plain[lit] for ping in range(PINGS)]
+        found = np.corrcoef(pings)[np.triu_indices(PINGS, 1)].mean()
+        assert found == pytest.approx(wanted, abs=0.05)
 
 
 def test_errors_fall_as_the_law_says(variant: str) -> None:

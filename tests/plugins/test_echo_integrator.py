@@ -8,9 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from helpers import MitsubaDict, box, diffuse, floor, sphere
+from helpers import MitsubaDict, box, diffuse, floor, floor_levels, scene, sphere
 
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.views import Receiver
+from mitsonar.motion.pose import Pose
 from mitsonar.records.echoes import CHANNELS
+from mitsonar.simulation.imaging import Simulator
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -130,3 +134,82 @@ def test_reflectivity_follows_an_edited_scene() -> None:
     parameters.update()
     assert np.array(mi.render(loaded))[..., place].max() == pytest.approx(0.6)
     assert dr.width(parameters["box.bsdf.reflectance.value"]) == 1
+
+
+# ---------------------------------------------------------------- cells below 1.15 deg of grazing
+
+LOW = 0.5
+"""Height of a sonar that sees the floor as flat as 0.48 deg, at 60 m [m]."""
+
+
+def low_sonar(**fields: Any) -> Sonar:
+    """A fan of 14 deg from 3 m to 60 m; its uppermost rays meet no floor."""
+    given = {"azimuth_fov_deg": 30, "beams": 12, "beam_width_deg": 0.3, "rays_per_beam": 700, "rays_across": 4}
+    return Sonar(**{**given, "range_min": 3.0, "range_max": 60.0, "range_bins": 1000, **fields})
+
+
+@pytest.mark.parametrize("gain_exponent", [0, 2])
+@pytest.mark.parametrize("bearing", ["azimuth", "cone"])
+def test_a_flat_floor_is_whole_down_to_the_flattest_angles(bearing: str, gain_exponent: int) -> None:
+    """Every bin of one ping against the integral of C cos dOmega / R^2: cells tile the range axis beyond R = 50 h too."""
+    sonar, pitch = low_sonar(bearing=bearing, gain_exponent=gain_exponent), np.radians(6)
+    truth = floor_levels(sonar, LOW, pitch, 0.5)
+    got = next(Simulator(scene(floor=floor(half=2000.0)), sonar).pings([[0, 0, LOW, pitch, 0, 0]])).levels[0].astype(float)
+    for part in (sonar.range_m < 50 * LOW, sonar.range_m >= 50 * LOW):
+        assert (got[part] > 0).all(), f"{100 * (got[part] == 0).mean():.1f} % of the bins are empty"
+        error = 10 * np.log10(got[part] / truth[part])
+        assert np.percentile(np.abs(error), 95) < 0.5, f"95 % within {np.percentile(np.abs(error), 95):.2f} dB"
+        assert np.abs(error).max() < 1.0
+        assert abs(10 * np.log10(got[part].sum() / truth[part].sum())) < 0.02
+
+
+@pytest.mark.parametrize("jitter", [True, False])
+def test_flat_cells_join_without_gap_or_overlap(jitter: bool) -> None:
+    """Where a cell ends the next begins, also where a cell is a tenth of the range long."""
+    sonar = low_sonar(rays_per_beam=200, jitter=jitter)
+    simulator = Simulator(scene(floor=floor(half=2000.0)), sonar)
+    got = simulator.tracer.film_echoes([0, 0, LOW, np.radians(6), 0, 0], 0)
+    near, far, radius = (values.reshape(200, sonar.columns) for values in (got.near_m, got.far_m, got.range_m))
+    flat = (radius[:-1] > 60 * LOW) & (radius[1:] > 60 * LOW) & (radius[:-1] < 400 * LOW)
+    assert flat.sum() > 5 * sonar.columns
+    assert np.abs(near[:-1] - far[1:])[flat].max() < 2e-3
+    assert (far - near)[:-1][flat].max() > 0.1 * radius[:-1][flat].min()
+
+
+def test_bodies_do_not_reach_farther_beyond_their_horizon() -> None:
+    """Where the edge of a cell misses, the slope is held: nothing lies R de / 0.02 beyond a ray, and little beyond."""
+    radius, distance = 0.1, 4.0
+    window = {"range_min": 3.8, "range_max": 5.0, "range_bins": 600}
+    sonar = low_sonar(azimuth_fov_deg=4, beams=8, beam_width_deg=None, bearing="cone", **window)
+    simulator = Simulator(scene(ball=sphere((0, distance, 0), radius)), sonar)
+    levels = np.concatenate([pings.levels for pings in simulator.pings([[0, 0, 0, 0, 0, 0]] * 40)]).astype(float)
+    horizon = np.sqrt(distance**2 - radius**2)
+    beyond = levels[:, sonar.range_m - sonar.bin_m / 2 > horizon].sum() / levels.sum()
+    assert beyond < 1.5e-3
+    got = simulator.tracer.film_echoes([0, 0, 0, 0, 0, 0], 0)
+    reach = 2 * distance * np.radians(14) / 700 / 0.02  # a ray may be at the other edge, and a beam's width is aside
+    assert (got.far_m - got.range_m).max() < reach
+
+
+def test_an_edge_on_another_surface_is_not_followed() -> None:
+    """A step of the floor: cells at its brink end there, not on the lower floor behind it."""
+    low, high = floor(half=2000.0), box((0, -30, 0.1), (50, 60, 0.1))  # the brink at 30 m is 0.2 m high
+    sonar, pose = low_sonar(jitter=False), [0, 0, LOW + 0.2, np.radians(6), 0, 0]
+    got = Simulator(scene(low=low, high=high), sonar).tracer.film_echoes(pose, 0)
+    brink = (got.hit > 0) & (got.z > 0.1) & (np.abs(got.nz) > 0.5)
+    assert got.range_m[brink].max() > 28
+    behind = (got.far_m[brink] * got.y[brink] / got.range_m[brink]).max()
+    assert 30 < behind < 30 + 30 * np.radians(14) / 700 / 0.02
+
+
+def test_a_receiver_hears_a_whole_floor_too() -> None:
+    """Half of the path by way of the edge: against ten times the rays, no gaps beyond R = 50 h."""
+    found = []
+    for rays in (700, 7000):
+        sonar = low_sonar(rays_per_beam=rays, rays_across=8, beam_width_deg=None, range_min=26.0, range_bins=400)
+        receiver = Receiver(sonar, sonar, Pose(0, 0, 0.3), "b")
+        simulator = Simulator(scene(floor=floor(half=2000.0)), sonar, views=[receiver])
+        found.append(next(simulator.render_views([[0, 0, LOW, 0.1, 0, 0]]))[0].levels[0].astype(float))
+    few, many = found
+    assert (few > 0).all()
+    assert np.percentile(np.abs(10 * np.log10(few / many)), 95) < 0.5
