@@ -123,7 +123,7 @@ class Sonar(Instrument):
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
     model: Model = Field(
         "physical",
-        description="coherent: speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's, artefacts included",
+        description="coherent: with speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's",
     )
     gain_exponent: int = Field(
         0,

@@ -12,15 +12,15 @@ from mitsonar.instruments.imaging_sonar import Coding, Sonar
 @pytest.mark.parametrize("coding", ["linear", "dB", "gamma"])
 def test_there_and_back(coding: Coding) -> None:
     sonar = Sonar(coding=coding, coding_db=60.0)
-    level = np.float32([1.0, 0.5, 1e-3, 2e-6])
+    level = np.array([1.0, 0.5, 1e-3, 2e-6], np.float32)
     np.testing.assert_allclose(decoded(coded(level, sonar), sonar), level, rtol=2e-5)
-    assert coded(np.float32([7.0]), sonar) == 1
+    assert coded(np.array([7.0], np.float32), sonar) == 1
 
 
 def test_ends_of_decibels() -> None:
     sonar = Sonar(coding="dB", coding_db=60.0)
-    np.testing.assert_allclose(coded(np.float32([1, 1e-3, 1e-6, 1e-9, 0]), sonar), [1, 0.5, 0, 0, 0], atol=1e-6)
-    assert (coded(np.float32([0, 1e-12]), sonar) >= 0).all()
+    np.testing.assert_allclose(coded(np.array([1, 1e-3, 1e-6, 1e-9, 0], np.float32), sonar), [1, 0.5, 0, 0, 0], atol=1e-6)
+    assert (coded(np.array([0, 1e-12], np.float32), sonar) >= 0).all()
 
 
 def test_a_count_of_an_aris() -> None:
