@@ -130,17 +130,18 @@ class EchoBatch:
 def link_table(
     sonar: ChannelSonar, receiver: int, pose: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the geometry of one ping in the world ``(27,)``.
+    """Return the geometry of one ping in the world ``(30,)``.
 
-    Three numbers each: positions of transmitter and receiver [m], the receiver's velocity [m/s]. Nine numbers each: axes of
-    the receiver's field of view, and of the transmitter's.
+    Three numbers each: positions of transmitter and receiver [m], their velocities [m/s]. Nine numbers each: axes of the
+    receiver's field of view, and of the transmitter's.
     """
     turn = vehicle_rotation(pose).as_matrix()[0]
     one = sonar.receivers[receiver]
     offset = np.array(one.position)
     swing = velocity[:3] + np.cross([0.0, 0.0, -velocity[3]], offset)
     axes = [field.axes @ turn.T for field in (one.field, sonar.transmitter)]
-    return np.concatenate([pose[:3], pose[:3] + turn @ offset, turn @ swing, *(each.ravel() for each in axes)])
+    places, velocities = (pose[:3], pose[:3] + turn @ offset), (turn @ velocity[:3], turn @ swing)
+    return np.concatenate([*places, *velocities, *(each.ravel() for each in axes)])
 
 
 class LinkGeometry:
@@ -154,7 +155,7 @@ class LinkGeometry:
 
     def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64) -> None:
         self.sonar = sonar
-        self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(27)]
+        self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(30)]
         dr.eval(self.numbers)  # read once, not once a point
         self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
         self.sends: FieldOfView = sonar.transmitter
@@ -171,11 +172,11 @@ class LinkGeometry:
     @property
     def velocity(self) -> list[DeviceArray]:
         """Return the velocity of the receiver [m/s]."""
-        return self.vector(6)
+        return self.vector(9)
 
     def axes(self, which: int) -> list[mi.Vector3f]:
         """Return the axes of the receiver's field of view (0) or the transmitter's (1)."""
-        return [mi.Vector3f(*self.vector(9 + 9 * which + 3 * k)) for k in range(3)]
+        return [mi.Vector3f(*self.vector(12 + 9 * which + 3 * k)) for k in range(3)]
 
     def to_point(self, point: list[DeviceArray]) -> tuple[list[DeviceArray], list[DeviceArray]]:
         """Return the vectors from the transmitter and from the receiver to points of the world [m]."""
@@ -194,10 +195,11 @@ class LinkGeometry:
     def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
         """Return the shift of the carrier [Hz], given unit directions to the points.
 
-        It is positive where the vehicle approaches the point: both parts of the path get shorter.
+        It is positive where the vehicle approaches the point: both parts of the path get shorter. In a turn transmitter and
+        receiver have velocities of their own. Terms of second order in velocity over sound speed are left out.
         """
-        velocity = mi.Vector3f(*self.velocity)
-        return (dr.dot(sent, velocity) + dr.dot(received, velocity)) * (1 / self.sonar.wavelength_m)
+        sender, receiver = (mi.Vector3f(*self.vector(start)) for start in (6, 9))
+        return (dr.dot(sent, sender) + dr.dot(received, receiver)) * (1 / self.sonar.wavelength_m)
 
     def echo_batch(self, delay: DeviceArray, amplitude: DeviceArray, doppler: DeviceArray, valid: DeviceArray) -> EchoBatch:
         """Return the echoes, divided into those within ``range_max`` and those from beyond."""
@@ -287,7 +289,7 @@ class _VehicleRays:
         """Return the echoes of the points that the rays hit."""
         directions, facets = tables
         own = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
-        axes = [link.vector(9 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
+        axes = [link.vector(12 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
         u = [sum(own[k] * axes[k][axis] for k in range(3)) for axis in range(3)]
         u_sent = mi.Vector3f(*u)
         hit = replace(self.surfaces, **facets).hit(scene, mi.Ray3f(mi.Point3f(*link.sent_from), u_sent))

@@ -179,6 +179,25 @@ def test_doppler_of_every_echo() -> None:
     assert np.abs(rate / doppler - 1)[steep].max() < 1e-4
 
 
+@pytest.mark.parametrize("velocity", [(0, 0, 0, 0.4), (0.5, 1.0, -0.2, 0.4), (0, 0, 0, -2.0)])
+def test_doppler_in_a_turn_is_the_slope_of_the_delay(velocity: tuple[float, ...]) -> None:
+    """-f d tau / dt of exact delays 2 ms apart, a receiver 0.5 m to starboard of the axis of the turn. What is left out is
+    of second order: twice (v / c)^2 of the carrier, and the turning of the receiver's velocity while sound travels."""
+    sonar = ChannelSonar(receivers=(received_from((0.5, 0, 0)),), points_per_m2=20.0)
+    made = simulator(sonar, floor=floor(diffuse(0.5), 5.0))
+    apart, turn = 1e-3, velocity[3]
+    start, ahead = Pose(0.3, -0.2, 10, heading=0.7), np.array([np.sin(0.7), np.cos(0.7)])
+    over_ground = [velocity[0] * ahead[1] + velocity[1] * ahead[0], velocity[1] * ahead[1] - velocity[0] * ahead[0]]
+    rate = np.array([*over_ground, velocity[2], 0, 0, turn])
+    before, after = (made.paths(Pose(*(start + sign * apart * rate)), velocity).delay_s for sign in (-1, 1))
+    slope = -sonar.carrier_hz * (after - before) / (2 * apart)
+    here = made.paths(start, velocity)
+    fastest = np.linalg.norm(velocity[:3]) + abs(turn) * 0.5
+    second_order = 3 * (fastest / C) ** 2 + abs(turn) * fastest * here.delay_s.max() / C
+    assert np.ptp(slope) > 2
+    assert np.abs(here.doppler_hz - slope).max() < sonar.carrier_hz * second_order
+
+
 @pytest.mark.parametrize("tilt", [45.0, 60.0])
 def test_doppler_of_an_angle(tilt: float) -> None:
     """Within 0.5 %: phase between responses 40 um apart of a narrow beam, mean over places. (A beam that moves over the
