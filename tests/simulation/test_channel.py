@@ -45,7 +45,8 @@ def test_one_plate_is_one_pulse_of_known_delay_magnitude_and_phase() -> None:
     r_a, r_b = np.linalg.norm(place - sent), np.linalg.norm(place - back)
     normal = np.array([-1, -7, 8]) / np.linalg.norm([-1, -7, 8])
     cosines = abs(normal @ (place - sent)) / r_a * abs(normal @ (place - back)) / r_b
-    amplitude = np.sqrt(0.5 * 1e-4 * cosines) / (r_a * r_b)
+    (strength,), (phase,) = scatterers_of(made).strength, scatterers_of(made).phase  # the point's own, drawn once
+    amplitude = np.sqrt(strength * cosines) * np.exp(1j * phase) / (r_a * r_b)
     delay = (r_a + r_b) / C
     wanted = amplitude * sonar.pulse(sonar.delay_s - delay) * np.exp(-2j * np.pi * sonar.carrier_hz * delay)
     found = one_response(made)[0]
@@ -147,7 +148,8 @@ def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
         weight = field.sensitivity(*(field.axes @ (back / r_b[:, None]).T))
         amplitude = weight * np.sqrt(echo.strength * np.maximum(cosines, 0)) / (r_a * r_b)
         loud = np.flatnonzero(amplitude)
-        responses.append(impulse_response((r_a + r_b)[loud] / C, amplitude[loud], sonar))
+        zeta = np.exp(1j * echo.phase[loud])  # its size is in the strength
+        responses.append(impulse_response((r_a + r_b)[loud] / C, amplitude[loud] * zeta, sonar))
     here, *there = responses
     direct = np.array([np.vdot(here, one) / np.linalg.norm(here) / np.linalg.norm(one) for one in there])
     assert np.abs(np.angle(found) / np.angle(direct) - 1)[1:].max() < 0.02
