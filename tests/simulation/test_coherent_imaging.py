@@ -72,7 +72,7 @@ def expected(sonar: Sonar, reflectivity: float = 0.5) -> Array:
 def test_energy_is_that_of_the_physical_model(flat: mi.Scene) -> None:
     """16 places: 0.1 dB."""
     made = np.abs(images(imager(flat), 16)) ** 2
-    box = SONAR.replace(model="physical", coding="linear", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
+    box = SONAR.replace(model="physical", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
     truth = next(iter(Simulator(flat, box).pings(POSE))).levels[0]
     assert 10 * np.log10(made.sum(axis=(1, 2)).mean() / truth.sum()) == pytest.approx(0, abs=0.1)
     middle = made[:, :, 20:28].mean(axis=(0, 2)).reshape(-1, 16).mean(axis=1)
