@@ -190,7 +190,8 @@ class Sonar(Instrument):
     )
     stripes_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' gains, by the seed [dB] (coherent)")
     coding: Coding | None = Field(
-        None, description="how values stand for levels (with a pattern): linear, dB or gamma; default: coherent dB, else linear"
+        None,
+        description="how values stand for levels (with a pattern): linear, dB or gamma; default: coherent dB, else linear",
     )
     coding_db: float = Field(80.0, gt=0, le=300, description="span of the coding dB, from value 0 to 1 [dB]")
     coding_gamma: float = Field(0.5, gt=0, le=4, description="of the coding gamma: value = amplitude^gamma")

@@ -119,7 +119,7 @@ class CoherentTracer:
         )
         real, imag = (dr.zeros(mi.UInt64, former.sines * former.ranges) for _ in range(2))
         counts = dr.zeros(mi.UInt32, len(COUNTED))
-        self._count(counts, hit, points)
+        self._count(counts, rays, hit, points)
 
         def step(number: mi.Int32) -> tuple[mi.Int32]:
             self._deposit(rays, points, number, patches, (real, imag), counts)
@@ -130,11 +130,12 @@ class CoherentTracer:
         dr.eval(real, imag, counts)
         return *(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in (real, imag)), counts
 
-    def _count(self, counts: mi.UInt32, hit: Hit, points: HashedPoints) -> None:
-        """Count what becomes of the rays."""
+    def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
+        """Count what becomes of the rays of the field of view; those beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
         for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), found, mode=ADD)
+            kept = found & rays.inside
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), kept, mode=ADD)
 
     def _deposit(
         self,
@@ -201,6 +202,8 @@ class FanRays:
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
         t = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
+        sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
+        self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1])
         cos_b, cos_e = dr.sqrt(1 - u * u), dr.rsqrt(1 + t * t)
         sin_e, zero = cos_e * t, mi.Float(0)
         if self.cone:

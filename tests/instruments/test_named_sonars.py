@@ -49,7 +49,7 @@ def test_beams_leave_no_direction_unseen(name: str) -> None:
 @pytest.mark.parametrize("name", ["aris3000", "didson300", "oculus-m1200d-2100khz"])
 def test_beams_receive_width_over_spacing_times_what_arrives(variant: str, name: str) -> None:
     """Sixteen beams of a preset over a floor: their sum against the integral over the fan, each direction counted once."""
-    whole = preset(name)
+    whole = preset(name).replace(model="physical")
     few = {"beams": 16, "azimuth_fov_deg": 16 * np.degrees(whole.beam_spacing_rad), "beam_layout": "even"}
     sonar = whole.replace(**few, rays_per_beam=200, rays_across=8)
     height, pitch = 0.3 * whole.range_max, np.radians(25)

@@ -61,7 +61,7 @@ def test_the_sonar_equation_holds_for_every_preset(name: str) -> None:
     assert places
     narrow = {"azimuth_fov_deg": 12.0, "beams": max(8, round(12 * base.beams / base.azimuth_fov_deg)), "beam_layout": "even"}
     sonar = base.replace(
-        model="physical", frequency_hz=base.frequency_hz or 1e6, pattern="two_way", gain_exponent=0, source_level_db=200.0,
+        model="physical", frequency_hz=base.frequency_hz or 1e6, pattern="two_way", gain_exponent=0, gain_absorption=False,
         beam_width_deg=math.degrees(base.beam_width_rad), rays_per_beam=900, rays_across=16, **narrow,
     )  # fmt: skip
     for r in places:
