@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,8 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.mirror_parts import MirrorPart, mirror_of
+from mitsonar.simulation.mirror_tracing import MirrorTracer
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -38,14 +40,23 @@ class CoherentImager:
         scene: any Mitsuba scene.
         sonar: of the model ``coherent``.
         absorption_db_per_m: of the water, one way [dB/m].
+        mirrors: parts of shapes that reflect as mirrors, by the shapes' ids; default: none.
 
     Attributes:
         notes: what a user should know about scene and sonar.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, absorption_db_per_m: float) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: Sonar,
+        absorption_db_per_m: float,
+        mirrors: Mapping[str, MirrorPart] | None = None,
+    ) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
-        self.tracer = CoherentTracer(scene, sonar, self.former)
+        parts = mirror_of(scene, mirrors)
+        self.tracer = CoherentTracer(scene, sonar, self.former, parts)
+        self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
         self.absorption_db_per_m = absorption_db_per_m
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar)]
 
@@ -57,6 +68,8 @@ class CoherentImager:
             ping: its number, of which the noise is a function.
         """
         field, counts = self.tracer.field(pose)
+        if self.glints is not None:
+            field = field + self.glints.field(pose)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
@@ -151,17 +164,21 @@ def point_notes(sonar: Sonar) -> list[str]:
     ]
 
 
-def coherent_imager(scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None) -> CoherentImager | None:
+def coherent_imager(
+    scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None, mirrors: Mapping[str, MirrorPart] | None = None
+) -> CoherentImager | None:
     """Return what renders pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: portions of the field of view, or receivers elsewhere.
+        MitsonarError: portions of the field of view, or receivers elsewhere; mirrors in other models.
     """
     if sonar.model != "coherent":
+        if mirrors:
+            raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
         return None
     if views is not None and any(not isinstance(view, Whole) for view in views):
         raise MitsonarError(
             "the model coherent has no portions of the field of view and no receivers elsewhere: render the whole view, "
             "or use the model physical"
         )
-    return CoherentImager(scene, sonar, sonar.absorption_db_per_m or 0.0)
+    return CoherentImager(scene, sonar, sonar.absorption_db_per_m or 0.0, mirrors)

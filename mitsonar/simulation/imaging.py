@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
+    from mitsonar.simulation.mirror_parts import MirrorPart
 from mitsonar.simulation.labels import labels_above, labels_of
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
@@ -36,6 +37,8 @@ class Simulator:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
         views: makes the images of a ping from its echoes; default: one, of all of them.
+        mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
+            materials (model ``coherent``); default: none.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -51,6 +54,7 @@ class Simulator:
         sonar: Sonar | None = None,
         *,
         views: Sequence[View] | None = None,
+        mirrors: Mapping[str, MirrorPart] | None = None,
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
@@ -69,7 +73,7 @@ class Simulator:
             sonar = found[0]
         self.sonar = sonar
         self.tracer = Tracer(scene, sonar)
-        self.coherent = coherent_imager(scene, sonar, views)
+        self.coherent = coherent_imager(scene, sonar, views, mirrors)
         self.notes = self.tracer.notes if self.coherent is None else self.coherent.notes
         self.views: Sequence[View] = [Whole(sonar)] if views is None else views
         self.view_tracers = view_tracers(self.views)
