@@ -130,17 +130,6 @@ class BeamFormer:
         return math.sqrt(self.sonar.beam_width_rad / (self.aperture.equivalent_width * kept))
 
     @cached_property
-    def point_gain(self) -> float:
-        """Return the amplitude in the image, at its peak, of a point's echo of amplitude 1.
-
-        It is not 1, since levels are those of a box as wide as the beam and as long as a bin. So the target strength of a
-        point is ``20 log10(peak R^2 / point_gain)``, where ``peak`` is an amplitude without losses and gain, within 0.3 dB
-        by where the point lies between beams, bins and lines of the grid.
-        """
-        lost = _kept_power(self.pulse.shape, self.range_step, 20 * self.pulse.resolution_m)
-        return self._gain * math.sqrt(self.sonar.bin_m / (self.pulse.equivalent_m * lost))
-
-    @cached_property
     def _away(self) -> NDArray[np.float64]:
         """Return the sine of each beam's axis less that of each line ``(beams, sines)``."""
         line = self.first_sine + np.arange(self.sines) * self.sine_step

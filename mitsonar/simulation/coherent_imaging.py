@@ -69,7 +69,7 @@ class CoherentImager:
         """
         field, counts = self.tracer.field(pose)
         if self.glints is not None:
-            field = field + self.glints.field(pose)
+            self.glints.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)

@@ -2,17 +2,23 @@
 
     s = sum j k / 2 pi V exp(-2 k^2 h^2 cos^2) cos dA sinc(g_u / 2) sinc(g_t / 2) exp(-2 j k R) / R^2
 
-with g = 2 k d . dX, where dX is the step of the hit on its tangent plane by one column (u) or row (t), and sinc x = sin x / x.
-So the echo of a mirror plane is 1 / 2R, that of a rigid sphere a / 2 R^2 (target strength a^2 / 4).
+with g = 2 k d . dX, where dX is the step of the hit on its tangent plane by one column (u) or row (t), and
+sinc x = sin x / x. So the echo of a mirror plane is 1 / 2R, that of a rigid sphere a / 2 R^2 (target strength a^2 / 4).
 
 A plane's cells join exactly. On curved bodies and at edges the cells of the common fan are too coarse, so a first launch
 finds where: a cell is divided until it is at most a quarter of the Fresnel radius sqrt(lambda a R / (2 (a + R))), a being
 the radius of curvature from the normals of neighbouring hits; at edges that face the sonar it is divided most. A second
-launch traces these finer rays. Facets of meshes are planes here: a mesh with facets larger than the Fresnel radius of the
-body that it stands for glints as the polyhedron that it is. Bodies between the rays of the fan are not found.
+launch traces these finer rays. Bodies between the rays of the fan are not found.
 
-Beyond 30 deg from the normal the integral fades and ends at 60 deg: a mirror sends nothing back there, and what is left of
-the sum is the edge of the fan.
+Facets of meshes are planes here. A mesh that stands for a curved body needs facets below half the Fresnel radius: larger
+ones glint as the polyhedron that they are. Vertex normals count for nothing.
+
+Beyond 30 deg from the normal the integral fades and ends at 45 deg: a mirror sends nothing back there, and what is left of
+the sum is the edge of the fan. So bodies of less than some five wavelengths' radius (k a < 30) are too weak.
+
+An image's levels are those of a box as wide as the beam and as long as a bin, so its peak is no target strength. Their sum
+is: 10 log10(sum of the levels over bins and beams around the echo, without gain, times spacing over width of the beams)
++ 40 log10(R) is the target strength in dB, and absorption comes on top.
 """
 
 from __future__ import annotations
@@ -40,7 +46,7 @@ from mitsonar.simulation.variant import garbage_stays
 
 __all__ = ["MirrorTracer"]
 
-FADING, LAST = 0.866, 0.5
+FADING, LAST = 0.866, 0.707
 """Cosines between normal and ray where the integral begins to fade, and where it ends."""
 
 FACING = 0.985
@@ -75,9 +81,7 @@ class MirrorTracer:
         finest: parts that a ray's cell is divided into each way, at most.
     """
 
-    def __init__(
-        self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors, *, finest: int = FINEST
-    ) -> None:
+    def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors, *, finest: int = FINEST) -> None:
         assert sonar.frequency_hz is not None
         self.scene, self.sonar, self.former, self.finest = scene, sonar, former, finest
         self.fan, self.surfaces, self.table = CommonFan.of(sonar), Surfaces.of(scene), mirrors.table()
@@ -93,29 +97,34 @@ class MirrorTracer:
         self.told = False
 
     def field(self, pose: NDArray[np.float64]) -> NDArray[np.complex64]:
-        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad].
+        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad]; see :meth:`add`."""
+        field = np.zeros((self.former.sines, self.former.ranges), np.complex64)
+        self.add(pose, field)
+        return field
+
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64]) -> None:
+        """Add the mirrors' echoes of one ping to its field, in place.
+
+        Args:
+            pose: of the sonar ``(6,)`` [m, rad].
+            field: on the grid ``(sines, ranges)``.
 
         Warns:
             MitsonarWarning: once, where cells exceed half the Fresnel radius and no finer ones were traced.
         """
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
-        field = np.zeros((self.former.sines, self.former.ranges), np.complex64)
         with garbage_stays():
             wanted = np.array(self.survey(self.index, self.scene, rows, self.surfaces.arrays(), self.table))
         cell = np.flatnonzero(wanted)
         if not len(cell):
-            return field
+            return
         parts = self._parts(np.abs(wanted[cell]))
         self._tell(wanted[cell], parts)
-        count = parts * parts
-        number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        cell, parts = (np.repeat(part, count) for part in (cell, parts))
-        # divided here: a processor ends the process where the idle lanes of a kernel divide integers by 0
-        inputs = tuple(mi.UInt32(part.astype(np.uint32)) for part in (cell, parts, number % parts, number // parts))
+        inputs = tuple(mi.UInt32(part) for part in _expanded(cell, parts))
         with garbage_stays():
             real, imag = self.launch(inputs, self.scene, rows, self.surfaces.arrays(), self.table)
-        field.real, field.imag = (np.array(part, copy=False).reshape(field.shape) for part in (real, imag))
-        return field
+        field.real += np.array(real, copy=False).reshape(field.shape)
+        field.imag += np.array(imag, copy=False).reshape(field.shape)
 
     def _parts(self, wanted: NDArray[np.float32]) -> NDArray[np.int64]:
         """Return into how many parts each way cells are divided: powers of two, fewer where rays are too many."""
@@ -133,7 +142,7 @@ class MirrorTracer:
         self.told = True
         rays = self.fan.rays * float(excess.max()) ** 2
         warnings.warn(
-            f"cells of rays on curved mirrors are up to {excess.max():.2g} times half the Fresnel radius: their echoes are "
+            f"cells of rays on mirrors are up to {excess.max():.2g} times half the Fresnel radius: their echoes are "
             f"wrong by decibels; {rays:,.0f} rays would do, of {self.fan.rays:,} now: choose a finer quality or a lower "
             "frequency",
             MitsonarWarning,
@@ -251,12 +260,23 @@ class FinerRays(FanRays):
     def __init__(self, fan: CommonFan, sonar: Sonar, inputs: tuple[mi.UInt32, ...], lines: list[list[Any]]) -> None:
         cell, parts, over, down = inputs
         super().__init__(fan, sonar, cell, lines)
-        self.sine_step = self.sine_step / mi.Float(parts)
-        self.tangent_step = self.tangent_step / mi.Float(parts)
+        self.sine_step: DeviceArray = self.sine_step / mi.Float(parts)
+        self.tangent_step: DeviceArray = self.tangent_step / mi.Float(parts)
         column = mi.Float(self.column * mi.Int32(parts) + mi.Int32(over)) + 0.5
         row = mi.Float(self.row * mi.Int32(parts) + mi.Int32(down)) + 0.5
         self.sine, self.tangent = column * self.sine_step - fan.sine, fan.tangent - row * self.tangent_step
         self._aim(self.sine, self.tangent)
+
+
+def _expanded(cell: NDArray[np.intp], parts: NDArray[np.int64]) -> tuple[NDArray[np.uint32], ...]:
+    """Return cell, parts each way, the part's column and row of each ray, for cells and their parts ``(n,)``.
+
+    Divided on the host: the processor ends the process where idle lanes of a kernel divide integers by 0.
+    """
+    count = parts * parts
+    number = np.arange(count.sum(), dtype=np.uint32) - np.repeat((np.cumsum(count) - count).astype(np.uint32), count)
+    cells, each = (np.repeat(part.astype(np.uint32), count) for part in (cell, parts))
+    return cells, each, number % each, number // each
 
 
 def _lines(rows: mi.Float64) -> list[list[Any]]:
