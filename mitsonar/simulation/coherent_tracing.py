@@ -21,8 +21,9 @@ from mitsonar.acoustics.speckle import patch_amplitudes
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit, Surfaces
-from mitsonar.simulation.beam_former import ELEVATION_HALF, BeamFormer, CommonFan
+from mitsonar.simulation.beam_former import BeamFormer, CommonFan
 from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.elevation_pattern import elevation_gain
 from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point, pick
 from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
 from mitsonar.simulation.variant import garbage_stays
@@ -284,17 +285,6 @@ class FanRays:
         """Return the component of vectors along one axis of the sensor."""
         axis = pick(points.axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
         return sum(own * part for own, part in zip(axis, way, strict=True))
-
-
-def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
-    """Return the amplitude of the elevation's pattern at a tangent of the elevation: a uniform aperture's, or 1."""
-    pattern = sonar.vertical_pattern
-    if pattern == "box":
-        return mi.Float(1)
-    half = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
-    x = tangent * dr.rsqrt(1 + tangent * tangent) * (ELEVATION_HALF[pattern] * math.pi / half)
-    one_way = dr.select(dr.abs(x) > 1e-4, dr.sin(x) / x, 1)
-    return one_way * one_way if pattern == "two_way" else one_way
 
 
 def point_pitch(sonar: Sonar) -> float:

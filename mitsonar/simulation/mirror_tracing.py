@@ -287,9 +287,11 @@ def _lines(rows: mi.Float64) -> list[list[Any]]:
 def _fading(cosine: DeviceArray) -> DeviceArray:
     """Return a factor that falls smoothly from 1 at :data:`FADING` to 0 at :data:`LAST`."""
     x = (cosine - LAST) * (1 / (FADING - LAST))
-    return dr.select(x < 1, dr.select(x > 0, x * x * (3 - 2 * x), 0), 1)
+    inner: DeviceArray = dr.select(x > 0, x * x * (3 - 2 * x), 0)
+    return dr.select(x < 1, inner, 1)
 
 
 def _sinc(x: DeviceArray) -> DeviceArray:
     """Return sin(x) / x."""
-    return dr.select(dr.abs(x) > 1e-3, dr.sin(x) / x, 1 - x * x / 6)
+    size: DeviceArray = dr.abs(x)
+    return dr.select(size > 1e-3, dr.sin(x) / x, 1 - x * x / 6)

@@ -110,6 +110,13 @@ def test_bad_yaml_files(tmp_path: Path, text: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_long_name_is_cut(tmp_path: Path) -> None:
+    (tmp_path / "long.yaml").write_text(f"preset: '{'9' * 5000}'\n")
+    with pytest.raises(MitsonarError, match=r"unknown sonar preset '9+\.\.\.9+': known: ") as caught:
+        load_sonar(tmp_path / "long.yaml")
+    assert len(str(caught.value)) < 500
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match=r"cannot read sonar file .*absent\.yaml: No such file"):
         load_sonar(tmp_path / "absent.yaml")

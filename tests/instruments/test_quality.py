@@ -200,6 +200,8 @@ def test_an_unknown_quality_names_the_nearest(wrong: str, near: str) -> None:
         Sonar.create(quality=wrong)
     with pytest.raises(MitsonarError, match="unknown quality 3"):
         sonar_from({"preset": "didson300", "quality": 3})
+    with pytest.raises(MitsonarError, match=r"unknown quality \['fine'\]"):
+        sonar_from({"preset": "didson300", "quality": ["fine"]})
 
 
 def test_an_unknown_quality_in_xml_names_the_nearest(variant: str) -> None:

@@ -35,7 +35,7 @@ STILL = np.zeros(6)
 def imager(loaded: mi.Scene, sonar: Sonar = SONAR, **mirrors: tuple[float, float] | Material) -> CoherentImager:
     from mitsonar.simulation.coherent_imaging import CoherentImager
 
-    return CoherentImager(loaded, sonar, sonar.absorption_db_per_m or 0.0, mirrors)
+    return CoherentImager(loaded, sonar, mirrors)
 
 
 def tracer(loaded: mi.Scene, sonar: Sonar = SONAR, **mirrors: tuple[float, float]) -> MirrorTracer:
