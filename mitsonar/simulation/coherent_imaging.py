@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,8 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.mirror_parts import MirrorPart, mirror_of
+from mitsonar.simulation.mirror_tracing import MirrorTracer
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -39,14 +41,17 @@ class CoherentImager:
     Args:
         scene: any Mitsuba scene.
         sonar: of the model ``coherent``.
+        mirrors: parts of shapes that reflect as mirrors, by the shapes' ids; default: none.
 
     Attributes:
         notes: what a user should know about scene and sonar.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar) -> None:
+    def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mapping[str, MirrorPart] | None = None) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
-        self.tracer = CoherentTracer(scene, sonar, self.former)
+        parts = mirror_of(scene, mirrors)
+        self.tracer = CoherentTracer(scene, sonar, self.former, parts)
+        self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
     def image(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.complex64], FieldCounts]:
@@ -57,6 +62,8 @@ class CoherentImager:
             ping: its number, of which the noise is a function.
         """
         field, counts = self.tracer.field(pose)
+        if self.glints is not None:
+            self.glints.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
@@ -147,17 +154,21 @@ def point_notes(sonar: Sonar) -> list[str]:
     ]
 
 
-def coherent_imager(scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None) -> CoherentImager | None:
+def coherent_imager(
+    scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None, mirrors: Mapping[str, MirrorPart] | None = None
+) -> CoherentImager | None:
     """Return what renders pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: portions of the field of view, or receivers elsewhere.
+        MitsonarError: portions of the field of view, or receivers elsewhere; mirrors in other models.
     """
     if sonar.model != "coherent":
+        if mirrors:
+            raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
         return None
     if views is not None and any(not isinstance(view, Whole) for view in views):
         raise MitsonarError(
             "the model coherent has no portions of the field of view and no receivers elsewhere: render the whole view, "
             "or use the model physical"
         )
-    return CoherentImager(scene, sonar)
+    return CoherentImager(scene, sonar, mirrors)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from mitsonar.instruments.views import View
     from mitsonar.simulation.expected_former import ExpectedFormer
+    from mitsonar.simulation.mirror_parts import MirrorPart
     from mitsonar.simulation.tracing import Tracer
 from mitsonar.simulation.labels import labels_above, labels_of
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
@@ -39,6 +40,8 @@ class Simulator:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
         views: makes the images of a ping from its echoes; default: one, of all of them.
+        mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
+            materials (model ``coherent``); default: none.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -54,6 +57,7 @@ class Simulator:
         sonar: Sonar | None = None,
         *,
         views: Sequence[View] | None = None,
+        mirrors: Mapping[str, MirrorPart] | None = None,
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
@@ -72,7 +76,7 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar = sonar
-        self.coherent = coherent_imager(scene, sonar, views)
+        self.coherent = coherent_imager(scene, sonar, views, mirrors)
         self.former = expected_former(sonar, views)
         traced = sonar if self.former is None else self.former.traced
         self.tracer = Tracer(scene, traced)
