@@ -177,6 +177,11 @@ class Sonar(Instrument):
     noise_level_db: float | None = Field(
         None, ge=-300, le=300, description="noise in a beam and bin [dB re 1 uPa] (coherent); default: none"
     )
+    volume_db: float | None = Field(
+        None, ge=-200, le=0, description="volume scattering strength of the water [dB re 1/m] (coherent); default: none"
+    )
+    near_glow_db: float = Field(0.0, ge=0, le=120, description="noise near the sonar above noise_level_db [dB] (coherent)")
+    near_glow_m: float = Field(0.5, gt=0, le=100, description="range over which near_glow_db falls to 0, evenly in dB [m]")
     absorption_db_per_m: float | None = Field(
         None, ge=0, le=1e3, description="one way [dB/m]; default: coherent by frequency and water, else 0"
     )
@@ -229,6 +234,8 @@ class Sonar(Instrument):
         return self
 
     def _check_coherent(self) -> None:
+        if self.near_glow_db > 0 and self.noise_level_db is None:
+            raise ValueError("near_glow_db stands above the noise: give noise_level_db too")
         if self.frequency_hz is None:
             raise ValueError("the model coherent needs the carrier: give frequency_hz, 1.8e6 for example")
         if self.azimuth_fov_deg > MOST_COHERENT_DEG or self.elevation_fov_deg > MOST_COHERENT_DEG:

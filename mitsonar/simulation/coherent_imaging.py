@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,8 +31,8 @@ __all__ = ["CoherentImager", "coherent_imager"]
 FEWEST_A_CELL = 4.0
 """Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
 
-STRIPES = 0x57121
-"""Keeps the draws of the stripes apart from those of the noise."""
+STRIPES, NOISE, VOLUME = 0x57121, 0x6E6F6973, 0x766F6C75
+"""Keep the draws of stripes, noise and volume apart."""
 
 
 class CoherentImager:
@@ -67,6 +67,8 @@ class CoherentImager:
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
+        if self.sonar.volume_db is not None:
+            image = image + self.volume(ping)
         if self.sonar.noise_level_db is not None:
             image = image + self.noise(ping)
         if self.sonar.stripes_db > 0:
@@ -96,40 +98,52 @@ class CoherentImager:
         rng = np.random.default_rng([abs(self.sonar.seed), STRIPES])
         return np.asarray(10 ** (rng.normal(0, self.sonar.stripes_db, self.sonar.beams) / 20), dtype=np.float32)
 
-    # ---------------------------------------------------------------- noise
+    # ---------------------------------------------------------------- noise and volume
 
     def noise(self, ping: int) -> NDArray[np.complex64]:
         """Return the receiver's noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
 
         White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
-        matched filter. Each number is a function of (seed, ping, cell).
+        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell).
         """
         sonar = self.sonar
         assert sonar.noise_level_db is not None
-        waves, beams = self._noise_beams
-        first, second = uniform(
-            (1, self.former.ranges, waves), seed=sonar.seed ^ 0x6E6F6973, frames=np.array([ping]), like=np.empty(0)
-        )
+        glow = sonar.near_glow_db * np.maximum(0, 1 - sonar.range_m / sonar.near_glow_m)
+        amplitude = 10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 20)
+        return self._white(ping, NOISE, 1) * np.asarray(amplitude, np.float32)[:, None]
+
+    def volume(self, ping: int) -> NDArray[np.complex64]:
+        """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4."""
+        sonar = self.sonar
+        assert sonar.volume_db is not None
+        volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
+        power = 10 ** (sonar.volume_db / 10) * volume / sonar.range_m**4 * loss_of(sonar)
+        return self._white(ping, VOLUME, 2) * np.asarray(np.sqrt(power), np.float32)[:, None]
+
+    def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
+        """Return complex Gaussian noise of unit power ``(bins, beams)`` that has passed array and matched filter."""
+        waves = self._waves(ways)
+        shape = 1, self.former.ranges, len(waves)
+        first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
         radius = np.sqrt(-np.log(first[0]))
-        white = np.stack([radius * np.cos(2 * math.pi * second[0]), radius * np.sin(2 * math.pi * second[0])])
-        filtered = self._noise_ranges @ white.astype(np.float32).transpose(1, 0, 2).reshape(self.former.ranges, 2 * waves)
-        amplitude = np.float32(10 ** ((sonar.noise_level_db - sonar.source_level_db) / 20))
-        real, imag = (np.ascontiguousarray(filtered[:, half * waves : (half + 1) * waves]) for half in (0, 1))
-        return np.asarray(amplitude * (real @ beams) + 1j * amplitude * (imag @ beams), dtype=np.complex64)
+        white = np.concatenate([radius * np.cos(2 * math.pi * second[0]), radius * np.sin(2 * math.pi * second[0])], axis=1)
+        filtered = self._noise_ranges @ white.astype(np.float32)
+        real, imag = (np.ascontiguousarray(part) @ waves for part in np.split(filtered, 2, axis=1))
+        return np.asarray(real + 1j * imag, dtype=np.complex64)
 
-    @cached_property
-    def _noise_beams(self) -> tuple[int, NDArray[np.float32]]:
-        """Return how many plane waves of noise there are, and their amplitude in each beam ``(waves, beams)``.
+    @cache  # noqa: B019  an imager lives as long as its matrices
+    def _waves(self, ways: int) -> NDArray[np.float32]:
+        """Return the amplitude of plane waves in each beam ``(waves, beams)``, by the pattern one way or both ways.
 
-        Waves are a wavelength over the aperture apart, by the receiving pattern alone. Each beam has unit power.
+        Waves are half a wavelength over the aperture apart, which resolves both patterns. Each beam has unit power.
         """
         length = self.former.aperture.length
         reach = math.sin(math.radians(self.sonar.azimuth_fov_deg) / 2) + 4 / length
-        wave = np.arange(-reach, reach, 1 / length)
+        wave = np.arange(-reach, reach, 1 / (ways * length))
         away = np.sin(self.sonar.bearing_rad)[:, None] - wave
-        amplitude = shaded_sinc(away * length, series(self.sonar.shading))
+        amplitude = shaded_sinc(away * length, series(self.sonar.shading)) ** ways
         amplitude /= np.sqrt(np.square(amplitude).sum(axis=1, keepdims=True))
-        return len(wave), np.ascontiguousarray(amplitude.T, dtype=np.float32)
+        return np.ascontiguousarray(amplitude.T, dtype=np.float32)
 
     @cached_property
     def _noise_ranges(self) -> csr_array[Any, Any]:

@@ -328,6 +328,27 @@ def test_noise_has_its_level_and_is_a_function_of_the_ping(flat: mi.Scene) -> No
     assert np.abs((draws[0] * draws[1].conj()).mean()) / (np.abs(draws) ** 2).mean() < 0.05
 
 
+def test_volume_reverberation_has_its_level(flat: mi.Scene) -> None:
+    """Sv + 10 log of the cell's volume - 40 log R - 2 alpha R; new in each ping."""
+    sonar = SONAR.replace(volume_db=-60.0, absorption_db_per_m=0.5)
+    source = imager(flat, sonar)
+    made = (np.abs(np.stack([source.volume(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2))
+    r = sonar.range_m
+    cell = r**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
+    truth = -60 + 10 * np.log10(cell) - 40 * np.log10(r) - 2 * 0.5 * r
+    assert np.abs(10 * np.log10(made) - truth).reshape(-1, 16).mean(axis=1).max() < 0.6
+    assert 10 * np.log10(made).mean() == pytest.approx(truth.mean(), abs=0.1)
+    assert not np.array_equal(source.volume(0), source.volume(1))
+
+
+def test_near_glow_falls_evenly_in_decibels(flat: mi.Scene) -> None:
+    sonar = SONAR.replace(range_min=0.2, range_max=1.1, noise_level_db=-120.0, near_glow_db=30.0, near_glow_m=0.8)
+    source = imager(flat, sonar)
+    made = 10 * np.log10((np.abs(np.stack([source.noise(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2)))
+    truth = -120 + 30 * np.maximum(0, 1 - sonar.range_m / 0.8)
+    assert np.abs((made - truth).reshape(-1, 16).mean(axis=1)).max() < 0.3
+
+
 def test_bright_speckle_stays_and_noise_changes(flat: mi.Scene) -> None:
     """A still sonar: pixels far above the noise keep their grain, pixels at its level do not."""
     level = 10 * math.log10(float(expected(SONAR).mean()))
