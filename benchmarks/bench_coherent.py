@@ -1,0 +1,144 @@
+"""What a coherent ping costs, beside the bare tracing of its rays and beside the model physical.
+
+    python benchmarks/bench_coherent.py [--json] [--quick] [--variant cuda_ad_mono]
+
+Milliseconds of processor time of all threads, and of wall time, medians within one run; rows take turns. `trace` is
+`ray_intersect_preliminary` on the rays of the coherent fan. `beams`: the model physical with pattern two_way. The poses move
+by 10 mm a ping.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from bench_render import machine
+from rocky_seabed import mitsuba_scene, rocky_seabed
+
+from mitsonar import Simulator, Sonar, load_scene
+from mitsonar.instruments.named_sonars import preset
+from mitsonar.simulation.variant import ensure_variant
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+TARGETS_MS = {"didson300, floor": 120, "oculus-m1200d-2100khz, floor": 300, "didson300, rocks": 250}
+"""Processor time of a coherent ping that is to be kept on two cores."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A sonar over a ground, at a height [m] and a pitch [deg]."""
+
+    name: str
+    scene: mi.Scene
+    sonar: Sonar
+    height_m: float
+    pitch_deg: float
+
+    def pose(self, ping: int) -> np.ndarray:
+        """Return the pose of a ping ``(1, 6)``."""
+        return np.array([[0.01 * ping, 0.002 * ping, self.height_m, np.radians(self.pitch_deg), 0, 0]])
+
+
+def main() -> None:
+    """Print the table, or everything as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print for programs")
+    parser.add_argument("--quick", action="store_true", help="a small seabed, each once: within a minute")
+    parser.add_argument("--variant", help="Mitsuba variant, e.g. cuda_ad_mono")
+    asked = parser.parse_args()
+    ensure_variant(asked.variant)
+    rows = [measured(case, 1 if asked.quick else 15) for case in cases(asked.quick)]
+    result = {"machine": machine(), "rows": rows}
+    print(json.dumps(result, indent=2) if asked.json else table(result))
+
+
+def cases(quick: bool) -> Iterator[Case]:
+    """Yield the sonars and grounds."""
+    floor = load_scene("flat_floor")
+    didson = preset("didson300")
+    yield Case("didson300, floor", floor, didson, 2.5, 35)
+    if not quick:
+        yield Case("oculus-m1200d-2100khz, floor", floor, preset("oculus-m1200d-2100khz"), 2.0, 20)
+    yield Case("didson300, rocks", mitsuba_scene(rocky_seabed(8 if quick else 52)), didson, 2.5, 35)
+
+
+def measured(case: Case, repeats: int) -> dict[str, Any]:
+    """Measure one case: milliseconds by name, points and rays of a coherent ping."""
+    hard = case.sonar.replace(model="physical", pattern="box")
+    sonars = {"physical": hard, "beams": hard.replace(pattern="two_way"), "coherent": case.sonar}
+    simulators = {name: Simulator(case.scene, sonar) for name, sonar in sonars.items()}
+    coherent = simulators["coherent"].coherent
+    assert coherent is not None
+    work: dict[str, Callable[[int], object]] = {"trace": bare(case)}
+    for name, simulator in simulators.items():
+        work[name] = lambda ping, simulator=simulator: next(iter(simulator.pings(case.pose(ping), first=ping)))
+    counts = coherent.image(case.pose(0)[0], 0)[1]
+    found = {"case": case.name, "rays": coherent.tracer.fan.rays, "points": counts.points}
+    return found | {name: dict(zip(("cpu", "wall"), ms, strict=True)) for name, ms in turns(work, repeats).items()}
+
+
+def bare(case: Case) -> Callable[[int], object]:
+    """Return a function that traces the rays of a coherent ping, and nothing else."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from mitsonar.motion.pose import to_world_matrices
+    from mitsonar.simulation.beam_former import CommonFan
+    from mitsonar.simulation.coherent_tracing import FanRays
+
+    sonar, fan = case.sonar, CommonFan.of(case.sonar)
+    index = dr.arange(mi.UInt32, fan.rays)
+    dr.make_opaque(index)
+
+    @dr.freeze
+    def launch(index: Any, scene: Any, rows: Any) -> Any:
+        lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
+        rays = FanRays(fan, sonar, index, lines)
+        return scene.ray_intersect_preliminary(mi.Ray3f(rays.origin, rays.d), coherent=True).t
+
+    def call(ping: int) -> None:
+        rows = mi.Float64(to_world_matrices(case.pose(ping))[0, :3].astype(np.float64).ravel().tolist())
+        dr.eval(launch(index, case.scene, rows))
+        dr.sync_thread()
+
+    return call
+
+
+def turns(work: dict[str, Callable[[int], object]], repeats: int) -> dict[str, tuple[float, float]]:
+    """Return the median milliseconds of processor and wall time of each, taking turns, after two rounds that do not count."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
+    for ping in range(repeats + 2):
+        for name, call in work.items():
+            cpu, wall = time.process_time(), time.perf_counter()
+            call(ping)
+            times[name].append((1000 * (time.process_time() - cpu), 1000 * (time.perf_counter() - wall)))
+    return {name: tuple(np.median(values[2:], axis=0).tolist()) for name, values in times.items()}
+
+
+def table(result: dict[str, Any]) -> str:
+    """Format the result as Markdown."""
+    m = result["machine"]
+    lines = [
+        f"{m['cpu']}, {m['cores']} cores, {m['variant']}, Mitsuba {m['mitsuba']}, {m['date']}",
+        "",
+        "| ms of CPU a ping | rays | points | trace | physical | with beams | coherent | wall | target |",
+        "|---" * 9 + "|",
+    ]
+    for row in result["rows"]:
+        cpu = [f"{row[name]['cpu']:.0f}" for name in ("trace", "physical", "beams", "coherent")]
+        lines.append(
+            f"| {row['case']} | {row['rays']:,} | {row['points']:,} | {' | '.join(cpu)} | {row['coherent']['wall']:.0f} "
+            f"| {TARGETS_MS[row['case']]} |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
