@@ -46,6 +46,7 @@ class CoherentImager:
     def __init__(self, scene: mi.Scene, sonar: Sonar, absorption_db_per_m: float) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
         self.tracer = CoherentTracer(scene, sonar, self.former)
+        self.tracer.surfaces = self.tracer.surfaces.heard_by(sonar)
         self.absorption_db_per_m = absorption_db_per_m
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar)]
 
