@@ -17,6 +17,9 @@ __all__ = ["AcousticMaterial", "is_acoustic_material"]
 SHADE = 0.5
 """Reflectance for cameras where none is given."""
 
+NO_MATERIAL = "none"
+"""Material of a surface that has none."""
+
 LOUDEST, FAINTEST = 1.0, 1e-6
 """Bounds of the one reflectivity that stands for a material where its law is not asked."""
 
@@ -24,10 +27,12 @@ LOUDEST, FAINTEST = 1.0, 1e-6
 class AcousticMaterial(mi.BSDF):
     """A surface of a material of :mod:`mitsonar.acoustics.backscatter`: its echo follows a law of the grazing angle.
 
-    Properties: ``material``: a name, or a YAML file (its path counts from the scene's folder); ``reflectance`` [0.5]: a
-    texture or number. Cameras see it as a diffuse surface, from both sides. For sonars only its relative variation counts:
-    it is divided by its mean, and multiplies the cross-section. So a number changes nothing but the camera's picture.
-    ``reflectance_mean`` [the texture's own]: what it is divided by; ``mesh_attribute`` needs it.
+    Properties: ``material``: a name, or a YAML file (its path counts from the scene's folder), or ``none``, which makes
+    a plain ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number.
+    ``reflectance_mean`` [the texture's own]: what it is divided by for sonars; ``mesh_attribute`` needs it.
+
+    Cameras see a diffuse surface of that reflectance, from both sides. For sonars only its relative variation counts: it is
+    divided by its mean, and multiplies the cross-section. So a number changes nothing but the camera's picture.
 
     The models ``physical`` and ``coherent`` read the law at each ray's angle, at the sonar's frequency. The model ``thesis``
     takes the law's mu, or sigma at normal incidence, for all angles. Impulse responses, other sensors and shapes of a
@@ -56,8 +61,8 @@ class AcousticMaterial(mi.BSDF):
 
     def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.Spectrum:
         """Return the one reflectivity that sonars take where they do not ask the law: mu times the relative variation."""
-        value: mi.Spectrum = self.reflectance.eval(si, active) * (self.mu / self.mean)
-        return value
+        value: Any = self.reflectance.eval(si, active) * (self.mu / self.mean)
+        return mi.Spectrum(value)
 
     def sample(
         self,
@@ -128,4 +133,12 @@ def is_acoustic_material(bsdf: mi.Object) -> bool:
     return type(bsdf).__name__ == AcousticMaterial.__name__
 
 
-mi.register_bsdf("acoustic_material", AcousticMaterial)
+def _create(props: mi.Properties) -> mi.BSDF:
+    """Return the BSDF: a plain diffuse one for the material ``none``."""
+    if str(props.get("material", "")) != NO_MATERIAL:
+        return AcousticMaterial(props)
+    reflectance = props.get_texture("reflectance", SHADE)
+    return cast(mi.BSDF, mi.load_dict({"type": "diffuse", "id": props.id(), "reflectance": reflectance}))
+
+
+mi.register_bsdf("acoustic_material", _create)

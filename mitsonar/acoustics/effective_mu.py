@@ -106,7 +106,7 @@ def single_mu(material: Material, frequency_hz: float | None = None, sound_speed
 
 
 def normal_mu(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> float:
-    """Return the reflectivity of the model ``thesis`` [1/sr]: the law's mu, or sigma at normal incidence where it has none."""
+    """Return the reflectivity of the model ``thesis``: the law's mu, or sigma at normal incidence without one [1/sr]."""
     return float(sigma_table(material, frequency_hz, sound_speed_m_s)[90]) if material.mu is None else material.mu
 
 

@@ -285,6 +285,38 @@ def test_a_hostile_file_is_refused(xml: Path, content: str) -> None:
         load_scene(xml)
 
 
+@pytest.mark.parametrize(
+    ("name", "shapes"),
+    [
+        ("sunken_ship", {"seabed": "sand_bed", "rocks": "stone", "ship": "steel"}),
+        ("observatory", {"seabed": "sand_bed", "torpedo": "steel", "cable": "rubber", "amphora": "fired_clay"}),
+    ],
+)
+def test_shipped_scenes_have_materials_that_hold_at_their_carrier(name: str, shapes: dict[str, str]) -> None:
+    loaded = load_scene(name)
+    simulator = Simulator(loaded)
+    assert simulator.notes == []
+    found = {shape.id(): shape.bsdf() for shape in loaded.shapes()}
+    assert {key: found[key].material.name for key in shapes} == shapes
+
+
+@pytest.mark.parametrize("name", ["flat_floor", "pattern", "objects"])
+def test_floors_of_measured_scenes_take_a_material_on_demand(name: str) -> None:
+    """Unasked they are what they were: a diffuse BSDF."""
+    shape = load_scene(name).shapes()
+    assert not any(type(one.bsdf()).__name__ == "AcousticMaterial" for one in shape)
+    asked = [one.bsdf() for one in load_scene(name, floor_material="gravel").shapes()]
+    assert [one.material.name for one in asked if type(one).__name__ == "AcousticMaterial"] == ["gravel"]
+
+
+def test_no_material_is_a_diffuse_surface() -> None:
+    noise = {"type": "cell_noise", "cells": 50}
+    got = reflectivity(scene(f=floor(made_of("none", reflectance=noise), 3)), down(900, 0.9))
+    np.testing.assert_array_equal(got, reflectivity(scene(f=floor(diffuse(noise), 3)), down(900, 0.9)))
+    with pytest.raises(RuntimeError, match="reflectance_mean"):
+        mi.load_dict(made_of("none", reflectance_mean=0.3))
+
+
 def test_a_reflectance_without_mean(tmp_path: Path) -> None:
     black = {"type": "uniform", "value": 0.0}
     with pytest.raises(RuntimeError, match="whose mean is above 0"):
