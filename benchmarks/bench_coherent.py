@@ -14,6 +14,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -78,10 +79,15 @@ def measured(case: Case, repeats: int) -> dict[str, Any]:
     assert coherent is not None
     work: dict[str, Callable[[int], object]] = {"trace": bare(case)}
     for name, simulator in simulators.items():
-        work[name] = lambda ping, simulator=simulator: next(iter(simulator.pings(case.pose(ping), first=ping)))
+        work[name] = partial(rendered, simulator, case)
     counts = coherent.image(case.pose(0)[0], 0)[1]
     found = {"case": case.name, "rays": coherent.tracer.fan.rays, "points": counts.points}
     return found | {name: dict(zip(("cpu", "wall"), ms, strict=True)) for name, ms in turns(work, repeats).items()}
+
+
+def rendered(simulator: Simulator, case: Case, ping: int) -> object:
+    """Render one ping of a case."""
+    return next(iter(simulator.pings(case.pose(ping), first=ping)))
 
 
 def bare(case: Case) -> Callable[[int], object]:
@@ -112,7 +118,7 @@ def bare(case: Case) -> Callable[[int], object]:
 
 
 def turns(work: dict[str, Callable[[int], object]], repeats: int) -> dict[str, tuple[float, float]]:
-    """Return the median milliseconds of processor and wall time of each, taking turns, after two rounds that do not count."""
+    """Return the median milliseconds of processor and wall time of each, taking turns, after two rounds of warming up."""
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in work}
     for ping in range(repeats + 2):
         for name, call in work.items():

@@ -1,4 +1,4 @@
-"""Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``channel_sonar``, ``echo``, ``cell_noise`` ...
+"""Plugins for Mitsuba 3, usable from any XML scene: ``imaging_sonar``, ``echo``, ``acoustic_material`` ...
 
 Mitsuba keeps one registry of plugins a variant, and a class can derive from ``mi.Sensor`` only once a variant is set.
 :func:`install` registers them for the variant that is set, if any, and after each change of variant. Mitsuba may be imported
@@ -17,8 +17,10 @@ from types import ModuleType
 __all__ = ["PLUGINS", "install"]
 
 PLUGINS = (
-    "surfaces",
     "hashed_texture",
+    "acoustic_material",
+    "material_laws",
+    "surfaces",
     "imaging_sonar_sensor",
     "channel_sonar_sensor",
     "echo_integrator",

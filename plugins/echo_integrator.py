@@ -9,6 +9,7 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from mitsonar.arrays import DeviceArray
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar, is_imaging_sonar
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.records.echoes import CHANNELS, Echoes
@@ -60,6 +61,7 @@ class Echo(ADIntegrator):
         super().__init__(props)  # type: ignore[no-untyped-call]  # Mitsuba's own class has no types
         self._fan: Fan | None = None
         self._edges = False
+        self._sonar: Sonar | None = None
         self._origin = mi.Point3f(0)
 
     @staticmethod
@@ -134,9 +136,10 @@ class Echo(ADIntegrator):
         if is_imaging_sonar(sensor):
             sonar = cast(ImagingSonar, sensor)
             self._fan, self._edges = sonar.film_fan(position).carried(sonar.lines()), sonar.sonar.model == "physical"
+            self._sonar = sonar.sonar
         else:
             self._fan = Fan(ray.d, mi.Vector3f(0), mi.Vector3f(0), *(mi.Float(0) for _ in range(5)))
-            self._edges = False
+            self._edges, self._sonar = False, None
         self._origin = mi.Point3f(sensor.world_transform().translation())
         return ray, weight, mi.Vector2f(mi.Vector2u(column, row)) + mi.Vector2f(sensor.film().crop_offset())
 
@@ -145,6 +148,8 @@ class Echo(ADIntegrator):
     ) -> tuple[mi.Spectrum, DeviceArray, list[DeviceArray], None]:
         """Return values, validity, channels and no state, as ``ADIntegrator`` expects them."""
         surfaces = Surfaces.of(scene)
+        if self._sonar is not None:
+            surfaces = surfaces.heard_by(self._sonar)
         for note in surfaces.notes:
             mi.Log(mi.LogLevel.Warn, note)  # type: ignore[operator]  # an `object` to Mitsuba's stubs
         assert self._fan is not None

@@ -2,6 +2,7 @@
 
 Reflectivity of a surface is one number in 0..1; colours count by their luminance:
 
+- ``acoustic_material``: one number of its law, or for a sonar (:meth:`Surfaces.heard_by`) what its law says at the angle;
 - a BSDF with a diffuse reflectance (``diffuse``, ``plastic``, ``roughplastic``; through ``twosided``, ``mask``,
   ``bumpmap``, ``normalmap``): that reflectance, textured or not;
 - ``principled``, ``principledthin``: the base colour; ``blendbsdf``: the weighted mean of the two;
@@ -12,19 +13,23 @@ Reflectivity of a surface is one number in 0..1; colours count by their luminanc
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 
+from mitsonar.acoustics.effective_mu import hearing_notes
 from mitsonar.arrays import DeviceArray
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.plugins.acoustic_material import AcousticMaterial
+from mitsonar.plugins.material_laws import law_rows, material_of, mirror_rows, weighed
 
 __all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces", "facet_points", "reflectances_of", "reflectivity_at"]
 
 DEFAULT_REFLECTIVITY = 0.5
 
-DIFFUSE = {"SmoothDiffuse", "SmoothPlastic", "RoughPlastic"}
+DIFFUSE = {"SmoothDiffuse", "SmoothPlastic", "RoughPlastic", AcousticMaterial.__name__}
 APPROXIMATED = {"Principled", "PrincipledThin", "BlendBSDF"}
 BENT = {"BumpMap", "NormalMap"}
 TWO_FACED = "a different BSDF on each side"
@@ -33,7 +38,10 @@ WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
 
 @dataclass
 class Hit:
-    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity`` 0..1, shape and object."""
+    """Where rays end: ``valid``, distance ``t`` [m], unit normal ``n``, ``reflectivity``, shape, object and material.
+
+    The reflectivity lies in 0..1; where a law is asked, in 0..1 / cosine. ``material`` is -1 where a shape has none.
+    """
 
     valid: DeviceArray
     t: DeviceArray
@@ -41,6 +49,7 @@ class Hit:
     reflectivity: DeviceArray
     shape_id: DeviceArray
     object_id: DeviceArray
+    material: DeviceArray
 
 
 @dataclass
@@ -55,11 +64,15 @@ class Surfaces:
         facets: normal and reflectivity (negative: evaluate the BSDF), four floats a triangle.
         corners: uv of the first corner and its change to the second and third, eight floats a triangle (two unused).
         shapes: by registry index, four numbers a shape: first facet (-1: not in the tables), first row in ``corners``,
-            index of the shape in ``scene.shapes()``, unused.
+            index of the shape in ``scene.shapes()``, number of its material (-1: none).
         constant: by registry index, reflectivity of a shape that has no diffuse reflectance; negative:
             evaluate its BSDF.
         objects: number of the object that a triangle belongs to (the mesh's attribute ``face_id``, 0 without it), one a
             triangle; empty but for one 0 where no mesh has it.
+        laws: of the materials, for the sonar of :meth:`heard_by`; without one, a single 0.
+        mirrors: by material, reflection coefficient at normal incidence and rms height [m]; zeros without a mirror part.
+        materials: BSDFs, one of each material, by number.
+        lawful: whether the laws are asked.
         textured: whether some shape has a reflectivity that varies within a triangle.
         foreign: whether some shape is not in the tables.
         notes: what a user should know about the scene's BSDFs, a sentence each.
@@ -70,20 +83,29 @@ class Surfaces:
     shapes: mi.Int32
     constant: mi.Float
     objects: mi.Float
+    laws: mi.Float
+    mirrors: mi.Float
+    materials: list[AcousticMaterial]
+    lawful: bool
     textured: bool
     foreign: bool
     notes: list[str]
 
     @classmethod
     def of(cls, scene: mi.Scene) -> Surfaces:
-        """Return the tables of a scene."""
+        """Return the tables of a scene. Materials have one reflectivity for all angles; see :meth:`heard_by`.
+
+        Raises:
+            MitsonarError: a shape with several materials.
+        """
         shapes = scene.shapes()
         size = 1 + max((_registry_index(shape) for shape in shapes), default=0)
-        rows = [[-1, 0, -1, 0] for _ in range(size)]
+        rows = [[-1, 0, -1, -1] for _ in range(size)]
         constant = [-1.0] * size
         facets: list[mi.Float] = []
         corners: list[mi.Float] = []
         tabled: list[mi.Mesh] = []
+        materials: list[AcousticMaterial] = []
         named: dict[str, list[str]] = {"approximated": [], "without": []}
         facet_count = corner_count = 0
         for number, shape in enumerate(shapes):
@@ -92,18 +114,14 @@ class Surfaces:
             if shape.bsdf() is None:  # an instance: Mitsuba evaluates the shapes of its group
                 continue
             kinds, textures = _walk(shape.bsdf())
-            if not kinds <= DIFFUSE | APPROXIMATED | WRAPPERS:
-                constant[index] = DEFAULT_REFLECTIVITY
-                named["without"] += [shape.id()]
-            elif kinds & APPROXIMATED:
-                named["approximated"] += [shape.id()]
+            rows[index][3] = _number_of_material(shape, materials) if AcousticMaterial.__name__ in kinds else -1
+            constant[index] = _fixed_reflectivity(shape, kinds, named)
             flat = constant[index] >= 0 or (TWO_FACED not in kinds and all(map(_constant_on_facets, textures)))
             if shape.is_mesh() and (flat or not (kinds & BENT or any(map(_by_vertex, textures)))):
                 rows[index][:2] = facet_count, corner_count
-                mesh = cast(mi.Mesh, shape)
+                tabled.append(mesh := cast(mi.Mesh, shape))
                 facets.append(_facet_rows(mesh, constant[index], flat))
                 facet_count += mesh.face_count()
-                tabled.append(mesh)
                 if not flat:
                     corners.append(_corner_rows(mesh))
                     corner_count += mesh.face_count()
@@ -113,6 +131,10 @@ class Surfaces:
             shapes=mi.Int32([number for row in rows for number in row]),
             constant=mi.Float(constant),
             objects=_object_ids(tabled),
+            laws=dr.zeros(mi.Float, 1),
+            mirrors=mirror_rows([one.material for one in materials]) if materials else dr.zeros(mi.Float, 1),
+            materials=materials,
+            lawful=False,
             textured=bool(corners),
             foreign=len(facets) < len(shapes),
             notes=_notes(named),
@@ -122,7 +144,26 @@ class Surfaces:
 
     def arrays(self) -> dict[str, DeviceArray]:
         """Return the tables by name: the inputs of a launch."""
-        return {name: getattr(self, name) for name in ("facets", "corners", "shapes", "constant", "objects")}
+        names = ("facets", "corners", "shapes", "constant", "objects", "laws", "mirrors")
+        return {name: getattr(self, name) for name in names}
+
+    def heard_by(self, sonar: Sonar) -> Surfaces:
+        """Return the tables with the laws of the materials at a sonar's frequency, and notes on them.
+
+        The models ``physical`` and ``coherent`` ask the law at each ray's angle. The model ``thesis`` takes mu, or sigma at
+        normal incidence, for all angles. Without a ``frequency_hz`` a material is taken in the middle of its band.
+        """
+        if not self.materials:
+            return self
+        laws = law_rows(self.materials, sonar)
+        dr.eval(laws)
+        notes = hearing_notes([one.material for one in self.materials], sonar.frequency_hz, sonar.sound_speed)
+        return replace(self, laws=laws, lawful=True, notes=[*self.notes, *notes])
+
+    def mirror(self, material: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+        """Return reflection coefficient at normal incidence and rms height [m] of materials; 0 where the number is -1."""
+        pair = dr.gather(mi.Vector2f, self.mirrors, mi.UInt32(dr.select(material >= 0, material, 0)), material >= 0)
+        return pair.x, pair.y
 
     def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
         """Trace rays to the nearest surface. The arrays are not evaluated: later operations join the same kernel."""
@@ -153,9 +194,13 @@ class Surfaces:
             top: DeviceArray = dr.reinterpret_array(mi.UInt32, found.instance)
             inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
             shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
+        material: DeviceArray = dr.select(known, shape.w, -1) if self.materials else mi.Int32(-1)
+        if self.lawful:
+            cosine: DeviceArray = dr.abs(dr.dot(normal, ray.d))
+            reflectivity = weighed(self.laws, material, reflectivity, dr.select(cosine < 1, cosine, 1))
         numbered = tabled & (dr.width(self.objects) > 1)
         object_id = dr.gather(mi.Float, self.objects, mi.UInt32(first) + found.prim_index, numbered)
-        return Hit(valid, found.t, normal, reflectivity, shape_id, object_id)
+        return Hit(valid, found.t, normal, reflectivity, shape_id, object_id, material)
 
     def _on_facet(
         self,
@@ -182,6 +227,27 @@ class Surfaces:
 def _registry_index(shape: mi.Shape) -> int:
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(index[0])
+
+
+def _fixed_reflectivity(shape: mi.Shape, kinds: set[str], named: dict[str, list[str]]) -> float:
+    """Return the reflectivity of a shape that has no diffuse reflectance, else -1; note what a user should know."""
+    if not kinds <= DIFFUSE | APPROXIMATED | WRAPPERS:
+        named["without"] += [shape.id()]
+        return DEFAULT_REFLECTIVITY
+    if kinds & APPROXIMATED:
+        named["approximated"] += [shape.id()]
+    return -1.0
+
+
+def _number_of_material(shape: mi.Shape, materials: list[AcousticMaterial]) -> int:
+    """Return the number of a shape's material; it joins ``materials`` where no equal one is there."""
+    own = material_of(shape)
+    assert own is not None
+    for number, other in enumerate(materials):
+        if own.material == other.material:
+            return number
+    materials.append(own)
+    return len(materials) - 1
 
 
 def _facet_rows(mesh: mi.Mesh, constant: float, flat: bool) -> DeviceArray:
@@ -277,7 +343,7 @@ def _walk(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
     """Return the class names of a BSDF and all nested ones, and the textures that their reflectance may come from."""
     children = _Children()
     bsdf.traverse(children)
-    kinds, textures = {bsdf.class_name()}, []
+    kinds, textures = {_kind(bsdf)}, []
     if bsdf.class_name() == "TwoSidedBRDF" and len({id(child) for child in children.objects}) > 1:
         kinds.add(TWO_FACED)
     for child in children.objects:
@@ -288,6 +354,12 @@ def _walk(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
         else:
             textures.append(child)
     return kinds, textures
+
+
+def _kind(bsdf: mi.Object) -> str:
+    """Return the name of a BSDF's class; Mitsuba calls all that are written in Python ``BSDF``."""
+    name = bsdf.class_name()
+    return type(bsdf).__name__ if name == "BSDF" else name
 
 
 def _constant_on_facets(texture: mi.Object) -> bool:

@@ -55,13 +55,16 @@ def render(
     ] = False,
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
+    mirrors: Annotated[
+        bool, typer.Option("--mirrors", help="Glints of smooth materials (model coherent); see docs/guides/coherent.md.")
+    ] = False,
     rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
     """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
-    from mitsonar.acoustics.noise import load_noise
+    from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.io.provenance import file_digest
     from mitsonar.motion.conventions import convention_named
     from mitsonar.simulation.imaging import Simulator
@@ -77,10 +80,16 @@ def render(
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     instrument, attitude = _instrument(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))
+    refuse_noise(outputs.noise, instrument)
     path = _path(instrument, attitude, scene, frames, start, end, trajectory, frame)
     folder = out or Path("out") / find_scene(scene).stem
-    simulator = Simulator(loaded, instrument, rays_per_launch=rays_per_launch)
+    if mirrors and instrument.model != "coherent":
+        raise MitsonarError(
+            f"--mirrors needs the model coherent: got {instrument.model}; leave it out, or give --model coherent"
+        )
+    simulator = Simulator(loaded, instrument, mirrors="materials" if mirrors else None, rays_per_launch=rays_per_launch)
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+    origin |= {"mirrors": True} if mirrors else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)

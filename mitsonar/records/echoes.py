@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.effective_mu import FLATTEST
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -25,7 +26,7 @@ class Echoes:
         range_m: distance from the sonar to the point hit [m].
         near_m: range where the ray's elevation cell begins on the surface (its tangent plane) [m].
         far_m: range where it ends [m].
-        reflectivity: 0..1.
+        reflectivity: 0..1; where a material's law is asked, 0..1 / cosine.
         cosine: |cos(angle of incidence)|.
         solid_angle_sr: of the ray's cell [sr].
         x, y, z: point hit in the world [m].
@@ -63,7 +64,7 @@ CHANNELS = tuple(field.name for field in fields(Echoes))
 
 
 LIMITS = (
-    *(("hit", 0, 1), ("reflectivity", 0, 1), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13), ("range_m", 0, 1e9)),
+    *(("hit", 0, 1), ("reflectivity", 0, 1001), ("cosine", 0, 1.001), ("solid_angle_sr", 0, 13), ("range_m", 0, 1e9)),
     *(("shape_id", -1, 2**24), ("nx", -1.001, 1.001), ("ny", -1.001, 1.001), ("nz", -1.001, 1.001)),
 )
 """Channels with their least and greatest values."""
@@ -115,6 +116,8 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
     for name, low, high in LIMITS:
         if values[name].min() < low or values[name].max() > high:
             raise MitsonarError(f"{path}: channel {name} must lie in {low}..{high}; render the echoes again with --exr")
+    if (values["reflectivity"] * np.maximum(values["cosine"], FLATTEST)).max() > 1.001:
+        raise MitsonarError(f"{path}: channel reflectivity must lie in 0..1 / cosine; render the echoes again with --exr")
     return Echoes(**values)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
-from mitsonar.simulation.mirror_parts import MirrorPart, mirror_of
+from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
 from mitsonar.simulation.mirror_tracing import MirrorTracer
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class CoherentImager:
         notes: what a user should know about scene and sonar.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mapping[str, MirrorPart] | None = None) -> None:
+    def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
         parts = mirror_of(scene, mirrors)
         self.tracer = CoherentTracer(scene, sonar, self.former, parts)
@@ -169,7 +169,7 @@ def point_notes(sonar: Sonar) -> list[str]:
 
 
 def coherent_imager(
-    scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None, mirrors: Mapping[str, MirrorPart] | None = None
+    scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None, mirrors: Mirroring = None
 ) -> CoherentImager | None:
     """Return what renders pings of the model ``coherent``; None for other models.
 

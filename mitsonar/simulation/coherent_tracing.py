@@ -73,7 +73,7 @@ class CoherentTracer:
     def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors | None = None) -> None:
         assert sonar.frequency_hz is not None
         self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.of(sonar)
-        self.surfaces = Surfaces.of(scene)
+        self.surfaces = Surfaces.of(scene).heard_by(sonar)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.pitch = point_pitch(sonar)
         table = patch_amplitudes(sonar.speckle_nu)
@@ -295,5 +295,5 @@ def point_pitch(sonar: Sonar) -> float:
     """Return the pitch of the lattice [m]: as given, or for the wanted points a resolution cell at mid range."""
     if sonar.scatterer_spacing_m is not None:
         return sonar.scatterer_spacing_m
-    middle = max(sonar.range_min, sonar.range_max / 2)
+    middle = (sonar.range_min + sonar.range_max) / 2
     return math.sqrt(middle * sonar.beam_width_rad * sonar.resolution_m / sonar.scatterers_per_cell)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from mitsonar.instruments.views import View
     from mitsonar.simulation.expected_former import ExpectedFormer
-    from mitsonar.simulation.mirror_parts import MirrorPart
+    from mitsonar.simulation.mirror_parts import Mirroring
     from mitsonar.simulation.tracing import Tracer
 from mitsonar.simulation.labels import labels_above, labels_of
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
@@ -57,7 +57,7 @@ class Simulator:
         sonar: Sonar | None = None,
         *,
         views: Sequence[View] | None = None,
-        mirrors: Mapping[str, MirrorPart] | None = None,
+        mirrors: Mirroring = None,
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()

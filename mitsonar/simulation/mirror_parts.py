@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -18,13 +18,17 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.backscatter import Material
 from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.device_arrays import DeviceArray
 
-__all__ = ["MirrorPart", "Mirrors", "mirror_of"]
+__all__ = ["MirrorPart", "Mirroring", "Mirrors", "mirror_of"]
 
 MirrorPart: TypeAlias = tuple[float, float] | Material
 """Reflection coefficient of pressures, -1 to 1, and rms height of the roughness [m]; or a material that has both."""
+
+Mirroring: TypeAlias = Mapping[str, MirrorPart] | Literal["materials"] | None
+"""Mirror parts by the ids of the shapes, those of the shapes' materials, or none."""
 
 ROUGHEST_M = 1.0
 """Largest rms height [m]."""
@@ -48,16 +52,19 @@ class Mirrors:
         return mi.Float(rows.ravel().astype(np.float32))
 
 
-def mirror_of(scene: mi.Scene, mirrors: Mapping[str, MirrorPart] | None) -> Mirrors | None:
+def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
     """Collect the mirror parts of a scene's shapes; None where there are none.
 
     Args:
         scene: any.
-        mirrors: parts by the ids of the shapes. A material without a mirror part gives none.
+        mirrors: parts by the ids of the shapes, or ``materials``: those of each shape's ``acoustic_material``. A material
+            without a mirror part gives none.
 
     Raises:
         MitsonarError: a shape that the scene does not have, or a number out of limits.
     """
+    if isinstance(mirrors, str):
+        mirrors = _of_materials(scene, mirrors)
     names = [shape.id() for shape in scene.shapes()]
     found = Mirrors(np.zeros(len(names)), np.zeros(len(names)))
     for name, part in (mirrors or {}).items():
@@ -74,6 +81,18 @@ def mirror_of(scene: mi.Scene, mirrors: Mapping[str, MirrorPart] | None) -> Mirr
     return found if found.reflection.any() else None
 
 
+def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:
+    """Return the materials of a scene's shapes by the shapes' ids."""
+    if asked != "materials":
+        raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {asked!r}")
+    found: dict[str, MirrorPart] = {}
+    for shape in scene.shapes():
+        own = material_of(shape) if shape.bsdf() is not None else None
+        if own is not None:
+            found[shape.id()] = own.material
+    return found
+
+
 def parts_at(table: mi.Float, hit: Hit) -> tuple[DeviceArray, DeviceArray]:
     """Return V and rms height [m] where rays hit, 0 where there is no mirror part."""
     known = hit.valid & (hit.shape_id >= 0)
@@ -87,7 +106,12 @@ def smooth_share(roughness_m: DeviceArray, cosine: DeviceArray, wavenumber: floa
 
 
 def without_mirror_part(table: mi.Float, hit: Hit, d: DeviceArray, wavenumber: float) -> Hit:
-    """Return hits whose reflectivity is what roughness takes from the mirror part; others stay as they are."""
+    """Return hits whose reflectivity is what roughness takes from the mirror part; others stay as they are.
+
+    The law of a material holds that share already.
+    """
     reflection, roughness_m = parts_at(table, hit)
     taken = 1 - dr.square(smooth_share(roughness_m, dr.dot(hit.n, d), wavenumber))
-    return replace(hit, reflectivity=dr.select(reflection == 0, hit.reflectivity, hit.reflectivity * taken))
+    return replace(
+        hit, reflectivity=dr.select((reflection == 0) | (hit.material >= 0), hit.reflectivity, hit.reflectivity * taken)
+    )

@@ -72,7 +72,7 @@ class Tracer:
     """Trace the echoes of a scene for one sonar.
 
     Attributes:
-        notes: what a user should know about the scene's BSDFs.
+        notes: what a user should know about the scene's BSDFs and materials.
     """
 
     def __init__(self, scene: mi.Scene, sonar: Sonar) -> None:
@@ -80,7 +80,7 @@ class Tracer:
         self.sonar = sonar
         given = {name: value for name, value in sonar.model_dump(exclude={"name"}).items() if value is not None}
         self.sensor: imaging_sonar_sensor.ImagingSonar = mi.load_dict({"type": "imaging_sonar", **given})
-        self.surfaces = surfaces.Surfaces.of(scene)
+        self.surfaces = surfaces.Surfaces.of(scene).heard_by(sonar)
         self.notes = self.surfaces.notes
 
     def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[mi.Float, mi.UInt32, LaunchTables]:

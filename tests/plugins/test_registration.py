@@ -17,10 +17,14 @@ SHIPPED = {
     "imaging_sonar": "imaging_sonar_sensor",
     "channel_sonar": "channel_sonar_sensor",
     "echo": "echo_integrator",
+    "acoustic_material": "acoustic_material",
     "cell_noise": "cell_noise",
     "perlin": "perlin",
 }
 """Plugins by their name in XML, and their files."""
+
+NEEDED = {"acoustic_material": {"material": "sand"}}
+"""Properties without a default."""
 
 SCENE = """
     XML = '''<scene version="3.0.0">
@@ -35,7 +39,9 @@ SCENE = """
         </shape>
         <shape type="sphere">
             <point name="center" x="0" y="4" z="0"/> <float name="radius" value="0.4"/>
-            <bsdf type="diffuse"><texture type="perlin" name="reflectance"/></bsdf>
+            <bsdf type="acoustic_material">
+                <string name="material" value="steel"/> <texture type="perlin" name="reflectance"/>
+            </bsdf>
         </shape>
     </scene>'''
 
@@ -144,7 +150,7 @@ def snippet(name: str) -> str:
     assert spec.submodule_search_locations is not None
     with open(f"{spec.submodule_search_locations[0]}/{SHIPPED[name]}.py", encoding="utf-8") as file:
         tree = ast.parse(file.read())
-    assert (ast.get_docstring(tree) or "").startswith(("The sensor", "The integrator", "The texture"))
+    assert (ast.get_docstring(tree) or "").startswith(("The sensor", "The integrator", "The texture", "The BSDF"))
     docs = [ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)]
     found = re.findall(r"\.\. code-block:: xml\n\n((?:    .*\n?|\n)+)", "\n".join(docs))
     assert len(found) == 1, f"{name} needs one scene snippet in its docstring"
@@ -164,6 +170,8 @@ def test_snippet_of_the_docstring_loads(name: str) -> None:
     assert f'type="{name}"' in text
     if text.startswith("<texture"):
         text = f'<shape type="sphere"><bsdf type="diffuse">{text}</bsdf></shape>'
+    if text.startswith("<bsdf"):
+        text = f'<shape type="sphere">{text}</shape>'
     scene = mi.load_string(f'<scene version="3.0.0">{text}</scene>', parallel=False)
     assert isinstance(scene, mi.Scene)
     if name == "imaging_sonar":
@@ -178,7 +186,7 @@ def test_a_typing_slip_is_an_error(name: str) -> None:
     import mitsuba as mi
 
     with pytest.raises(RuntimeError, match=r"sead"):
-        mi.load_dict({"type": name, "sead": 3})
+        mi.load_dict({"type": name, **NEEDED.get(name, {}), "sead": 3})
 
 
 def test_asking_whether_mitsuba_is_there_does_not_lose_the_plugins() -> None:

@@ -72,6 +72,7 @@ def test_a_missing_channel_is_named(tmp_path: Path, name: str) -> None:
         ("x", np.inf),
         ("hit", 2),
         ("reflectivity", 1.5),
+        ("reflectivity", 1e6),
         ("reflectivity", -0.1),
         ("cosine", -1),
         ("solid_angle_sr", 20),
@@ -79,10 +80,19 @@ def test_a_missing_channel_is_named(tmp_path: Path, name: str) -> None:
 )
 def test_values_out_of_bounds(tmp_path: Path, name: str, value: float) -> None:
     channels = table()
+    channels["cosine"][3, 4] = 1
     channels[name][3, 4] = value
     write(tmp_path / "e.exr", channels)
     with pytest.raises(MitsonarError, match=f"channel {name} (holds inf or nan|must lie in)"):
         load_exr(tmp_path / "e.exr", SONAR)
+
+
+def test_a_law_may_exceed_1_at_flat_angles(tmp_path: Path) -> None:
+    """What counts for the sums is reflectivity times cosine."""
+    channels = table()
+    channels["reflectivity"][3, 4], channels["cosine"][3, 4] = 9.5, 0.1
+    write(tmp_path / "e.exr", channels)
+    assert load_exr(tmp_path / "e.exr", SONAR).reflectivity.max() == 9.5
 
 
 def test_another_size_and_no_exr(tmp_path: Path) -> None:

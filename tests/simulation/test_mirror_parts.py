@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import Array, box, diffuse, floor, plate, scene, sphere
 
-from mitsonar.acoustics.backscatter import Material, mirror_amplitude
+from mitsonar.acoustics.backscatter import Material, material, mirror_amplitude
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
@@ -237,3 +237,17 @@ def test_mistakes_are_one_sentence() -> None:
             imager(loaded, target=part)
     with pytest.raises(MitsonarError, match="model physical has no mirrors"):
         Simulator(loaded, SONAR.replace(model="physical", coding="linear"), mirrors={"target": (1.0, 0.0)})
+
+
+def test_materials_bring_their_mirror_parts(variant: str) -> None:
+    """Steel named in the scene is the mirror that its numbers make, and scatters the rest once."""
+    from mitsonar.simulation.mirror_parts import mirror_of
+
+    steel = {"type": "acoustic_material", "material": "steel"}
+    loaded = scene(plate=plate((0, 5, 0), (0, -1, 0), half=0.05, bsdf=steel))
+    found = mirror_of(loaded, "materials")
+    assert found is not None
+    own = material("steel")
+    assert (found.reflection[0], found.roughness_m[0]) == (own.reflection, own.roughness_m)
+    with pytest.raises(MitsonarError, match="or `materials`"):
+        mirror_of(loaded, "all")  # type: ignore[arg-type]  # a slip of the user's

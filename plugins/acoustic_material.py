@@ -1,0 +1,144 @@
+"""The BSDF ``acoustic_material``."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import mitsuba as mi
+
+from mitsonar.acoustics.backscatter import Material, material, named_materials
+from mitsonar.acoustics.effective_mu import single_mu
+from mitsonar.arrays import DeviceArray
+from mitsonar.errors import MitsonarError
+from mitsonar.plugins.hashed_texture import number_of_property
+
+__all__ = ["AcousticMaterial", "is_acoustic_material"]
+
+SHADE = 0.5
+"""Reflectance for cameras where none is given."""
+
+NO_MATERIAL = "none"
+"""Material of a surface that has none."""
+
+LOUDEST, FAINTEST = 1.0, 1e-6
+"""Bounds of the one reflectivity that stands for a material where its law is not asked."""
+
+
+class AcousticMaterial(mi.BSDF):
+    """A surface of a material of :mod:`mitsonar.acoustics.backscatter`: its echo follows a law of the grazing angle.
+
+    Properties: ``material``: a name, or a YAML file (its path counts from the scene's folder), or ``none``, which makes
+    a plain ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number.
+    ``reflectance_mean`` [the texture's own]: what it is divided by for sonars; ``mesh_attribute`` needs it.
+
+    Cameras see a diffuse surface of that reflectance, from both sides. For sonars only its relative variation counts: it is
+    divided by its mean, and multiplies the cross-section. So a number changes nothing but the camera's picture.
+
+    The models ``physical`` and ``coherent`` read the law at each ray's angle, at the sonar's frequency. The model ``thesis``
+    takes the law's mu, or sigma at normal incidence, for all angles. Impulse responses, other sensors and shapes of a
+    ``shapegroup`` take mu, or sigma / sin^2 at 45 deg of grazing.
+
+    Not modelled: the mirror part's own echo, transmission, two materials on one shape.
+
+    .. code-block:: xml
+
+        <bsdf type="acoustic_material">
+            <string name="material" value="sand"/>
+            <texture type="cell_noise" name="reflectance"/>
+        </bsdf>
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.material = _material(str(props.get("material", "")))
+        self.reflectance = cast(mi.Texture, props.get_texture("reflectance", SHADE))
+        self.mean = _mean(self.reflectance, number_of_property(props, "reflectance_mean", 0.0))
+        self.mu = min(max(single_mu(self.material), FAINTEST), LOUDEST)
+        shown = {"type": "twosided", "below": {"type": "diffuse", "reflectance": self.reflectance}}
+        self.shown = cast(mi.BSDF, mi.load_dict(shown))
+        self.m_components = [self.shown.flags(index) for index in range(self.shown.component_count())]
+        self.m_flags = self.shown.flags()
+
+    def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: DeviceArray = True) -> mi.Spectrum:
+        """Return the one reflectivity that sonars take where they do not ask the law: mu times the relative variation."""
+        value: Any = self.reflectance.eval(si, active) * (self.mu / self.mean)
+        return mi.Spectrum(value)
+
+    def sample(
+        self,
+        ctx: mi.BSDFContext,
+        si: mi.SurfaceInteraction3f,
+        sample1: DeviceArray,
+        sample2: mi.Point2f,
+        active: DeviceArray = True,
+    ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
+        """Sample a direction as the diffuse surface does that cameras see."""
+        return self.shown.sample(ctx, si, sample1, sample2, active)
+
+    def eval(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: DeviceArray = True
+    ) -> mi.Spectrum:
+        """Return the value of the diffuse surface that cameras see."""
+        return self.shown.eval(ctx, si, wo, active)
+
+    def pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: DeviceArray = True
+    ) -> DeviceArray:
+        """Return the density of :meth:`sample`."""
+        return self.shown.pdf(ctx, si, wo, active)
+
+    def eval_pdf(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: DeviceArray = True
+    ) -> tuple[mi.Spectrum, DeviceArray]:
+        """Return :meth:`eval` and :meth:`pdf`."""
+        return self.shown.eval_pdf(ctx, si, wo, active)
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        """Show the reflectance to ``mi.traverse``."""
+        callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+
+    def to_string(self) -> str:
+        """Return one line for Mitsuba's logs."""
+        return f"AcousticMaterial[material = {self.material.name}, reflectance = {self.reflectance}]"
+
+
+def _material(name: str) -> Material:
+    """Return the material of a name, or of a YAML file that Mitsuba finds from the scene's folder."""
+    if not name:
+        raise MitsonarError(
+            f"acoustic_material needs a material: {', '.join(named_materials())}, or a YAML file of your own"
+        )
+    is_file = name.lower().endswith((".yaml", ".yml"))
+    resolver: Any = mi.file_resolver  # an `object` to Mitsuba's stubs
+    return material(str(resolver().resolve(name)) if is_file else name)
+
+
+def _mean(texture: mi.Texture, given: float) -> float:
+    """Return what a reflectance is divided by, above 0."""
+    if given == 0:
+        try:
+            given = float(texture.mean()[0])
+        except RuntimeError:
+            raise MitsonarError(
+                f"acoustic_material cannot tell the mean of a reflectance of kind {texture.class_name()}: give it as "
+                "reflectance_mean"
+            ) from None
+    if not 0 < given < float("inf"):
+        raise MitsonarError(f"acoustic_material needs a reflectance whose mean is above 0: got {given:g}")
+    return given
+
+
+def is_acoustic_material(bsdf: mi.Object) -> bool:
+    """Return whether a BSDF is one. Compare names: each variant makes the class anew."""
+    return type(bsdf).__name__ == AcousticMaterial.__name__
+
+
+def _create(props: mi.Properties) -> mi.BSDF:
+    """Return the BSDF: a plain diffuse one for the material ``none``."""
+    if str(props.get("material", "")) != NO_MATERIAL:
+        return AcousticMaterial(props)
+    reflectance = props.get_texture("reflectance", SHADE)
+    return cast(mi.BSDF, mi.load_dict({"type": "diffuse", "id": props.id(), "reflectance": reflectance}))
+
+
+mi.register_bsdf("acoustic_material", _create)

@@ -1,0 +1,117 @@
+"""Tables of materials on the device: what a ray multiplies the reflectivity of a surface by at its own angle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mitsonar.acoustics.backscatter import Material
+from mitsonar.acoustics.effective_mu import FLATTEST, mu_table, normal_mu, reference_hz
+from mitsonar.arrays import DeviceArray
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.plugins.acoustic_material import AcousticMaterial, is_acoustic_material
+
+__all__ = ["law_rows", "material_of", "mirror_rows", "weighed"]
+
+ENTRIES = 91
+"""Pairs of numbers of a material: 90 of value and change to the next degree, and the power of the sine."""
+
+
+def law_rows(materials: Sequence[AcousticMaterial], sonar: Sonar) -> mi.Float:
+    """Return the laws of materials for one sonar, relative to the one reflectivity that each has without a law.
+
+    Args:
+        materials: one of each kind.
+        sonar: of the models ``physical`` and ``coherent``, or of ``thesis``, which has no laws.
+    """
+    rows = np.zeros((len(materials), ENTRIES, 2))
+    for row, one in zip(rows, materials, strict=True):
+        frequency = sonar.frequency_hz or reference_hz(one.material)
+        if sonar.model == "thesis":
+            row[:90, 0] = normal_mu(one.material, frequency, sonar.sound_speed) / one.mu
+            row[90, 0] = 2
+            continue
+        table = mu_table(one.material, frequency, sonar.sound_speed)
+        row[:90, 0], row[:90, 1] = table.values[:-1] / one.mu, np.diff(table.values) / one.mu
+        row[90, 0] = table.power
+    return mi.Float(rows.ravel().tolist())
+
+
+def mirror_rows(materials: Sequence[Material]) -> mi.Float:
+    """Return reflection coefficient at normal incidence and rms height [m] of each material; zeros without a mirror part."""
+    return mi.Float([number for one in materials for number in (one.reflection or 0.0, one.roughness_m or 0.0)])
+
+
+def weighed(laws: mi.Float, material: DeviceArray, reflectivity: DeviceArray, cosine: DeviceArray) -> DeviceArray:
+    """Return the effective reflectivity of points at the angle of their rays; unchanged where there is no material.
+
+    It is that of :func:`mitsonar.acoustics.effective_mu.mu_at`, and at most 1 / cosine.
+
+    Args:
+        laws: of :func:`law_rows`.
+        material: number of each point's material; -1 without one.
+        reflectivity: of the points without a law.
+        cosine: of the angle between ray and normal, 0..1.
+    """
+    known = material >= 0
+    place = dr.asin(cosine) * (180 / math.pi)
+    below = dr.select(place < 89, dr.floor(place), 89)
+    begin = mi.UInt32(dr.select(known, material, 0)) * ENTRIES
+    value = dr.gather(mi.Vector2f, laws, begin + mi.UInt32(below), known)
+    power = dr.gather(mi.Vector2f, laws, begin + 90, known).x
+    steep = dr.select(cosine > FLATTEST, cosine, FLATTEST)
+    shape = dr.select(power > 1.5, 1, dr.select(power > 0.5, 1 / steep, 1 / (steep * steep)))
+    law = reflectivity * (value.x + value.y * (place - below)) * shape
+    return dr.select(known, dr.select(law * steep < 1, law, 1 / steep), reflectivity)
+
+
+class _Children(mi.TraversalCallback):
+    """Collect the BSDFs directly below one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[mi.BSDF] = []
+
+    def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
+        """Keep a value that is a BSDF; Mitsuba calls this for each parameter."""
+        if isinstance(value, mi.BSDF):
+            self.found.append(value)
+
+
+def material_of(shape: mi.Shape) -> AcousticMaterial | None:
+    """Return the material of a shape, also where another BSDF wraps it; None where it has none.
+
+    Raises:
+        MitsonarError: several materials, or a material beside another BSDF.
+    """
+    found, others = _leaves(shape.bsdf())
+    names = sorted({one.material.name for one in found})
+    if len(found) > 1 or (found and others):
+        raise MitsonarError(
+            f"shape {shape.id()} must have one material for all of it: got {', '.join(names)} beside another BSDF; "
+            "acoustic_material has two sides, give it alone"
+        )
+    return found[0] if found else None
+
+
+def _leaves(bsdf: mi.BSDF) -> tuple[list[AcousticMaterial], int]:
+    """Return the materials at or below a BSDF, each once, and how many other BSDFs without any below them there are."""
+    if is_acoustic_material(bsdf):
+        return [cast(AcousticMaterial, bsdf)], 0
+    children = _Children()
+    bsdf.traverse(children)
+    if not children.found:
+        return [], 1
+    found: list[AcousticMaterial] = []
+    others = 0
+    for child in children.found:
+        below = _leaves(child)
+        found += [one for one in below[0] if all(one is not other for other in found)]
+        others += below[1]
+    return found, others
