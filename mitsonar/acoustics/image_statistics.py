@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,7 +73,7 @@ def decibels(intensity: ArrayLike, least_db: float = -200.0) -> Array:
 
 def percentile_span_db(level_db: ArrayLike, low: float = 1.0, high: float = 99.9) -> float:
     """Return the distance of two percentiles of all levels [dB]."""
-    below, above = np.percentile(level_db, [low, high])
+    below, above = np.percentile(np.asarray(level_db, dtype=float), [low, high])
     return float(above - below)
 
 
@@ -247,29 +248,46 @@ def _rows_and_neighbours(values: Array) -> tuple[Array, Array, Array]:
     return values[:, reach : reach + rows], np.asarray(one) / LEAK_BINS, np.asarray(other) / LEAK_BINS
 
 
-def _leaking_rows(intensity: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what is known of the rows that may leak most, each ``(rows,)``.
+class _Rows(NamedTuple):
+    """Rows that may leak most, ``(rows,)`` each, and what rows do by chance.
 
-    Returns:
-        Excess of the sum over the other beams; median of the quiet beams over their neighbours; mean level of these; largest cell.
+    Attributes:
+        excess: of the sum over the other beams.
+        lift: median of the quiet beams over their neighbours, in medians of exponential intensities of mean 1.
+        level: mean of the quiet beams' neighbours.
+        top: the largest cell.
+        chance: standard error of the median lift.
     """
+
+    excess: Array
+    lift: Array
+    level: Array
+    top: Array
+    chance: float
+
+
+def _leaking_rows(intensity: Array) -> _Rows | None:
+    """Return the rows of each frame that may leak most; None where none can leak."""
     if intensity.shape[1] < 4 * (LEAK_GUARD + LEAK_BINS):
-        return (np.empty(0),) * 4
+        return None
     row, chooser, around = _rows_and_neighbours(intensity)
     quiet = (chooser <= np.percentile(chooser, 40, axis=2, keepdims=True)) & (around > 0)
     excess = np.where(quiet, 0, row - around).sum(axis=2)
     ratio = np.divide(row, around, out=np.full_like(row, np.nan), where=quiet)
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a row without a quiet beam is nan, and not used
-        median, mean = np.nanmedian(ratio, axis=2), np.nanmean(np.where(quiet, around, np.nan), axis=2)
-    score = np.where(np.isfinite(median) & (mean > 0), excess / mean, -np.inf)
-    score[row.max(axis=2) < LEAK_CONTRAST * mean] = -np.inf
+        median, level = np.nanmedian(ratio, axis=2), np.nanmean(np.where(quiet, around, np.nan), axis=2)
+    top = row.max(axis=2)
+    can = np.isfinite(median) & (level > 0) & (excess > 0) & (top > LEAK_CONTRAST * level)
+    if not can.any():
+        return None
+    lift = median * np.log(2) / np.nanmedian(median)  # the mean of few neighbours lifts all ratios
+    spread = 1.4826 * np.nanmedian(np.abs(lift - np.log(2)))
+    score = np.where(can, excess / np.where(level > 0, level, 1), -np.inf)
     best = np.argsort(score, axis=1)[:, -LEAK_ROWS:]
-    excess, median, mean, top = (
-        np.take_along_axis(table, best, axis=1).ravel() for table in (excess, median, mean, row.max(axis=2))
-    )
-    kept = np.isfinite(median) & (excess > 0) & (top > LEAK_CONTRAST * mean)
-    return excess[kept], median[kept], mean[kept], top[kept]
+    kept = np.take_along_axis(can, best, axis=1)
+    excess, lift, level, top = (np.take_along_axis(table, best, axis=1)[kept] for table in (excess, lift, level, top))
+    return _Rows(excess, lift, level, top, float(1.25 * spread / np.sqrt(LEAK_ROWS)))
 
 
 def _steady_power(median: float) -> float:
@@ -291,13 +309,13 @@ def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
         The median over the strongest rows; 0 where quiet beams rise by no more than chance.
     """
     intensity = np.asarray(intensity, dtype=float)
-    excess, median, level, top = _leaking_rows(intensity)
-    open_ = top < limit
-    chance = 1.25 / np.sqrt(0.4 * intensity.shape[2] * LEAK_ROWS)  # standard error of the median of medians
-    if not open_.any() or np.median(median[open_]) < np.log(2) + LEAK_SURE * chance:
+    rows = _leaking_rows(intensity)
+    if rows is None or not (open_ := rows.top < limit).any():
         return 0.0
-    leaked = np.array([_steady_power(one) for one in median[open_]]) * level[open_]
-    return float(np.median(leaked / excess[open_]))
+    if np.median(rows.lift[open_]) < np.log(2) + LEAK_SURE * rows.chance:
+        return 0.0
+    leaked = np.array([_steady_power(one) for one in rows.lift[open_]]) * rows.level[open_]
+    return float(np.median(leaked / rows.excess[open_]))
 
 
 def smear_db(level_db: ArrayLike) -> float:
