@@ -138,7 +138,7 @@ def rate_of(simulator: ChannelSimulator, poses: NDArray[np.float64], velocity: N
     return echoes.size / seconds, float(echoes.mean())
 
 
-def direct_seconds(delay: NDArray[np.float64], amplitude: NDArray[np.float64], sonar: ChannelSonar) -> float:
+def direct_seconds(delay: NDArray[np.float64], amplitude: NDArray[np.complex128], sonar: ChannelSonar) -> float:
     """Time of eq. 5.15 as it stands, frequency by frequency."""
     frequency = sonar.carrier_hz + np.arange(-360, 361) * sonar.frequency_step_hz
     begun = time.perf_counter()

@@ -71,7 +71,7 @@ def qualities(name: str, pings: int, reference_pings: int, repeats: int) -> dict
     ground = Ground(name, reference_pings)
     rows: dict[str, dict[str, float]] = {}
     for quality in QUALITIES:
-        sonar = preset(name).replace(quality=quality)
+        sonar = preset(name).replace(model="physical", quality=quality)
         plain, textured, still = ground.errors(sonar.rays_per_beam, sonar.rays_across, pings)
         rows[quality] = {
             "rays_per_beam": sonar.rays_per_beam,
@@ -108,7 +108,7 @@ class Ground:
     """
 
     def __init__(self, name: str, pings: int) -> None:
-        whole = preset(name)
+        whole = preset(name).replace(model="physical")
         self.sonar = whole.replace(beams=BEAMS, beam_width_deg=math.degrees(whole.beam_width_rad))
         self.height = whole.range_max * math.sin(FAR_GRAZING_RAD)
         self.pitch = FAR_GRAZING_RAD + math.radians(whole.elevation_fov_deg) / 2

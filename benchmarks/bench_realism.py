@@ -97,7 +97,7 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
     poses = stage.start + np.arange(frames)[:, None] * stage.step
     with tempfile.TemporaryDirectory() as made:
         scene = stage.build(Path(made))
-        silent = Simulator(scene, sonar)
+        silent = Simulator(scene, sonar, mirrors=stage.mirrors)
         bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels, 99.9)
         assert silent.coherent is not None
         middle = silent.coherent.gain[sonar.range_bins // 2]
@@ -105,7 +105,9 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
             below = fit.noise_db - fit.bright_db
             level = 10 * math.log10(bright / middle) + below + sonar.source_level_db
             sonar = sonar.replace(noise_level_db=level)
-        made_frames = Simulator(scene, sonar).render(poses, gain=float(10 ** (fit.bright_db / 10) / bright))
+        made_frames = Simulator(scene, sonar, mirrors=stage.mirrors).render(
+            poses, gain=float(10 ** (fit.bright_db / 10) / bright)
+        )
     image = np.rint(made_frames.image * 255).astype(np.float32) / 255
     if stage.pictures:
         image = as_recorded(image, folder, stage.pictures, stage.video)

@@ -8,6 +8,7 @@ import struct
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +60,16 @@ def fan_of(image: Picture, outline: Outline, shape: tuple[int, int]) -> NDArray[
     return np.asarray(np.rint(np.clip(np.stack(drawn), 0, 1) * 255), dtype=np.uint8)
 
 
+PLAIN: dict[str, Any] = {
+    "model": "coherent",
+    "gain_absorption": False,
+    "source_level_db": 0.0,
+    "noise_level_db": None,
+    "absorption_db_per_m": 0.0,
+}
+"""What the presets say of levels, undone: recordings have no scale. Of the gain over range nothing is documented."""
+
+
 def _frames(image: NDArray[np.floating], sonar: Sonar, time_step_s: float, level: str) -> SonarFrames:
     time = np.arange(len(image), dtype=np.float64) * np.float64(time_step_s)
     return SonarFrames(image, sonar.range_m, sonar.bearing_rad, time, sonar, level=level)
@@ -75,7 +86,7 @@ def didson(folder: Path, name: str, window: tuple[float, float]) -> SonarFrames:
     with np.load(folder / "didson-static-video" / f"{name}_first30.npz") as table:
         pictures = table["frames"][:12]
     sonar = preset("didson300").replace(
-        model="coherent", frequency_hz=1.8e6, azimuth_fov_deg=28.3, gain_exponent=0, coding="dB", coding_db=90.0,
+        **PLAIN, frequency_hz=1.8e6, azimuth_fov_deg=28.3, gain_exponent=0, coding="dB", coding_db=90.0,
         range_min=window[0], range_max=window[1],
     )  # fmt: skip
     return _frames(polar_of(pictures, LAMPREY[name], 512, 96), sonar, 0.1, "dB")
@@ -93,7 +104,7 @@ def aris3000(folder: Path, name: str) -> SonarFrames:
     """Return fan pictures of a moving ARIS 3000 in a tank, 80 dB in 255 counts. Licence unknown: not for documents."""
     pictures, outline = _tank(folder, name)
     sonar = preset("aris3000").replace(
-        model="coherent", frequency_hz=3.0e6, azimuth_fov_deg=29.9, gain_exponent=0, coding="dB", coding_db=80.0,
+        **PLAIN, frequency_hz=3.0e6, azimuth_fov_deg=29.9, gain_exponent=0, coding="dB", coding_db=80.0,
         range_bins=430, range_min=1.6, range_max=3.975,
     )  # fmt: skip
     return _frames(polar_of(pictures, outline, 430, 128), sonar, 1 / 15, "dB")
@@ -110,7 +121,7 @@ def aris1200(folder: Path) -> SonarFrames:
     image = np.stack(raw).reshape(-1, samples, beams)[:, :, ::-1].astype(np.float32) / 255
     near, step = delay * 0.5e-6 * speed, period * 0.5e-6 * speed
     sonar = Sonar.create(
-        name="aris1200", model="coherent", frequency_hz=1.2e6, azimuth_fov_deg=14.9, elevation_fov_deg=3.0, beams=beams,
+        name="aris1200", **PLAIN, frequency_hz=1.2e6, azimuth_fov_deg=14.9, elevation_fov_deg=3.0, beams=beams,
         beam_width_deg=0.31, bearing="cone", range_min=near, range_max=near + samples * step, range_bins=samples,
         sound_speed=speed, frame_rate_hz=6.55, coding="dB", coding_db=80.0,
     )  # fmt: skip
@@ -129,7 +140,7 @@ def oculus(folder: Path) -> SonarFrames:
         images.append(np.frombuffer(data, np.uint8, bins * beams, at + begin).reshape(bins, beams))
         at += 16 + payload
     sonar = preset("oculus-m1200d-2100khz").replace(
-        model="coherent", frequency_hz=2.1e6, beams=beams, range_min=0.0, range_max=bins * step, range_bins=bins,
+        **PLAIN, frequency_hz=2.1e6, beams=beams, range_min=0.0, range_max=bins * step, range_bins=bins,
         sound_speed=1490.66, gain_exponent=2, coding="gamma", coding_gamma=0.5,
     )  # fmt: skip
     return _frames(np.stack(images).astype(np.float32) / 255, sonar, 1 / 40, "gamma")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ class Stage:
         sonar: fields that the recording does not tell.
         pictures: whether frames pass through fan pictures of 8 bit, as the recording did.
         video: whether these pass through MPEG-4.
+        mirrors: reflection coefficient and rms height [m] of smooth shapes.
     """
 
     build: Callable[[Path], mi.Scene]
@@ -39,6 +40,7 @@ class Stage:
     sonar: dict[str, Any]
     pictures: str = ""
     video: bool = False
+    mirrors: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def pose(height: float, pitch_deg: float, y: float = 0.0, x: float = 0.0, heading_deg: float = 0.0) -> NDArray[np.float64]:
@@ -242,6 +244,7 @@ STAGES = {
         np.array([0.0, 0.0055, 0.0, 0.0, 0.0, math.radians(0.16)]),
         {"absorption_db_per_m": 2.34},
         pictures="translate_tyre",
+        mirrors={"tyre": (0.5, 5e-5), "box": (0.5, 5e-5), "lid": (0.5, 5e-5), "wall": (0.5, 8e-5)},
     ),
     "ARIS 3000 chain": Stage(
         tank_with_chain,
@@ -249,6 +252,7 @@ STAGES = {
         np.array([0.0, 0.0068, 0.0, 0.0, 0.0, math.radians(0.09)]),
         {"absorption_db_per_m": 2.34},
         pictures="forward_chain",
+        mirrors={"chain": (0.9, 3e-5), "beams": (0.5, 8e-5)},
     ),
     "Oculus 2.1 MHz": Stage(small_tank, pose(0.27, 21), STILL, {"absorption_db_per_m": 1.14}),
 }

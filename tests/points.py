@@ -22,8 +22,10 @@ CELL_M = 50 / 2048
 class PointGround:
     """One scatterer in each cell of the level ground, anywhere in it; strength 0..1 times the cell's area.
 
+    Each has its own complex Gaussian number besides, of variance 1, as the scatterers of the simulator have.
+
     Args:
-        seed: of places and strengths.
+        seed: of places, strengths and these numbers.
         half_m: the ground reaches so far to each side.
         cell_m: edge of a cell [m].
     """
@@ -35,6 +37,7 @@ class PointGround:
         grid = np.stack(np.meshgrid(line + shift[0], line + shift[1], indexing="ij"), axis=-1).reshape(-1, 2)
         self.points = np.column_stack([grid + rng.random(grid.shape) * cell_m, np.zeros(len(grid))])
         self.strength = rng.random(len(grid)) * cell_m**2
+        self.zeta = rng.standard_normal((len(grid), 2)) @ [1, 1j] / np.sqrt(2)
 
 
 def ping(
@@ -54,7 +57,7 @@ def ping(
     found = []
     for number, receiver in enumerate(sonar.receivers):
         of = slice(None) if keep is None or len(keep) <= number else keep[number]
-        points, strength = ground.points[of], ground.strength[of]
+        points, strength, zeta = ground.points[of], ground.strength[of], ground.zeta[of]
         sent = points - place
         there = np.linalg.norm(sent, axis=1)
         received = sent - np.array(receiver.position) @ turn
@@ -72,11 +75,11 @@ def ping(
             delay = tau + np.linalg.norm(received[on] - delay[:, None] * speed, axis=1) / sonar.sound_speed
         cosines = -sent[on, 2] / there[on] * -received[on, 2] / back[on]
         amplitude = gain[on] * np.sqrt(strength[on] * cosines) / (there[on] * back[on] if sonar.spreads else 1.0)
-        found.append(_response(sonar, amplitude, delay))
+        found.append(_response(sonar, amplitude * zeta[on], delay))
     return np.array(found, dtype=np.complex64)
 
 
-def _response(sonar: ChannelSonar, amplitude: Array, delay: Array) -> NDArray[np.complex128]:
+def _response(sonar: ChannelSonar, amplitude: NDArray[np.complex128], delay: Array) -> NDArray[np.complex128]:
     """The taps of echoes (eq. 5.15 to 5.17)."""
     count = sonar.taps
     phase = np.exp(-2j * np.pi * sonar.carrier_hz * delay)

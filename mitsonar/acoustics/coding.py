@@ -29,13 +29,13 @@ def coded(level: NDArray[np.float32], sonar: Sonar) -> NDArray[np.float32]:
     return np.asarray(np.maximum(value, np.float32(0)), dtype=np.float32)
 
 
-def decoded(value: ArrayLike, sonar: Sonar) -> NDArray[np.float64]:
+def decoded(value: ArrayLike, sonar: Sonar, coding: str | None = None) -> NDArray[np.float64]:
     """Return the levels relative to full scale that values 0..1 stand for, of the same shape.
 
-    A value of 0 of the coding ``dB`` stands for its least level, or less.
+    A value of 0 of the coding ``dB`` stands for its least level, or less. ``coding`` None is the sonar's own.
     """
     value = np.asarray(value, dtype=float)
-    match sonar.value_coding:
+    match coding or sonar.value_coding:
         case "linear":
             return value
         case "gamma":

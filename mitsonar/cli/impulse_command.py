@@ -46,7 +46,7 @@ def impulse(
         str | None,
         typer.Option(help="scatterers (fixed in the world) or rays (fixed to the vehicle, as in Almanza-Medina)."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the positions of scatterers.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the places and amplitudes of scatterers without cells.")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3.")
     ] = None,

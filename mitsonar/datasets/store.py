@@ -303,6 +303,8 @@ class DataStore:
     def missing(self, *, verify: bool = False) -> list[int]:
         """Find the shards that are not written or that have changed. A whole shard without a seal is sealed.
 
+        In a store that is open for reading only, a shard without a seal counts as missing.
+
         Args:
             verify: whether digests are compared, too, which reads everything; otherwise only sizes.
         """
@@ -314,7 +316,7 @@ class DataStore:
             if (found < 0).any():
                 lacking.append(shard)
             elif not seals[shard].any():  # stopped between the last file and the seal
-                if self._reads_whole(shard):
+                if not self.group.read_only and self._reads_whole(shard):
                     self.seal(shard)
                 else:
                     lacking.append(shard)

@@ -120,18 +120,16 @@ AnyEstimator = Estimator[Any]
 
 
 def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the two images as float32 in 0..1.
+    """Return the two images as float32 in 0..1, as :meth:`SonarFrames.matching_values` has them.
 
     Raises:
-        MitsonarError: not two frames, too few bins or beams, axes that do not rise, levels not linear or not finite.
+        MitsonarError: not two frames, too few bins or beams, axes that do not rise, values not finite.
     """
     if len(frames) != 2:
         raise MitsonarError(f"an estimator takes two frames: got {len(frames)}")
     kind = frames.image.dtype
-    if frames.level != "linear" or not (kind == np.uint8 or np.issubdtype(kind, np.floating)):
-        raise MitsonarError(
-            f"estimators take linear images, uint8 or float in 0..1: got {kind}, {frames.level}; convert them first"
-        )
+    if not (kind == np.uint8 or np.issubdtype(kind, np.floating)):
+        raise MitsonarError(f"estimators take images of uint8 or float in 0..1: got {kind}; convert them first")
     rising = (np.diff(frames.range_m) > 0).all() and (np.diff(frames.bearing_rad) > 0).all()
     if min(frames.image.shape[1:]) < FEWEST_CELLS or not rising:
         raise MitsonarError(
@@ -140,8 +138,7 @@ def two_frames(frames: SonarFrames) -> tuple[NDArray[np.float32], NDArray[np.flo
         )
     if not np.isfinite(frames.image).all():
         raise MitsonarError("the images hold nan or inf: set pixels without echo to 0")
-    scale = np.float32(1 / 255 if frames.image.dtype == np.uint8 else 1)
-    first, second = (np.asarray(image, dtype=np.float32) * scale for image in frames.image)
+    first, second = frames.matching_values()
     return first, second
 
 

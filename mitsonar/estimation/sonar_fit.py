@@ -13,6 +13,7 @@ from scipy import ndimage, optimize, special
 
 from mitsonar.acoustics import image_statistics as statistics
 from mitsonar.acoustics.coding import decoded
+from mitsonar.acoustics.sonar_losses import gain_of, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.records.sonar_frames import SonarFrames
@@ -23,7 +24,8 @@ Array = NDArray[np.float64]
 
 GEOMETRY = (
     "azimuth_fov_deg", "beams", "beam_layout", "bearing", "range_min", "range_max", "range_bins", "sound_speed",
-    "gain_exponent", "gain_absorption", "source_level_db", "frame_rate_hz",
+    "gain_exponent", "gain_absorption", "absorption_db_per_m", "temperature_c", "salinity_psu", "water_depth_m", "ph",
+    "source_level_db", "frame_rate_hz",
 )  # fmt: skip
 """Fields that the recording knows better than a named sonar."""
 
@@ -136,7 +138,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
-    flat = intensity / _gain(sonar)[:, None]
+    flat = intensity / gain_of(sonar)[:, None]
     noise = _noise(flat, value, level, notes)
     nu = _nu(flat, value, noise or 0.0)
     if nu is not None and nu < STRUCTURED:
@@ -149,7 +151,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     }
     if noise is not None:
         fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + _full_scale_db(frames, sonar, flat, notes), 1)
-    middle = float(_gain(sonar)[len(frames.range_m) // 2])
+    middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
         sonar=sonar.replace(**fitted),
         noise_db=None if noise is None else float(10 * math.log10(noise * middle)),
@@ -244,12 +246,6 @@ def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure:
 # ---------------------------------------------------------------- levels
 
 
-def _gain(sonar: Sonar) -> Array:
-    """Return the time-varying gain that the levels hold ``(bins,)``."""
-    loss = 2 * (sonar.absorption_db_per_m or 0.0) * sonar.range_m if sonar.gain_absorption else 0.0
-    return np.asarray(sonar.range_m**sonar.gain_exponent * 10 ** (np.asarray(loss) / 10), dtype=np.float64)
-
-
 def _noise(flat: Array, value: Array, level: Array, notes: list[str]) -> float | None:
     """Return the mean intensity of the darkest windows, if it can be noise: not below the coding, and new in each frame."""
     beyond = slice(statistics.GLOW_BINS, None)
@@ -280,7 +276,7 @@ def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[s
     at = np.nonzero(flat >= bright)[1] + statistics.GLOW_BINS
     range_m = float(np.median(sonar.range_m[at]))
     face = FACE * SLANT * sonar.beam_width_rad * sonar.bin_m / range_m**3 * math.log(1000)
-    lost = 2 * (sonar.absorption_db_per_m or 0.0) * range_m
+    lost = -float(10 * np.log10(np.interp(range_m, sonar.range_m, loss_of(sonar))))
     notes.append(
         f"levels have no scale: noise_level_db takes the brightest thousandth, at {range_m:.3g} m, for a face "
         f"of reflectivity {FACE:g} at 45 deg"

@@ -113,8 +113,9 @@ class Aperture:
             Amplitude ``(...)``; at a curvature of 0 the pattern itself.
         """
         x = (np.arange(FOCUS_PARTS) + 0.5) / FOCUS_PARTS - 0.5  # along the aperture, in its length
-        weight = 1 + sum(2 * part * np.cos(2 * math.pi * m * x) for m, part in enumerate(series(self.shading), 1))
-        weight = weight / FOCUS_PARTS
+        weight = np.full(FOCUS_PARTS, 1 / FOCUS_PARTS)
+        for m, part in enumerate(series(self.shading), 1):
+            weight = weight + 2 * part / FOCUS_PARTS * np.cos(2 * math.pi * m * x)
         bend = math.pi * (self.length * x) ** 2 * wavelength * curvature
         u = np.asarray(u, dtype=float)
         steer = np.exp(-2j * math.pi * self.length * u[..., None] * x)

@@ -179,7 +179,7 @@ class ChannelSonar(Instrument):
         1700.0, gt=0, le=1e7, description="scatterers of surfaces without cells of their own [1/m2]"
     )
     rays: int = Field(50_000, ge=1, le=10**8, description="rays within each receiver's field of view, model rays")
-    seed: int = Field(0, ge=0, lt=2**31, description="of the positions of scatterers")
+    seed: int = Field(0, ge=0, lt=2**31, description="of the places and amplitudes of scatterers without cells")
     transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="its field of view")
     receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
 

@@ -123,7 +123,7 @@ class Sonar(Instrument):
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
     model: Model = Field(
         "physical",
-        description="coherent: speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's, artefacts included",
+        description="coherent: with speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's",
     )
     gain_exponent: int = Field(
         0,
@@ -190,7 +190,8 @@ class Sonar(Instrument):
     )
     stripes_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' gains, by the seed [dB] (coherent)")
     coding: Coding | None = Field(
-        None, description="how values stand for levels: linear, dB or gamma; default: dB in the model coherent, else linear"
+        None,
+        description="how values stand for levels (with a pattern): linear, dB or gamma; default: coherent dB, else linear",
     )
     coding_db: float = Field(80.0, gt=0, le=300, description="span of the coding dB, from value 0 to 1 [dB]")
     coding_gamma: float = Field(0.5, gt=0, le=4, description="of the coding gamma: value = amplitude^gamma")
@@ -286,7 +287,9 @@ class Sonar(Instrument):
 
     @property
     def value_coding(self) -> Coding:
-        """Return how values stand for levels."""
+        """Return how values stand for levels. With hard edges they are linear."""
+        if self.beam_pattern == "box":
+            return "linear"
         return self.coding or ("dB" if self.model == "coherent" else "linear")
 
     @property

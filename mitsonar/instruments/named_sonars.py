@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_yaml
 
@@ -56,7 +56,7 @@ def preset(name: str) -> Sonar:
     """
     known = named_sonars()
     if name not in known:
-        raise MitsonarError(f"unknown sonar preset {name!r}: {nearest_names(name, known)}")
+        raise MitsonarError(f"unknown sonar preset {shortened(name)}: {nearest_names(name, known)}")
     return Sonar.create(name=name, **known[name].values)
 
 

@@ -63,7 +63,7 @@ class FrameFan:
 
 
 def levels_of(frames: SonarFrames) -> Floats:
-    """Return the images ``(frames, bins, beams)`` as float32 in 0..1.
+    """Return the images ``(frames, bins, beams)`` as float32 in 0..1, as estimators match them.
 
     Raises:
         MitsonarError: too few or too many bins or beams, axes that do not rise, pixels that are not finite.
@@ -73,7 +73,7 @@ def levels_of(frames: SonarFrames) -> Floats:
         raise MitsonarError(f"a mosaic needs images of 2 to {LONGEST_SIDE:,} bins and beams: got {bins:,} x {beams:,}")
     if (np.diff(frames.range_m) <= 0).any() or (np.diff(frames.bearing_rad) <= 0).any():
         raise MitsonarError("range_m and bearing_rad must rise: sort the images' rows and columns")
-    images = frames.image.astype(np.float32) / np.float32(255 if frames.image.dtype == np.uint8 else 1)
+    images = frames.matching_values()
     if not np.isfinite(images).all():
         raise MitsonarError("images must be finite: got inf or nan; 0 means no echo")
     return np.asarray(images)

@@ -183,9 +183,12 @@ class FrameSource:
         Their poses have height, pitch and roll, but position and heading 0, so that no truth can leak.
 
         Raises:
-            MitsonarError: pixels that cannot be read.
+            MitsonarError: frames that are not there, or pixels that cannot be read.
         """
         chosen = np.asarray(index, dtype=np.intp)
+        beyond = chosen[(chosen < 0) | (chosen >= len(self))]
+        if beyond.size:
+            raise MitsonarError(f"{self.name} has no frame {beyond[0]}: it holds {len(self):,}, numbered from 0")
         try:
             image = self.images(chosen)
         except (OSError, ValueError, RuntimeError, KeyError) as error:
@@ -323,9 +326,9 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
     except Exception as error:
         raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
     like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
-    for name in ("poses", "height_m"):
-        if name in table:
-            check_column(table[name], name, COLUMNS[name], {"frames": done, "six": 6}, str(path))
+    for known in ("poses", "height_m"):
+        if known in table:
+            check_column(table[known], known, COLUMNS[known], {"frames": done, "six": 6}, str(path))
     times = table["time_s"]
     if times.ndim == 1:
         check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
@@ -394,7 +397,9 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
 
 def _picked(image: StoredArray, index: Index) -> Pixels:
     """Read frames of a Zarr array; those at equal steps at once."""
+    if not len(index):
+        return np.asarray(image[:0])
     steps = np.unique(np.diff(index))
-    if len(index) and len(steps) <= 1 and (not len(steps) or steps[0] > 0):
+    if len(steps) <= 1 and (not len(steps) or steps[0] > 0):
         return np.asarray(image[int(index[0]) : int(index[-1]) + 1 : int(steps[0]) if len(steps) else 1])
     return np.stack([np.asarray(image[int(one)]) for one in index])

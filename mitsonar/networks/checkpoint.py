@@ -224,7 +224,7 @@ class Checkpoint:
         """
         if isinstance(answer, GaussianHead):
             mean, covariance = (values.detach().cpu().double().numpy() for values in answer)
-            return mean, covariance
+            return mean, (covariance + covariance.swapaxes(-1, -2)) / 2  # single precision leaves it lopsided by 1e-8
         names = self.labels["names"]
         if not isinstance(answer, Tensor) or answer.ndim != 2 or answer.shape[1] != len(names):
             got = tuple(answer.shape) if isinstance(answer, Tensor) else type(answer).__name__

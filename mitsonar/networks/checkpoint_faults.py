@@ -55,9 +55,9 @@ def unpacked(content: bytes, source: str) -> Table:
         MitsonarError: not a file of torch, damaged, or one that would unpack to more than it is.
     """
     buffer = io.BytesIO(content)
-    if not zipfile.is_zipfile(buffer):
-        raise MitsonarError(f"{source} is not a checkpoint, or was cut off: give a {FILE} of `mitsonar train`")
     try:
+        if not zipfile.is_zipfile(buffer):  # raises where the end says that parts lie in other files
+            raise MitsonarError(f"{source} is not a checkpoint, or was cut off: give a {FILE} of `mitsonar train`")
         with zipfile.ZipFile(buffer) as parts:
             packed = [part for part in parts.infolist() if part.compress_type != zipfile.ZIP_STORED]
             if packed or sum(part.file_size for part in parts.infolist()) > min(LARGEST, len(content)):

@@ -111,8 +111,19 @@ class SonarFrames:
         Relative to the source where the sonar has no ``source_level_db``. A value of 0 of a linear image is -inf.
         """
         with np.errstate(divide="ignore"):
-            level = 10 * np.log10(decoded(value, self.sonar) * self.level_scale)
+            level = 10 * np.log10(decoded(value, self.sonar, self.level) * self.level_scale)
         return float(level) + self.sonar.source_level_db
+
+    def matching_values(self) -> NDArray[np.float32]:
+        """Return the images as float32 in 0..1, as estimators and mosaics match them, like ``image``.
+
+        Linear images are as they are. Of images in the codings ``dB`` and ``gamma`` the root of the amplitude is returned:
+        of level, amplitude, root of the amplitude and dB it made the smallest errors on speckle, with all estimators.
+        """
+        values = np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
+        if self.level == "linear":
+            return values
+        return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level) ** 0.25, dtype=np.float32)
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
         """Return some of the frames."""

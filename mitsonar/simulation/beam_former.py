@@ -20,7 +20,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.pulse import Pulse
 from mitsonar.instruments.quality import rays_over_elevation
 
-__all__ = ["BeamFormer", "CommonFan"]
+__all__ = ["BeamFormer", "CommonFan", "elevation_end", "side_lobes"]
 
 SINES_A_LOBE, RANGES_A_PULSE = 8, 4
 """Lines of the grid a wavelength over the aperture, and a resolution."""
@@ -65,11 +65,7 @@ class CommonFan:
     @classmethod
     def of(cls, sonar: Sonar) -> CommonFan:
         """Derive the fan of a sonar; its density follows from the sonar's quality."""
-        half = math.radians(sonar.elevation_fov_deg) / 2
-        end = half
-        if sonar.vertical_pattern != "box":
-            stretched = math.sin(half) * ELEVATION_END[sonar.vertical_pattern] / ELEVATION_HALF[sonar.vertical_pattern]
-            end = max(half, min(math.radians(STEEPEST_DEG), math.asin(min(1.0, stretched))))
+        end = elevation_end(sonar)
         sine = min(0.999, math.sin(math.radians(sonar.azimuth_fov_deg) / 2) + side_lobes(sonar.aperture))
         columns = math.ceil(2 * sine / sonar.beam_width_rad * COLUMNS_A_BEAM[sonar.quality])
         rows = 2 * rays_over_elevation(sonar.quality, 2 * end)
@@ -79,6 +75,15 @@ class CommonFan:
     def rays(self) -> int:
         """Return the number of rays."""
         return self.columns * self.rows
+
+
+def elevation_end(sonar: Sonar) -> float:
+    """Return the largest elevation of rays [rad]: the edge of the field of view, or where the pattern has faded."""
+    half = math.radians(sonar.elevation_fov_deg) / 2
+    if sonar.vertical_pattern == "box":
+        return half
+    stretched = math.sin(half) * ELEVATION_END[sonar.vertical_pattern] / ELEVATION_HALF[sonar.vertical_pattern]
+    return max(half, min(math.radians(STEEPEST_DEG), math.asin(min(1.0, stretched))))
 
 
 def side_lobes(aperture: Aperture) -> float:
@@ -144,7 +149,8 @@ class BeamFormer:
     def focused(self) -> list[tuple[slice, NDArray[np.complex64]]]:
         """Return blocks of bins and their matrices ``(beams, sines)``, of an array focused at one range."""
         sonar = self.sonar
-        assert sonar.focus_m is not None and sonar.frequency_hz is not None
+        assert sonar.focus_m is not None
+        assert sonar.frequency_hz is not None
         wavelength = sonar.sound_speed / sonar.frequency_hz
         found = []
         for part in np.array_split(np.arange(sonar.range_bins), min(FOCUS_BLOCKS, sonar.range_bins)):

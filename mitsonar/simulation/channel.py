@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impulse_response"]
 
-FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "doppler")
+FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "phase", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
 """Fields of :class:`~mitsonar.simulation.channel_tracing.EchoBatch` that a launch returns."""
 
@@ -61,13 +61,13 @@ class Paths:
 
     Attributes:
         delay_s: ``(n,)`` float64.
-        amplitude: ``(n,)`` float64.
+        amplitude: ``(n,)`` complex128, before the carrier's phase -2 pi f_c tau; real and positive in the model ``rays``.
         doppler_hz: shift of the carrier ``(n,)``, positive where the path gets shorter.
         dropped: number of echoes from beyond ``range_max``.
     """
 
     delay_s: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
+    amplitude: NDArray[np.complex128]
     doppler_hz: NDArray[np.float64]
     dropped: int
 
@@ -76,9 +76,9 @@ class ChannelSimulator:
     """Simulate the impulse responses that a channel sonar measures in a scene.
 
     Model ``scatterers``: points of the world (:mod:`mitsonar.simulation.scatterers`) that the transmitter sees, with one
-    shadow ray each. The amplitude is sqrt(C dA cos_A cos_B) / (r_A r_B), so that its square is the level of an imaging
-    sonar's echo. Model ``rays`` (Almanza-Medina, 5.2.1): rays that are fixed to the vehicle, evenly over each receiver's
-    field of view. The amplitude is C cos_A.
+    shadow ray each. The amplitude is zeta sqrt(C dA cos_A cos_B) / (r_A r_B), where zeta is the point's own complex Gaussian
+    number. The mean of its square is the level of an imaging sonar's echo. Model ``rays`` (Almanza-Medina, 5.2.1): rays that
+    are fixed to the vehicle, evenly over each receiver's field of view. The amplitude is C cos_A.
 
     Args:
         scene: any Mitsuba scene.
@@ -201,8 +201,9 @@ class ChannelSimulator:
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
         received = self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS)
         keep = received["counts"].astype(bool)
-        delay, amplitude, doppler = (received[name][keep].astype(float) for name in ("delay", "amplitude", "doppler"))
-        return Paths(delay, amplitude, doppler, int(np.count_nonzero(received["beyond"])))
+        names = ("delay", "amplitude", "phase", "doppler")
+        delay, size, phase, doppler = (received[name][keep].astype(float) for name in names)
+        return Paths(delay, size * np.exp(1j * phase), doppler, int(np.count_nonzero(received["beyond"])))
 
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
@@ -240,7 +241,7 @@ def frequency_response(
 
     Args:
         delay_s: of each echo ``(n,)`` [s].
-        amplitude: of each echo ``(n,)``.
+        amplitude: of each echo ``(n,)``, real or complex.
         sonar: carrier, band and frequency step.
 
     Returns:
@@ -260,7 +261,7 @@ def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSon
 
     Args:
         delay_s: of each echo ``(n,)`` [s].
-        amplitude: of each echo ``(n,)``.
+        amplitude: of each echo ``(n,)``, real or complex.
         sonar: carrier, band, frequency step and taps.
 
     Returns:

@@ -83,7 +83,7 @@ class ChannelTracer:
         table = mi.Float64(link_table(self.sonar, receiver, pose, velocity))
         with garbage_stays():
             received = self.launches[receiver, wanted](mi.UInt32(asked), self.scene, table, self.source.tables(receiver))
-        return {name: np.array(values) for name, values in zip(wanted, received, strict=True)}
+        return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height of each pose over what is straight below it ``(pings,)`` [m]; nan where there is nothing."""
@@ -109,16 +109,18 @@ class EchoBatch:
 
     Attributes:
         delay: of the echo [s].
-        amplitude: of the echo.
+        amplitude: magnitude of the echo.
+        phase: of the scatterer itself, beside that of the delay [rad]; one 0 for all in the model rays.
         doppler: shift of the carrier [Hz].
         counts: whether there is an echo within ``range_max``.
         beyond: whether there is an echo from beyond ``range_max``.
         turn: phase of the delay at the finest frequency, -pi..pi, for the transform [rad].
-        real, imag: the amplitude with the carrier's phase.
+        real, imag: the amplitude with the scatterer's and the carrier's phase.
     """
 
     delay: DeviceArray
     amplitude: DeviceArray
+    phase: DeviceArray
     doppler: DeviceArray
     counts: DeviceArray
     beyond: DeviceArray
@@ -130,17 +132,18 @@ class EchoBatch:
 def link_table(
     sonar: ChannelSonar, receiver: int, pose: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the geometry of one ping in the world ``(27,)``.
+    """Return the geometry of one ping in the world ``(30,)``.
 
-    Three numbers each: positions of transmitter and receiver [m], the receiver's velocity [m/s]. Nine numbers each: axes of
-    the receiver's field of view, and of the transmitter's.
+    Three numbers each: positions of transmitter and receiver [m], their velocities [m/s]. Nine numbers each: axes of the
+    receiver's field of view, and of the transmitter's.
     """
     turn = vehicle_rotation(pose).as_matrix()[0]
     one = sonar.receivers[receiver]
     offset = np.array(one.position)
     swing = velocity[:3] + np.cross([0.0, 0.0, -velocity[3]], offset)
     axes = [field.axes @ turn.T for field in (one.field, sonar.transmitter)]
-    return np.concatenate([pose[:3], pose[:3] + turn @ offset, turn @ swing, *(each.ravel() for each in axes)])
+    places, velocities = (pose[:3], pose[:3] + turn @ offset), (turn @ velocity[:3], turn @ swing)
+    return np.concatenate([*places, *velocities, *(each.ravel() for each in axes)])
 
 
 class LinkGeometry:
@@ -154,7 +157,7 @@ class LinkGeometry:
 
     def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64) -> None:
         self.sonar = sonar
-        self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(27)]
+        self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(30)]
         dr.eval(self.numbers)  # read once, not once a point
         self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
         self.sends: FieldOfView = sonar.transmitter
@@ -171,11 +174,11 @@ class LinkGeometry:
     @property
     def velocity(self) -> list[DeviceArray]:
         """Return the velocity of the receiver [m/s]."""
-        return self.vector(6)
+        return self.vector(9)
 
     def axes(self, which: int) -> list[mi.Vector3f]:
         """Return the axes of the receiver's field of view (0) or the transmitter's (1)."""
-        return [mi.Vector3f(*self.vector(9 + 9 * which + 3 * k)) for k in range(3)]
+        return [mi.Vector3f(*self.vector(12 + 9 * which + 3 * k)) for k in range(3)]
 
     def to_point(self, point: list[DeviceArray]) -> tuple[list[DeviceArray], list[DeviceArray]]:
         """Return the vectors from the transmitter and from the receiver to points of the world [m]."""
@@ -194,20 +197,24 @@ class LinkGeometry:
     def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
         """Return the shift of the carrier [Hz], given unit directions to the points.
 
-        It is positive where the vehicle approaches the point: both parts of the path get shorter.
+        It is positive where the vehicle approaches the point: both parts of the path get shorter. In a turn transmitter and
+        receiver have velocities of their own. Terms of second order in velocity over sound speed are left out.
         """
-        velocity = mi.Vector3f(*self.velocity)
-        return (dr.dot(sent, velocity) + dr.dot(received, velocity)) * (1 / self.sonar.wavelength_m)
+        sender, receiver = (mi.Vector3f(*self.vector(start)) for start in (6, 9))
+        return (dr.dot(sent, sender) + dr.dot(received, receiver)) * (1 / self.sonar.wavelength_m)
 
-    def echo_batch(self, delay: DeviceArray, amplitude: DeviceArray, doppler: DeviceArray, valid: DeviceArray) -> EchoBatch:
+    def echo_batch(
+        self, delay: DeviceArray, amplitude: DeviceArray, phase: DeviceArray, doppler: DeviceArray, valid: DeviceArray
+    ) -> EchoBatch:
         """Return the echoes, divided into those within ``range_max`` and those from beyond."""
         beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
         turn = delay * (self.sonar.frequency_step_hz / PADDING)
-        phase = delay * self.sonar.carrier_hz
-        sin, cos = dr.sincos(mi.Float((phase - dr.round(phase)) * (2 * math.pi)))  # float32 once the turns are away
+        turns = delay * self.sonar.carrier_hz
+        sin, cos = dr.sincos(mi.Float((turns - dr.round(turns)) * (2 * math.pi)) - phase)  # float32 once the turns are away
         return EchoBatch(
             delay=delay,
             amplitude=amplitude,
+            phase=phase,
             doppler=doppler,
             counts=valid & ~beyond,
             beyond=beyond,
@@ -230,7 +237,7 @@ class _WorldScatterers:
         self.scatterers = Scatterers.of(scene, sonar)
         rows = np.zeros((len(self.scatterers), 8), np.float32)  # two fetches of 16 bytes a point
         rows[:, :3], rows[:, 3] = self.scatterers.place, self.scatterers.strength
-        rows[:, 4:7] = self.scatterers.normal
+        rows[:, 4:7], rows[:, 7] = self.scatterers.normal, self.scatterers.phase
         self.stored = mi.Float(rows.ravel())
 
     def asked(self, pose: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
@@ -240,7 +247,7 @@ class _WorldScatterers:
         return self.scatterers.within(pose[:3] + turn @ np.array(one.position), one.field.axes @ turn.T, one.field)
 
     def tables(self, receiver: int) -> mi.Float:
-        """Return the inputs of a launch: position, strength and normal of all points."""
+        """Return the inputs of a launch: position, strength, normal and phase of all points."""
         return self.stored
 
     def received(self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: mi.Float) -> EchoBatch:
@@ -261,7 +268,7 @@ class _WorldScatterers:
         amplitude = weight * dr.sqrt(dr.select(seen, strength * lambert, 0))
         if self.sonar.spreads:
             amplitude /= sent * received
-        return link.echo_batch(delay, amplitude, link.doppler(u_sent, u_received), seen)
+        return link.echo_batch(delay, amplitude, second.w, link.doppler(u_sent, u_received), seen)
 
 
 class _VehicleRays:
@@ -287,7 +294,7 @@ class _VehicleRays:
         """Return the echoes of the points that the rays hit."""
         directions, facets = tables
         own = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
-        axes = [link.vector(9 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
+        axes = [link.vector(12 + 3 * k) for k in range(3)]  # a direction is given along the axes of the field of view
         u = [sum(own[k] * axes[k][axis] for k in range(3)) for axis in range(3)]
         u_sent = mi.Vector3f(*u)
         hit = replace(self.surfaces, **facets).hit(scene, mi.Ray3f(mi.Point3f(*link.sent_from), u_sent))
@@ -300,7 +307,8 @@ class _VehicleRays:
         amplitude = weight * hit.reflectivity * dr.abs(dr.dot(hit.n, u_sent))
         if self.sonar.spreads:
             amplitude /= hit.t * received
-        return link.echo_batch(delay, amplitude, link.doppler(u_sent, way_back / received), hit.valid & (weight > 0))
+        doppler = link.doppler(u_sent, way_back / received)
+        return link.echo_batch(delay, amplitude, mi.Float(0), doppler, hit.valid & (weight > 0))
 
 
 def _even(field: FieldOfView, rays: int) -> NDArray[np.float64]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mitsonar.acoustics.noise import uniform
+from mitsonar.acoustics.sonar_losses import gain_of, loss_notes, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.aperture import series, shaded_sinc
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -18,6 +20,8 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.mirror_parts import MirrorPart, mirror_of
+from mitsonar.simulation.mirror_tracing import MirrorTracer
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -37,17 +41,18 @@ class CoherentImager:
     Args:
         scene: any Mitsuba scene.
         sonar: of the model ``coherent``.
-        absorption_db_per_m: of the water, one way [dB/m].
+        mirrors: parts of shapes that reflect as mirrors, by the shapes' ids; default: none.
 
     Attributes:
         notes: what a user should know about scene and sonar.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, absorption_db_per_m: float) -> None:
+    def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mapping[str, MirrorPart] | None = None) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
-        self.tracer = CoherentTracer(scene, sonar, self.former)
-        self.absorption_db_per_m = absorption_db_per_m
-        self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar)]
+        parts = mirror_of(scene, mirrors)
+        self.tracer = CoherentTracer(scene, sonar, self.former, parts)
+        self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
+        self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
     def image(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the complex image of one ping ``(bins, beams)`` with its noise, and the counts of its rays.
@@ -57,6 +62,8 @@ class CoherentImager:
             ping: its number, of which the noise is a function.
         """
         field, counts = self.tracer.field(pose)
+        if self.glints is not None:
+            self.glints.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
@@ -75,16 +82,13 @@ class CoherentImager:
 
     @cached_property
     def gain(self) -> NDArray[np.float32]:
-        """Return the time-varying gain of levels ``(bins,)``: spreading, and absorption where the sonar undoes it."""
-        range_m = self.sonar.range_m
-        exponent = range_m**self.sonar.gain_exponent
-        undone = 2 * self.absorption_db_per_m * range_m if self.sonar.gain_absorption else 0.0
-        return np.asarray(exponent * 10 ** (np.asarray(undone) / 10), dtype=np.float32)
+        """Return the time-varying gain of levels ``(bins,)``."""
+        return np.asarray(gain_of(self.sonar), dtype=np.float32)
 
     @cached_property
     def _loss(self) -> NDArray[np.float32]:
         """Return the amplitude that absorption leaves, there and back ``(bins,)``."""
-        return np.asarray(10 ** (-2 * self.absorption_db_per_m * self.sonar.range_m / 20), dtype=np.float32)
+        return np.asarray(np.sqrt(loss_of(self.sonar)), dtype=np.float32)
 
     @cached_property
     def _stripes(self) -> NDArray[np.float32]:
@@ -111,8 +115,7 @@ class CoherentImager:
         filtered = self._noise_ranges @ white.astype(np.float32).transpose(1, 0, 2).reshape(self.former.ranges, 2 * waves)
         amplitude = np.float32(10 ** ((sonar.noise_level_db - sonar.source_level_db) / 20))
         real, imag = (np.ascontiguousarray(filtered[:, half * waves : (half + 1) * waves]) for half in (0, 1))
-        made: NDArray[np.complex64] = amplitude * (real @ beams) + 1j * amplitude * (imag @ beams)
-        return made
+        return np.asarray(amplitude * (real @ beams) + 1j * amplitude * (imag @ beams), dtype=np.complex64)
 
     @cached_property
     def _noise_beams(self) -> tuple[int, NDArray[np.float32]]:
@@ -129,11 +132,11 @@ class CoherentImager:
         return len(wave), np.ascontiguousarray(amplitude.T, dtype=np.float32)
 
     @cached_property
-    def _noise_ranges(self) -> object:
+    def _noise_ranges(self) -> csr_array[Any, Any]:
         """Return the matrix of the matched filter with rows of unit power ``(bins, ranges)``."""
         rows = self.former.over_range
         power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
-        return rows.multiply(1 / np.sqrt(power)[:, None]).tocsr().astype(np.float32)
+        return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
 
 
 def point_notes(sonar: Sonar) -> list[str]:
@@ -143,7 +146,7 @@ def point_notes(sonar: Sonar) -> list[str]:
     held = nearest * sonar.beam_width_rad * sonar.resolution_m / pitch**2
     needed = math.sqrt(nearest * sonar.beam_width_rad * sonar.resolution_m / FEWEST_A_CELL)
     enough = FEWEST_A_CELL * pitch**2 / (sonar.beam_width_rad * sonar.resolution_m)
-    if held >= FEWEST_A_CELL or sonar.scatterer_spacing_m is None and enough <= sonar.range_max / 2:
+    if held >= FEWEST_A_CELL or (sonar.scatterer_spacing_m is None and enough <= sonar.range_max / 2):
         return []
     return [
         f"a resolution cell holds {held:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
@@ -151,17 +154,21 @@ def point_notes(sonar: Sonar) -> list[str]:
     ]
 
 
-def coherent_imager(scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None) -> CoherentImager | None:
+def coherent_imager(
+    scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None, mirrors: Mapping[str, MirrorPart] | None = None
+) -> CoherentImager | None:
     """Return what renders pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: portions of the field of view, or receivers elsewhere.
+        MitsonarError: portions of the field of view, or receivers elsewhere; mirrors in other models.
     """
     if sonar.model != "coherent":
+        if mirrors:
+            raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
         return None
     if views is not None and any(not isinstance(view, Whole) for view in views):
         raise MitsonarError(
             "the model coherent has no portions of the field of view and no receivers elsewhere: render the whole view, "
             "or use the model physical"
         )
-    return CoherentImager(scene, sonar, sonar.absorption_db_per_m or 0.0)
+    return CoherentImager(scene, sonar, mirrors)

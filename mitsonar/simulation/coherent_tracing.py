@@ -21,12 +21,14 @@ from mitsonar.acoustics.speckle import patch_amplitudes
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit, Surfaces
-from mitsonar.simulation.beam_former import ELEVATION_HALF, BeamFormer, CommonFan
+from mitsonar.simulation.beam_former import BeamFormer, CommonFan
 from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.elevation_pattern import elevation_gain
 from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point, pick
+from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
 from mitsonar.simulation.variant import garbage_stays
 
-__all__ = ["CoherentTracer", "FieldCounts"]
+__all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
 
 ADD = dr.ReduceMode.Local
 """Mode of the additions: Dr.Jit's default assumes that the number of threads is the same when a launch is replayed."""
@@ -62,12 +64,13 @@ class CoherentTracer:
         scene: to trace.
         sonar: of the model ``coherent``.
         former: gives the grid.
+        mirrors: what shapes reflect as mirrors, and do not scatter; default: nothing.
 
     Attributes:
         pitch: of the lattice [m].
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer) -> None:
+    def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors | None = None) -> None:
         assert sonar.frequency_hz is not None
         self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.of(sonar)
         self.surfaces = Surfaces.of(scene)
@@ -81,13 +84,16 @@ class CoherentTracer:
         self.index = dr.arange(mi.UInt32, self.fan.rays)
         dr.make_opaque(self.index)
         dr.eval(self.patches)
+        self.mirrors = None if mirrors is None else mirrors.table()
         self.launch = self._compile()
 
     def field(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad], and its counts."""
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
         with garbage_stays():
-            real, imag, counts = self.launch(self.index, self.scene, rows, self.surfaces.arrays(), self.patches)
+            real, imag, counts = self.launch(
+                self.index, self.scene, rows, self.surfaces.arrays(), self.patches, self.mirrors
+            )
         shape = self.former.sines, self.former.ranges
         field = np.empty(shape, np.complex64)
         field.real, field.imag = (np.array(part, copy=False).reshape(shape) for part in (real, imag))
@@ -95,10 +101,12 @@ class CoherentTracer:
 
     def _compile(self) -> Callable[..., Any]:
         @dr.freeze
-        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any) -> Any:
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.fan, self.sonar, index, lines)
             hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+            if mirrors is not None:
+                hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
             return self._sums(rays, hit, patches)
 
         return launch
@@ -118,7 +126,7 @@ class CoherentTracer:
         )
         real, imag = (dr.zeros(mi.UInt64, former.sines * former.ranges) for _ in range(2))
         counts = dr.zeros(mi.UInt32, len(COUNTED))
-        self._count(counts, hit, points)
+        self._count(counts, rays, hit, points)
 
         def step(number: mi.Int32) -> tuple[mi.Int32]:
             self._deposit(rays, points, number, patches, (real, imag), counts)
@@ -129,11 +137,12 @@ class CoherentTracer:
         dr.eval(real, imag, counts)
         return *(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in (real, imag)), counts
 
-    def _count(self, counts: mi.UInt32, hit: Hit, points: HashedPoints) -> None:
-        """Count what becomes of the rays."""
+    def _count(self, counts: mi.UInt32, rays: FanRays, hit: Hit, points: HashedPoints) -> None:
+        """Count what becomes of the rays of the field of view; those beside it only carry side lobes and skirts."""
         near, far = hit.valid & (hit.t < self.sonar.range_min), hit.valid & (hit.t >= self.sonar.range_max)
         for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
-            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), found, mode=ADD)
+            kept = found & rays.inside
+            dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), kept, mode=ADD)
 
     def _deposit(
         self,
@@ -145,28 +154,45 @@ class CoherentTracer:
         counts: mi.UInt32,
     ) -> None:
         """Add one point of each ray to the four cells of the grid around it."""
-        former = self.former
         point = points.point(number, patches, self.patch_entries)
         seen = rays.seen(points, point)
         turns = seen.range_m * (2 / self.wavelength)
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + point.turn) * (2 * math.pi))
         level = points.strength * seen.cosine * point.amplitude / dr.square(mi.Float(seen.range_m))
         level = level * elevation_gain(self.sonar, seen.tangent)
-        at_sine = (seen.sine - former.first_sine) * (1 / former.sine_step)
-        at_range = mi.Float(seen.range_m - former.first_range) * (1 / former.range_step)
-        line, cell = dr.floor(at_sine), dr.floor(at_range)
-        kept = seen.mine & (number < points.count) & (cell >= 0) & (cell < former.ranges - 1)
-        kept &= (line >= 0) & (line < former.sines - 1)
-        begin = mi.UInt32(dr.select(kept, line, 0)) * former.ranges + mi.UInt32(dr.select(kept, cell, 0))
-        part = at_sine - line, at_range - cell
-        for over_sine in (0, 1):
-            for over_range in (0, 1):
-                share = (part[0] if over_sine else 1 - part[0]) * (part[1] if over_range else 1 - part[1])
-                for total, wave in zip(sums, (cos, sin), strict=True):
-                    value = mi.UInt64(mi.Int64(mi.Float64(level * share * wave) * 2.0**self.bits))
-                    where = begin + over_sine * former.ranges + over_range
-                    dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, kept, mode=ADD)
+        wave = seen.sine, seen.range_m, level, cos, sin
+        kept = add_waves(self.former, self.bits, sums, wave, seen.mine & (number < points.count))
         dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(COUNTED.index("points")), kept, mode=ADD)
+
+
+def add_waves(
+    former: BeamFormer, bits: int, sums: tuple[mi.UInt64, mi.UInt64], wave: tuple[DeviceArray, ...], active: DeviceArray
+) -> DeviceArray:
+    """Add waves to the four cells of the grid around each, in fixed point; return which lie on the grid.
+
+    Args:
+        former: gives the grid.
+        bits: after the point.
+        sums: real and imaginary part ``(sines * ranges,)``.
+        wave: sine of the bearing, range [m], amplitude, cosine and sine of the phase.
+        active: which to add.
+    """
+    sine, range_m, level, cos, sin = wave
+    at_sine = (sine - former.first_sine) * (1 / former.sine_step)
+    at_range = mi.Float(range_m - former.first_range) * (1 / former.range_step)
+    line, cell = dr.floor(at_sine), dr.floor(at_range)
+    kept = active & (cell >= 0) & (cell < former.ranges - 1)
+    kept &= (line >= 0) & (line < former.sines - 1)
+    begin = mi.UInt32(dr.select(kept, line, 0)) * former.ranges + mi.UInt32(dr.select(kept, cell, 0))
+    part = at_sine - line, at_range - cell
+    for over_sine in (0, 1):
+        for over_range in (0, 1):
+            share = (part[0] if over_sine else 1 - part[0]) * (part[1] if over_range else 1 - part[1])
+            for total, turned in zip(sums, (cos, sin), strict=True):
+                value = mi.UInt64(mi.Int64(mi.Float64(level * share * turned) * 2.0**bits))
+                where = begin + over_sine * former.ranges + over_range
+                dr.scatter_reduce(dr.ReduceOp.Add, total, value, where, kept, mode=ADD)
+    return kept
 
 
 @dataclass
@@ -200,6 +226,12 @@ class FanRays:
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
         t = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
+        sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
+        self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1])
+        self._aim(u, t)
+
+    def _aim(self, u: DeviceArray, t: DeviceArray) -> None:
+        """Point the rays at sines of the bearing and tangents of the elevation, and derive how they turn with these."""
         cos_b, cos_e = dr.sqrt(1 - u * u), dr.rsqrt(1 + t * t)
         sin_e, zero = cos_e * t, mi.Float(0)
         if self.cone:
@@ -211,7 +243,7 @@ class FanRays:
             by_sine = (cos_e, -cos_e * u / cos_b, zero)
             by_tangent = (-cos_e * cos_e * sin_e * u, -cos_e * cos_e * sin_e * cos_b, cos_e * cos_e * cos_e)
         self.by_sine, self.by_tangent = self._world(*by_sine), self._world(*by_tangent)
-        self.origin = mi.Point3f(*(mi.Float(line[3]) for line in lines))
+        self.origin = mi.Point3f(*(mi.Float(line[3]) for line in self.lines))
 
     def _world(self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray) -> mi.Vector3f:
         """Turn (starboard, forward, up) into the world's axes."""
@@ -257,17 +289,6 @@ class FanRays:
         """Return the component of vectors along one axis of the sensor."""
         axis = pick(points.axis, mi.Vector3f(*(mi.Float(line[column]) for line in self.lines)))
         return sum(own * part for own, part in zip(axis, way, strict=True))
-
-
-def elevation_gain(sonar: Sonar, tangent: DeviceArray) -> DeviceArray:
-    """Return the amplitude of the elevation's pattern at a tangent of the elevation: a uniform aperture's, or 1."""
-    pattern = sonar.vertical_pattern
-    if pattern == "box":
-        return mi.Float(1)
-    half = math.sin(math.radians(sonar.elevation_fov_deg) / 2)
-    x = tangent * dr.rsqrt(1 + tangent * tangent) * (ELEVATION_HALF[pattern] * math.pi / half)
-    one_way = dr.select(dr.abs(x) > 1e-4, dr.sin(x) / x, 1)
-    return one_way * one_way if pattern == "two_way" else one_way
 
 
 def point_pitch(sonar: Sonar) -> float:

@@ -129,7 +129,8 @@ class HashedPoints:
 
 def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:
     """Return 32 bits of a cell."""
-    one, other = (dr.reinterpret_array(mi.UInt32, value) for value in (i, j))
+    one: DeviceArray = dr.reinterpret_array(mi.UInt32, i)
+    other: DeviceArray = dr.reinterpret_array(mi.UInt32, j)
     return _mixed(one * mi.UInt32(0x9E3779B1) ^ _mixed(other ^ key))
 
 

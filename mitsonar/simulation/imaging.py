@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
+    from mitsonar.simulation.expected_former import ExpectedFormer
+    from mitsonar.simulation.mirror_parts import MirrorPart
+    from mitsonar.simulation.tracing import Tracer
 from mitsonar.simulation.labels import labels_above, labels_of
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
@@ -36,6 +40,8 @@ class Simulator:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
         views: makes the images of a ping from its echoes; default: one, of all of them.
+        mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
+            materials (model ``coherent``); default: none.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -51,11 +57,13 @@ class Simulator:
         sonar: Sonar | None = None,
         *,
         views: Sequence[View] | None = None,
+        mirrors: Mapping[str, MirrorPart] | None = None,
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
         from mitsonar.instruments.views import Whole
         from mitsonar.simulation.coherent_imaging import coherent_imager
+        from mitsonar.simulation.expected_former import expected_former
         from mitsonar.simulation.scene import sonar_in
         from mitsonar.simulation.tracing import Tracer
         from mitsonar.simulation.view_tracers import view_tracers
@@ -68,13 +76,15 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar = sonar
-        self.tracer = Tracer(scene, sonar)
-        self.coherent = coherent_imager(scene, sonar, views)
+        self.coherent = coherent_imager(scene, sonar, views, mirrors)
+        self.former = expected_former(sonar, views)
+        traced = sonar if self.former is None else self.former.traced
+        self.tracer = Tracer(scene, traced)
         self.notes = self.tracer.notes if self.coherent is None else self.coherent.notes
-        self.views: Sequence[View] = [Whole(sonar)] if views is None else views
+        self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        self.pings_per_launch = max(1, rays_per_launch // max(sonar.rays, cells))
+        self.pings_per_launch = max(1, rays_per_launch // max(traced.rays, cells))
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
@@ -130,9 +140,15 @@ class Simulator:
         for view, (image, counters, truth) in zip(self.views, made, strict=True):
             pings = RenderedPings(first, *binning.fetch(image, counters, len(poses), view), height_m)
             if labels:
-                pings.labels = labels_of(pings, truth, self.sonar.rays)
-            looks.append(pings)
+                pings.labels = labels_of(pings, truth, self.tracer.sonar.rays)
+            looks.append(pings if self.former is None else self._formed(pings, self.former))
         return looks
+
+    def _formed(self, pings: RenderedPings, former: ExpectedFormer) -> RenderedPings:
+        """Return pings of traced boxes as the beams and the pulse spread them; labels are those of the boxes."""
+        labels = {name: former.crop(values) for name, values in pings.labels.items()}
+        expected = former.crop(pings.levels) if labels else None
+        return RenderedPings(pings.first, former.levels(pings.levels), pings.counts, pings.height_m, labels, expected)
 
     def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
         """Compile the fused launch.
@@ -142,18 +158,23 @@ class Simulator:
         import drjit as dr
 
         from mitsonar.simulation.binning import accumulate, develop, strongest
+        from mitsonar.simulation.elevation_pattern import elevation_gain
         from mitsonar.simulation.tracing import Rays
 
-        tracer, sonar = self.tracer, self.sonar
+        tracer, sonar, own = self.tracer, self.tracer.sonar, self.sonar
 
         @dr.freeze
         def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any) -> Any:
             rays = Rays(sonar, index)
             ray, fan = tracer.rays_of(rays, rows, keys)
             echoes = tracer.echoes(scene, ray, fan, surfaces)
+            if self.former is not None:
+                echoes = replace(
+                    echoes, reflectivity=echoes.reflectivity * dr.square(elevation_gain(own, dr.tan(fan.elevation)))
+                )
             looks = [
-                tracer.view_echoes(scene, rays, fan, echoes, own)
-                for tracer, own in zip(self.view_tracers, tables, strict=True)
+                tracer.view_echoes(scene, rays, fan, echoes, table)
+                for tracer, table in zip(self.view_tracers, tables, strict=True)
             ]
             sums = [
                 accumulate(seen, rays.ping, pings, tracer) for seen, tracer in zip(looks, self.view_tracers, strict=True)
@@ -180,7 +201,14 @@ class Simulator:
 
     def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
         """One ping's echoes as NumPy arrays, in the order of the film."""
-        return self.tracer.film_echoes(pose, ping)
+        return self._own_tracer.film_echoes(pose, ping)
+
+    @cached_property
+    def _own_tracer(self) -> Tracer:
+        """Return the tracer of the sonar's own rays: those of the launch may reach beyond the field of view."""
+        from mitsonar.simulation.tracing import Tracer
+
+        return self.tracer if self.former is None else Tracer(self.tracer.scene, self.sonar)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""

@@ -38,7 +38,7 @@ SOUNDING = RunKind(
 )
 
 OVERSPREAD = 0.3
-"""Delay spread times Doppler spread above which a channel is reported as overspread."""
+"""Delay spread times Doppler spread of a receiver above which a channel is reported as overspread."""
 
 MOST_ENERGY = (0.01, 0.99)
 """Quantiles of the echoes' energy between which the spread of delays and Doppler shifts is measured."""
@@ -46,7 +46,7 @@ MOST_ENERGY = (0.01, 0.99)
 
 @dataclass(frozen=True)
 class Spread:
-    """Delay spread [s] and Doppler spread [Hz] of echoes: 98 % of their energy lies within each."""
+    """Delay spread [s] and Doppler spread [Hz] of a receiver's echoes: 98 % of their energy lies within each."""
 
     delay_s: float
     doppler_hz: float
@@ -198,10 +198,18 @@ FAR_ARM_M = 10.0
 
 
 def spread_of(paths: list[Paths]) -> Spread:
-    """Measure the spread of the echoes of all receivers, of 98 % of their energy."""
-    energy = np.concatenate([path.amplitude**2 for path in paths])
+    """Measure the spread of the echoes of 98 % of each receiver's energy, and return the spread of the largest factor.
+
+    Each receiver has a channel of its own: shifts of receivers that look different ways do not blur one response.
+    """
+    return max((_own_spread(path) for path in paths), key=lambda spread: spread.factor)
+
+
+def _own_spread(path: Paths) -> Spread:
+    """Measure the spread of one receiver's echoes."""
+    energy = np.abs(path.amplitude) ** 2
     widths = []
-    for values in (np.concatenate([path.delay_s for path in paths]), np.concatenate([path.doppler_hz for path in paths])):
+    for values in (path.delay_s, path.doppler_hz):
         order = np.argsort(values)
         share = np.cumsum(energy[order])
         if not share.size or share[-1] == 0:

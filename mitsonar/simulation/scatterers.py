@@ -3,6 +3,9 @@
 A surface whose reflectivity comes in cells (``cell_noise`` over uv, or a picture) has one point in each cell. Its position
 is a hash of the cell. Any other surface gets random points, ``points_per_m2`` of them, from the seed. The points do not
 depend on the sonar's pose, the time or the number of rays.
+
+Each point scatters with a complex Gaussian number zeta of its own, E|zeta|^2 = 1: a hash of its cell, or of its number.
+Echoes of many points then add in power, as those of rough ground do. Their energy does not depend on the density of points.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +32,7 @@ from mitsonar.simulation.device_arrays import DeviceArray
 __all__ = ["Scatterers"]
 
 MOST = 2**26
-"""Largest number of points of a scene, 28 bytes each."""
+"""Largest number of points of a scene, 32 bytes each: place, normal, strength and phase."""
 
 A_BUCKET = 256
 """Points in a bucket, about: few enough to fit a field of view closely, enough to keep the buckets few."""
@@ -78,7 +81,8 @@ class Scatterers:
     Attributes:
         place: positions ``(points, 3)`` float32 [m]; exact as they are.
         normal: unit normal of the surface ``(points, 3)`` float32.
-        strength: reflectivity times the area that a point represents ``(points,)`` float32 [m2].
+        strength: reflectivity times the area that a point represents, times |zeta|^2 ``(points,)`` float32 [m2].
+        phase: of zeta ``(points,)`` float32, -pi..pi [rad].
         first: index of the first point of each bucket, and the number of points ``(buckets + 1,)``.
         one_sided: whether a bucket's points lie on closed bodies, visible from outside only ``(buckets,)``.
     """
@@ -86,6 +90,7 @@ class Scatterers:
     place: NDArray[np.float32]
     normal: NDArray[np.float32]
     strength: NDArray[np.float32]
+    phase: NDArray[np.float32]
     first: NDArray[np.int64]
     one_sided: NDArray[np.bool_]
 
@@ -101,16 +106,16 @@ class Scatterers:
             if shape.bsdf() is not None:
                 grid = _grid_of(shape)
                 parts.append(_in_cells(shape, grid, number) if grid else _at_random(shape, sonar, number))
-                closed.append(np.full(len(parts[-1][2]), isinstance(shape, mi.Mesh) and _is_closed(shape)))
+                closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
         if not sum(map(len, closed)):
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
                 "bitmap as reflectance, or raise points_per_m2"
             )
-        place, normal, strength = (np.concatenate(values) for values in zip(*parts, strict=True))
+        place, normal, strength, phase = (np.concatenate(values) for values in zip(*parts, strict=True))
         one_sided = np.concatenate(closed)
         order, first = _buckets(place, np.where(one_sided, _side(normal), 0))
-        return cls(place[order], normal[order], strength[order], first, one_sided[order[first[:-1]]])
+        return cls(place[order], normal[order], strength[order], phase[order], first, one_sided[order[first[:-1]]])
 
     def __len__(self) -> int:
         return len(self.strength)
@@ -194,12 +199,26 @@ def _grid_of(shape: mi.Shape) -> _Grid | None:
     return None
 
 
-Points: TypeAlias = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""Positions, normals and strengths."""
+class _Points(NamedTuple):
+    """The points of a shape; fields as of :class:`Scatterers`."""
+
+    place: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    strength: NDArray[np.float32]
+    phase: NDArray[np.float32]
 
 
-def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> Points:
-    """Place one point in each cell, at a hash of the cell and the texture's seed (for a picture: the shape's number)."""
+class _Zeta(NamedTuple):
+    """Complex Gaussian numbers of points on the device: |zeta|^2, and the phase [rad]."""
+
+    power: DeviceArray
+    phase: DeviceArray
+
+
+def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> _Points:
+    """Place one point in each cell. Place and zeta are hashes of the cell and the texture's seed (of a picture: the shape's
+    number).
+    """
     texture, columns, rows = grid
     turn = np.eye(3)
     if texture is not None:
@@ -211,24 +230,28 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> Points:
     _check_count(shape, float(wide) * float(tall))
     cell = dr.arange(mi.UInt32, int(wide * tall))
     column, row = mi.Int32(cell % int(wide)) + int(low[0]), mi.Int32(cell // int(wide)) + int(low[1])
-    key = mi.UInt32(_key(texture.seed if texture is not None else number, texture is not None))
+    seed = (texture.seed, 1) if texture is not None else (number, 0)
     bits: list[DeviceArray] = [dr.reinterpret_array(mi.UInt32, value) for value in (column, row)]
-    first, second = mi.sample_tea_32(bits[0], bits[1] ^ key, ROUNDS)
+    first, second = mi.sample_tea_32(bits[0], bits[1] ^ _key(*seed, PLACE), ROUNDS)
     u, v = (mi.Float(column) + _fraction(first)) / columns, (mi.Float(row) + _fraction(second)) / rows
     uv = mi.Point2f(*(float(a) * u + float(b) * v + float(c) for a, b, c in back[:2]))
     inside = (uv.x >= 0) & (uv.x < 1) & (uv.y >= 0) & (uv.y < 1)
     si = shape.eval_parameterization(uv, mi.RayFlags.All, inside)
     area = dr.norm(dr.cross(si.dp_du, si.dp_dv)) * abs(float(np.linalg.det(back[:2, :2]))) / (columns * rows)
-    return _kept(shape, si, area, inside & si.is_valid())
+    return _kept(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
 
 
-def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> Points:
-    """Place random points on a surface; on a mesh each represents the same area, elsewhere its own part of the area."""
+def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> _Points:
+    """Place random points on a surface; on a mesh each represents the same area, elsewhere its own part of the area.
+
+    Their zeta is a hash of the sonar's seed, the shape's number and the point's.
+    """
     area = float(shape.surface_area()[0])
     _check_count(shape, area * sonar.points_per_m2)
     count = round(area * sonar.points_per_m2)
     if count == 0:
-        return np.empty((0, 3), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+        return _Points(*np.empty((2, 0, 3), np.float32), *np.empty((2, 0), np.float32))
+    zeta = _zeta_of(dr.arange(mi.UInt32, count), _key(sonar.seed, number, ZETA_OF_RANDOM))
     rng = np.random.default_rng([sonar.seed, number, 81])
     u, v = (mi.Float(draw.astype(np.float32)) for draw in rng.random((2, count)))
     if isinstance(shape, mi.Mesh):
@@ -236,9 +259,9 @@ def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> Points:
         facet = np.searchsorted(share, np.sort(rng.random(count)) * share[-1], side="right")
         facet, root = np.minimum(facet, len(share) - 1).astype(np.uint32), dr.sqrt(u)
         si = facet_points(shape, mi.UInt32(facet), mi.Point2f(root * v, 1 - root))
-        return _kept(shape, si, mi.Float(area / count), mi.Bool(True))
+        return _kept(shape, si, mi.Float(area / count), zeta, mi.Bool(True))
     si = shape.eval_parameterization(mi.Point2f(u, v), mi.RayFlags.All)
-    return _kept(shape, si, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / count, si.is_valid())
+    return _kept(shape, si, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / count, zeta, si.is_valid())
 
 
 def _facet_areas(mesh: mi.Mesh) -> NDArray[np.float64]:
@@ -248,14 +271,14 @@ def _facet_areas(mesh: mi.Mesh) -> NDArray[np.float64]:
     return np.asarray(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0), axis=0) / 2)
 
 
-def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, valid: DeviceArray) -> Points:
-    """Return position, normal and strength of the points whose strength is above 0."""
-    strength = dr.select(valid, reflectivity_at(shape.bsdf(), si) * area, 0)
-    dr.eval(si.p, si.n, strength)
-    found = np.broadcast_to(np.array(strength), np.array(si.p).shape[1:])
+def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, zeta: _Zeta, valid: DeviceArray) -> _Points:
+    """Return the points whose strength is above 0."""
+    strength = dr.select(valid, reflectivity_at(shape.bsdf(), si) * area * zeta.power, 0)
+    dr.eval(si.p, si.n, strength, zeta.phase)
+    found = np.array(strength)
     keep = np.flatnonzero((found > 0) & np.isfinite(found))
     place, normal = (np.broadcast_to(np.array(values).T, (len(found), 3))[keep] for values in (si.p, si.n))
-    return np.ascontiguousarray(place, np.float32), np.ascontiguousarray(normal, np.float32), found[keep].astype(np.float32)
+    return _Points(np.ascontiguousarray(place), np.ascontiguousarray(normal), found[keep], np.array(zeta.phase)[keep])
 
 
 def _check_count(shape: mi.Shape, count: float) -> None:
@@ -266,9 +289,20 @@ def _check_count(shape: mi.Shape, count: float) -> None:
         )
 
 
-def _key(number: int, texture: bool) -> int:
-    """Return 32 bits to draw positions within cells; they differ from those that draw the reflectivity."""
-    return int(np.random.SeedSequence([abs(number), int(texture), 82]).generate_state(1)[0])
+PLACE, ZETA, ZETA_OF_RANDOM = 82, 83, 84
+"""Last numbers of the keys that draw places within cells, zeta of cells and zeta of random points."""
+
+
+def _key(seed: int, kind: int, drawn: int) -> DeviceArray:
+    """Return 32 bits that choose a hash; they differ from those that draw the reflectivity."""
+    return mi.UInt32(int(np.random.SeedSequence([abs(seed), kind, drawn]).generate_state(1)[0]))
+
+
+def _zeta_of(first: DeviceArray, second: DeviceArray) -> _Zeta:
+    """Hash 64 bits to complex Gaussian numbers of variance 1 (Box and Muller)."""
+    bits: tuple[DeviceArray, DeviceArray] = mi.sample_tea_32(first, second, ROUNDS)
+    # 23 bits: with one half added they fit a float32, so that the logarithm of 1 is never taken
+    return _Zeta(-dr.log((mi.Float(bits[0] >> 9) + 0.5) * 2.0**-23), (_fraction(bits[1]) - 0.5) * (2 * math.pi))
 
 
 def _fraction(bits: mi.UInt32) -> mi.Float:

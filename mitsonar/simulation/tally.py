@@ -85,7 +85,7 @@ class Tally:
             )
         if self.saturated > 0.01 * self.pixels:
             found["saturated"] = (
-                f"{100 * self.saturated / self.pixels:.2g} % of pixels are at the maximum (more than 1 %): the gain, "
+                f"{_percent(self.saturated / self.pixels)} % of pixels are at the maximum (more than 1 %): the gain, "
                 f"{self.gain_from}, is too high for the rest"
             )
         if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:

@@ -21,7 +21,11 @@ AMPHORA = Path(__file__).parents[1] / "scenes" / "meshes" / "amphora.ply"
 SLIPS = [
     ("render flat_floor --noise hgih", "got 'hgih'; did you mean high?"),
     ("render flat_flor", "did you mean flat_floor?"),
-    ("render flat_floor --model physicl", "--model: input should be 'physical' or 'thesis'", "did you mean physical?"),
+    (
+        "render flat_floor --model physicl",
+        "--model: input should be 'coherent', 'physical' or 'thesis'",
+        "did you mean physical?",
+    ),
     ("render flat_floor --sonar didson30", "did you mean didson300?"),
     ("render flat_floor --trajectory shiped", "did you mean shipped?"),
     ("render flat_floor --frame end", "unknown frame 'end' of poses: did you mean ned?"),

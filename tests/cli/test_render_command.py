@@ -295,8 +295,9 @@ def test_shipped_scenes_render_and_have_a_trajectory_to_fly(name: str) -> None:
     scene = load_scene(name)
     found = sonar_in(scene)
     assert found is not None
-    frames = Simulator(scene).render([found[1], path.poses[len(path) // 2]])
-    lit = (frames.image > 0).mean(axis=(1, 2))
+    frames = Simulator(scene).render([found[1], path.poses[len(path) // 2]], labels=True)
+    assert frames.shape_id is not None
+    lit = (frames.shape_id >= 0).mean(axis=(1, 2))  # noise and side lobes fill every pixel of a coherent image
     assert (lit > 0.05).all(), lit
     assert (lit < 0.98).all(), lit
 

@@ -17,7 +17,7 @@ from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 PLAIN = Sonar.create(model="coherent", frequency_hz=1.8e6, range_min=1.4, range_max=5.6, bearing="cone", gain_exponent=2,
-                     beam_width_deg=0.3)  # fmt: skip
+                     beam_width_deg=0.3, absorption_db_per_m=0.0)  # fmt: skip
 
 FITTED = {"noise_level_db": None, "stripes_db": 0.0, "crosstalk_db": None, "speckle_nu": None}
 
@@ -46,7 +46,7 @@ TRUE: dict[str, dict[str, Any]] = {
     "dB": {"noise_level_db": -98.0, "stripes_db": 0.5, "crosstalk_db": -45.0, "speckle_nu": 2.0},
     "70 dB": {"noise_level_db": -102.0, "stripes_db": 1.0, "crosstalk_db": -50.0, "speckle_nu": 1.0, "coding_db": 70.0},
     "gamma": {"noise_level_db": -95.0, "stripes_db": 0.3, "coding": "gamma", "coding_gamma": 0.5},
-    "linear": {"noise_level_db": -98.0, "coding": "linear"},
+    "linear": {"noise_level_db": -98.0, "coding": "linear", "absorption_db_per_m": 0.5, "gain_absorption": True},
 }
 
 

@@ -49,7 +49,7 @@ def test_beams_leave_no_direction_unseen(name: str) -> None:
 @pytest.mark.parametrize("name", ["aris3000", "didson300", "oculus-m1200d-2100khz"])
 def test_beams_receive_width_over_spacing_times_what_arrives(variant: str, name: str) -> None:
     """Sixteen beams of a preset over a floor: their sum against the integral over the fan, each direction counted once."""
-    whole = preset(name)
+    whole = preset(name).replace(model="physical")
     few = {"beams": 16, "azimuth_fov_deg": 16 * np.degrees(whole.beam_spacing_rad), "beam_layout": "even"}
     sonar = whole.replace(**few, rays_per_beam=200, rays_across=8)
     height, pitch = 0.3 * whole.range_max, np.radians(25)
@@ -108,6 +108,13 @@ def test_bad_yaml_files(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(MitsonarError, match=message) as caught:
         load_sonar(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_long_name_is_cut(tmp_path: Path) -> None:
+    (tmp_path / "long.yaml").write_text(f"preset: '{'9' * 5000}'\n")
+    with pytest.raises(MitsonarError, match=r"unknown sonar preset '9+\.\.\.9+': known: ") as caught:
+        load_sonar(tmp_path / "long.yaml")
+    assert len(str(caught.value)) < 500
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:

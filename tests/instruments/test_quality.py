@@ -60,7 +60,7 @@ def plain_error(loaded: Any, sonar: Sonar) -> float:
 @pytest.mark.parametrize("name", ["didson300", "oculus-m1200d-2100khz"])
 def test_a_plain_floor_errs_by_what_is_printed(variant: str, name: str, quality: str) -> None:
     """The table was measured against many rays; this is against the integral. Not above it, and not far below."""
-    whole = preset(name).replace(quality=quality)
+    whole = preset(name).replace(model="physical", quality=quality)
     few = whole.replace(beams=BEAMS, beam_width_deg=np.degrees(whole.beam_width_rad))
     assert numbers(few) == numbers(whole)
     stated = measured_errors()[1][name][quality].plain_percent / 100
@@ -76,7 +76,9 @@ def test_the_table_is_of_these_presets_and_these_rays() -> None:
     for name, rows in measured.items():
         assert list(rows) == list(QUALITIES)
         for quality, row in rows.items():
-            assert (row.rays_per_beam, row.rays_across) == numbers(preset(name).replace(quality=quality)), (name, quality)
+            assert (row.rays_per_beam, row.rays_across) == numbers(
+                preset(name).replace(model="physical", quality=quality)
+            ), (name, quality)
 
 
 def test_each_quality_is_as_good_as_its_word() -> None:
@@ -94,7 +96,7 @@ def test_each_quality_is_as_good_as_its_word() -> None:
 @pytest.mark.parametrize("quality", ["standard", "fine"])
 def test_pings_of_a_resting_sonar_differ_as_much_as_is_printed(variant: str, quality: str) -> None:
     """Over 15 mm cells the rays' jitter makes pings differ; without jitter they are the same."""
-    whole = preset("didson300").replace(quality=quality)
+    whole = preset("didson300").replace(model="physical", quality=quality)
     sonar = whole.replace(beams=BEAMS, beam_width_deg=np.degrees(whole.beam_width_rad))
     cells = {"type": "cell_noise", "coordinates": "position", "cell_size": 0.015}
     rough, height = scene(floor=floor(diffuse(cells), 500.0)), sonar.range_max * np.sin(FAR_GRAZING_RAD)
@@ -111,7 +113,7 @@ def test_pings_of_a_resting_sonar_differ_as_much_as_is_printed(variant: str, qua
 def test_errors_fall_as_the_law_says(variant: str) -> None:
     """Plain: faster than 1 / rays over elevation. Textured: as 1 / sqrt(rays across) while each reads a cell of its own."""
     plain = scene(floor=floor(diffuse(0.5), 500.0))
-    wide = preset("oculus-m1200d-1200khz").replace(beams=1, azimuth_fov_deg=2, rays_across=1)
+    wide = preset("oculus-m1200d-1200khz").replace(model="physical", beams=1, azimuth_fov_deg=2, rays_across=1)
     counts = [50, 100, 200, 400]
     assert slope(counts, [plain_error(plain, wide.replace(rays_per_beam=count)) for count in counts]) < -1.0
 
@@ -200,6 +202,8 @@ def test_an_unknown_quality_names_the_nearest(wrong: str, near: str) -> None:
         Sonar.create(quality=wrong)
     with pytest.raises(MitsonarError, match="unknown quality 3"):
         sonar_from({"preset": "didson300", "quality": 3})
+    with pytest.raises(MitsonarError, match=r"unknown quality \['fine'\]"):
+        sonar_from({"preset": "didson300", "quality": ["fine"]})
 
 
 def test_an_unknown_quality_in_xml_names_the_nearest(variant: str) -> None:
@@ -217,7 +221,7 @@ def test_an_unknown_quality_in_xml_names_the_nearest(variant: str) -> None:
 def test_the_thesis_model_keeps_its_own_numbers(quality: str) -> None:
     for name in named_sonars():
         rays = 1000 if name == "lookdown100" else 700
-        thesis = preset(name).replace(quality=quality).replace(model="thesis")
+        thesis = preset(name).replace(model="physical", quality=quality).replace(model="thesis")
         assert (thesis.rays_per_beam, thesis.across, thesis.columns) == (rays, 1, thesis.beams)
     assert Sonar(model="thesis", rays_per_beam=350).replace(quality=quality).rays_per_beam == 350
     assert Sonar(quality=quality).replace(model="thesis").replace(model="physical") == Sonar(quality=quality)

@@ -39,9 +39,9 @@ from hostile_readers import (
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
-from mutations import changed_bytes, limits, npz, outcome, with_part
+from mutations import changed_arrays, changed_bytes, limits, npz, outcome, with_part
 
-from mitsonar.errors import MitsonarError, shortened
+from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -92,6 +92,12 @@ def test_the_harness_sees_what_it_looks_for() -> None:
     with pytest.raises(MemoryError):
         outcome(lambda: np.ones(2**32))
     assert outcome(lambda: None) == "read"
+
+
+def test_a_text_that_was_spoilt_is_spoilt_again() -> None:
+    """The second change of a text of JSON finds no JSON there."""
+    made = [changed_arrays(np.random.default_rng(seed), {"sonar": np.array('{"beams": 4,')}) for seed in range(30)]
+    assert any(str(one.get("sonar", "")).startswith('{"be') for one in made)
 
 
 # ---------------------------------------------------------------- hypothesis
@@ -578,6 +584,35 @@ def test_frames_done_of_a_run_that_cannot_be(done: Any, tmp_path: Path) -> None:
     make_frames_zarr(tmp_path)
     set_attributes(tmp_path / "frames.zarr", frames_done=done)
     assert "frames_done" in refusal(lambda: SonarFrames.load(tmp_path / "frames.zarr"))
+
+
+def test_a_run_without_frames_has_none_to_read(tmp_path: Path) -> None:
+    """The index of a frame that is not there was a traceback."""
+    from mitsonar.mapping.frame_source import load_frames, open_frames
+
+    make_frames_zarr(tmp_path)
+    path = tmp_path / "frames.zarr"
+    assert f"{path} has no frame 3: it holds 3, numbered from 0" in refusal(lambda: open_frames(path).read([0, 3]))
+    assert "has no frame -1" in refusal(lambda: open_frames(path).read([-1]))
+    set_attributes(path, frames_done=0)
+    with pytest.warns(MitsonarWarning, match="0 of 3 frames are there"):
+        source = open_frames(path)
+    assert f"{path} has no frame 0: it holds 0" in refusal(lambda: source.read([0]))
+    with pytest.warns(MitsonarWarning, match="0 of 3 frames are there"):
+        assert load_frames(path).image.shape == (0, 6, 4)
+
+
+def test_a_shard_without_a_seal_is_sealed_by_its_writer_only(spoilt: Path) -> None:
+    """Who only reads was asked to write the seal, a traceback."""
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.datasets.store_arrays import SEAL
+
+    store = DataStore.open(spoilt, write=True)
+    store.array(SEAL)[0] = 0
+    assert DataStore.open(spoilt).missing() == [0]
+    assert not DataStore.open(spoilt).seals()[0].any()
+    assert store.missing() == []
+    assert DataStore.open(spoilt).missing() == []
 
 
 # ---------------------------------------------------------------- YAML and JSON

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import os
 import pickle
+import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -167,6 +168,8 @@ def test_files_that_are_no_checkpoints(checkpoint: Checkpoint, tmp_path: Path) -
     assert "something else" in refusal(packed([1, 2]))
     assert "that.ckpt is damaged" in refusal(packed(torch.nn.Linear(1, 1)))
     assert "--resume" in refusal(packed({"pytorch-lightning_version": "2.6", "state_dict": {}}))
+    locator = b"PK\x06\x07" + struct.pack("<LQL", 0, 0, 2)  # the end's place, on the first of two disks
+    assert "that.ckpt" in refusal(whole[:-22] + locator + whole[-22:])
     foreign = io.BytesIO()
     with zipfile.ZipFile(foreign, "w") as parts:
         parts.writestr("data.pkl", b"\x80\x02K\x01.")

@@ -45,7 +45,8 @@ def test_one_plate_is_one_pulse_of_known_delay_magnitude_and_phase() -> None:
     r_a, r_b = np.linalg.norm(place - sent), np.linalg.norm(place - back)
     normal = np.array([-1, -7, 8]) / np.linalg.norm([-1, -7, 8])
     cosines = abs(normal @ (place - sent)) / r_a * abs(normal @ (place - back)) / r_b
-    amplitude = np.sqrt(0.5 * 1e-4 * cosines) / (r_a * r_b)
+    (strength,), (phase,) = scatterers_of(made).strength, scatterers_of(made).phase  # the point's own, drawn once
+    amplitude = np.sqrt(strength * cosines) * np.exp(1j * phase) / (r_a * r_b)
     delay = (r_a + r_b) / C
     wanted = amplitude * sonar.pulse(sonar.delay_s - delay) * np.exp(-2j * np.pi * sonar.carrier_hz * delay)
     found = one_response(made)[0]
@@ -147,7 +148,8 @@ def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
         weight = field.sensitivity(*(field.axes @ (back / r_b[:, None]).T))
         amplitude = weight * np.sqrt(echo.strength * np.maximum(cosines, 0)) / (r_a * r_b)
         loud = np.flatnonzero(amplitude)
-        responses.append(impulse_response((r_a + r_b)[loud] / C, amplitude[loud], sonar))
+        zeta = np.exp(1j * echo.phase[loud])  # its size is in the strength
+        responses.append(impulse_response((r_a + r_b)[loud] / C, amplitude[loud] * zeta, sonar))
     here, *there = responses
     direct = np.array([np.vdot(here, one) / np.linalg.norm(here) / np.linalg.norm(one) for one in there])
     assert np.abs(np.angle(found) / np.angle(direct) - 1)[1:].max() < 0.02
@@ -177,6 +179,25 @@ def test_doppler_of_every_echo() -> None:
     steep = np.abs(cosine) > 0.1
     assert np.abs(doppler / (2 * 2 * cosine / sonar.wavelength_m) - 1)[steep].max() < 1e-5
     assert np.abs(rate / doppler - 1)[steep].max() < 1e-4
+
+
+@pytest.mark.parametrize("velocity", [(0, 0, 0, 0.4), (0.5, 1.0, -0.2, 0.4), (0, 0, 0, -2.0)])
+def test_doppler_in_a_turn_is_the_slope_of_the_delay(velocity: tuple[float, ...]) -> None:
+    """-f d tau / dt of exact delays 2 ms apart, a receiver 0.5 m to starboard of the axis of the turn. What is left out is
+    of second order: twice (v / c)^2 of the carrier, and the turning of the receiver's velocity while sound travels."""
+    sonar = ChannelSonar(receivers=(received_from((0.5, 0, 0)),), points_per_m2=20.0)
+    made = simulator(sonar, floor=floor(diffuse(0.5), 5.0))
+    apart, turn = 1e-3, velocity[3]
+    start, ahead = Pose(0.3, -0.2, 10, heading=0.7), np.array([np.sin(0.7), np.cos(0.7)])
+    over_ground = [velocity[0] * ahead[1] + velocity[1] * ahead[0], velocity[1] * ahead[1] - velocity[0] * ahead[0]]
+    rate = np.array([*over_ground, velocity[2], 0, 0, turn])
+    before, after = (made.paths(Pose(*(start + sign * apart * rate)), velocity).delay_s for sign in (-1, 1))
+    slope = -sonar.carrier_hz * (after - before) / (2 * apart)
+    here = made.paths(start, velocity)
+    fastest = np.linalg.norm(velocity[:3]) + abs(turn) * 0.5
+    second_order = 3 * (fastest / C) ** 2 + abs(turn) * fastest * here.delay_s.max() / C
+    assert np.ptp(slope) > 2
+    assert np.abs(here.doppler_hz - slope).max() < sonar.carrier_hz * second_order
 
 
 @pytest.mark.parametrize("tilt", [45.0, 60.0])

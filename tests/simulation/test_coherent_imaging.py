@@ -46,7 +46,7 @@ def flat(variant: str) -> mi.Scene:
 def imager(loaded: mi.Scene, sonar: Sonar = SONAR) -> CoherentImager:
     from mitsonar.simulation.coherent_imaging import CoherentImager
 
-    return CoherentImager(loaded, sonar, sonar.absorption_db_per_m or 0.0)
+    return CoherentImager(loaded, sonar)
 
 
 def images(source: CoherentImager, count: int, apart: float = 0.7) -> Array:
@@ -72,7 +72,7 @@ def expected(sonar: Sonar, reflectivity: float = 0.5) -> Array:
 def test_energy_is_that_of_the_physical_model(flat: mi.Scene) -> None:
     """16 places: 0.1 dB."""
     made = np.abs(images(imager(flat), 16)) ** 2
-    box = SONAR.replace(model="physical", coding="linear", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
+    box = SONAR.replace(model="physical", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
     truth = next(iter(Simulator(flat, box).pings(POSE))).levels[0]
     assert 10 * np.log10(made.sum(axis=(1, 2)).mean() / truth.sum()) == pytest.approx(0, abs=0.1)
     middle = made[:, :, 20:28].mean(axis=(0, 2)).reshape(-1, 16).mean(axis=1)
@@ -199,7 +199,7 @@ def test_speckle_follows_a_motion_as_theory_says(flat: mi.Scene, name: str) -> N
     """Fields before and after, weighted by the predicted phase of each pixel: the coherence within 0.03 of the integral."""
     source, motion = imager(flat), np.array(MOTIONS[name])
     bins, beams = np.arange(24, 168, 8), np.arange(4, 44, 3)
-    truth = np.array([[coherence(SONAR, POSE, POSE + motion, beam, bin_) for beam in beams] for bin_ in bins])
+    truth = np.array([[coherence(SONAR, POSE, POSE + motion, int(beam), int(bin_)) for beam in beams] for bin_ in bins])
     top = bottom = 0.0
     power = [0.0, 0.0]
     for shift in np.arange(14)[:, None] * np.array([0.7, 0.2, 0, 0, 0, 0]):
@@ -214,7 +214,8 @@ def test_speckle_follows_a_motion_as_theory_says(flat: mi.Scene, name: str) -> N
 def test_a_still_sonar_sees_the_same_speckle(flat: mi.Scene) -> None:
     """Bit for bit, in any order of pings, and in another simulator."""
     simulator = Simulator(flat, SONAR)
-    one = simulator.render([POSE, POSE + [0.1, 0, 0, 0, 0, 0], POSE], gain=1e6).image
+    moved = POSE + np.array([0.1, 0, 0, 0, 0, 0])
+    one = simulator.render(np.stack([POSE, moved, POSE]), gain=1e6).image
     np.testing.assert_array_equal(one[0], one[2])
     assert not np.array_equal(one[0], one[1])
     np.testing.assert_array_equal(Simulator(flat, SONAR).render([POSE], gain=1e6).image[0], one[0])
@@ -379,7 +380,8 @@ def test_frames_carry_decibels(flat: mi.Scene) -> None:
 def test_labels_come_with_speckle(flat: mi.Scene) -> None:
     sonar = SONAR.replace(noise_level_db=-150.0)
     frames = Simulator(flat, sonar).render([POSE], labels=True)
-    assert frames.shape_id is not None and frames.shadow is not None
+    assert frames.shape_id is not None
+    assert frames.shadow is not None
     assert (frames.shape_id[0, 10:-10] == 0).all()
     assert not frames.shadow[0, 10:-10].any()
 

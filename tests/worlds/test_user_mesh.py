@@ -156,7 +156,9 @@ def test_real_models_render(path: Path, tmp_path: Path) -> None:
     scene = load_scene(mesh_world(path).write(tmp_path / "world"))
     found = sonar_in(scene)
     assert found is not None
-    frames = Simulator(scene, found[0].replace(rays_per_beam=200)).render([found[1]], labels=True, gain=1.0)
+    frames = Simulator(scene, found[0].replace(model="physical", rays_per_beam=200)).render(
+        [found[1]], labels=True, gain=1.0
+    )
     assert frames.object_id is not None
     assert (frames.object_id >= 1).mean() > 0.005
 

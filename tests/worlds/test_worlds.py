@@ -271,7 +271,9 @@ def test_worlds_render_and_tell_their_objects(name: str, tmp_path: Path) -> None
     scene = load_scene(world.write(tmp_path / "world"))
     found = sonar_in(scene)
     assert found is not None
-    frames = Simulator(scene, found[0].replace(rays_per_beam=200)).render([found[1]], labels=True, gain=1.0)
+    frames = Simulator(scene, found[0].replace(model="physical", rays_per_beam=200)).render(
+        [found[1]], labels=True, gain=1.0
+    )
     assert np.isfinite(frames.image).all()
     assert 0.02 < (frames.image > 0).mean() < 0.98
     assert frames.object_id is not None

@@ -108,6 +108,8 @@ class ImageNetwork(Trained):
             return rejected("the network's answer is not finite")
         if targets.shape[1] != 3:
             raise MitsonarError(f"a motion has three numbers: this {self._checkpoint.network} says {targets.shape[1]}")
+        if covariances is not None and not _is_covariance(covariances[0]):
+            return rejected("the network's covariance is not positive: images unlike those of its training")
         motion = Motion(*targets[0].tolist())
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
         reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion)
@@ -180,3 +182,11 @@ def smooth(image: NDArray[np.float32], step: int = 1) -> NDArray[np.float32]:
 def without_slow(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """Remove what varies slowly: it belongs to the illumination, not to the ground."""
     return np.asarray(image - cv2.blur(image, (16, 16)), dtype=np.float32)
+
+
+def _is_covariance(matrix: NDArray[np.float64]) -> bool:
+    """Return whether a matrix ``(3, 3)`` is finite, symmetric and not negative, as a series of motions asks."""
+    if not np.isfinite(matrix).all() or np.abs(matrix - matrix.T).max() > 1e-9 * np.abs(matrix).max():
+        return False
+    least, _, largest = np.linalg.eigvalsh(matrix)
+    return bool(least >= -1e-9 * largest)

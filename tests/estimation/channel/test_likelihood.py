@@ -7,6 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from helpers import diffuse, floor, scene
+from numpy.typing import NDArray
 from points import PointGround, run
 
 from mitsonar.errors import MitsonarError
@@ -18,9 +20,11 @@ from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb, impulse_information
 from mitsonar.estimation.named_estimators import create_estimator, estimator_from
 from mitsonar.instruments.channel_sonar import ChannelSonar, four_receivers
-from mitsonar.motion.composition import Motion
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.simulation.channel import impulse_response
+from mitsonar.simulation.channel import ChannelSimulator, impulse_response
 
 HEIGHT = 4.0
 SONAR = ChannelSonar.create(range_max=10.0, frequency_step_hz=20.0, receivers=four_receivers(across_deg=6.0))
@@ -44,6 +48,19 @@ def pair(motion: Motion, pings: int = 2, seed: int = 0, noise: float = 0.0) -> I
     return run(SONAR, ground, motion, pings=pings, height_m=HEIGHT, noise=noise, seed=seed)
 
 
+def simulator_over(half_m: float, seed: int) -> ChannelSimulator:
+    """The simulator over cells of 24 mm, reflectivity 0..1: its points are the law's unknown scatterers."""
+    texture = {"type": "cell_noise", "cells": round(2 * half_m / 0.0244), "seed": seed}
+    return ChannelSimulator(scene(floor=floor(diffuse(texture), half_m)), SONAR)
+
+
+def simulated(motion: Motion, seed: int) -> ImpulseResponses:
+    """Two pings of the simulator."""
+    start = Pose(0.0, 0.0, HEIGHT)
+    flown = Trajectory(np.array([start, compose(start, motion)]), np.array([0.0, 0.05]))
+    return simulator_over(6.0, seed).responses(flown, velocities(flown))
+
+
 # ---------------------------------------------------------------- the law
 
 
@@ -59,11 +76,15 @@ def test_delay_of_a_resting_and_of_a_moving_receiver() -> None:
     np.testing.assert_allclose(moving, met, rtol=1e-14)
 
 
-def test_covariance_of_scatterers_drawn_at_random() -> None:
-    """Products of taps over 12 grounds against the law, by a z-test of their weighted sum."""
+@pytest.mark.parametrize("source", ["points", pytest.param("simulator", marks=pytest.mark.thorough)])
+@pytest.mark.usefixtures("variant")
+def test_covariance_of_scatterers_drawn_at_random(source: str) -> None:
+    """Products of taps over 12 grounds against the law, by a z-test of their weighted sum: of points written down in NumPy,
+    and of the simulator's own."""
     motion, law = Motion(0.012, 0.03, 0.0), ResponseCovariance(SONAR, SONAR.receivers[0], HEIGHT, 0.05)
     own, shared = (law.covariance(motion, lag) for lag in (0, 1))
-    z = np.array([pair(motion, seed=seed).response[:, 0, law.taps] for seed in range(12)])
+    grounds = [simulated(motion, seed) if source == "simulator" else pair(motion, seed=seed) for seed in range(12)]
+    z = np.array([ground.response[:, 0, law.taps] for ground in grounds])
     # a sum of products that the law says is real, and as large as its energy times the mean strength of 1/2
     told = np.einsum("nk,kl,nl->n", z[:, 0], shared.conj(), z[:, 1].conj()) / (np.abs(shared) ** 2).sum() / 0.5
     error = np.std(told.real, ddof=1) / np.sqrt(len(told))
@@ -71,6 +92,21 @@ def test_covariance_of_scatterers_drawn_at_random() -> None:
     assert abs(told.imag.mean()) < 3.5 * np.std(told.imag, ddof=1) / np.sqrt(len(told))
     energy = (np.abs(z) ** 2).mean(axis=(0, 1)).sum() / (0.5 * np.diag(own).real.sum())
     assert abs(energy - 1) < 0.25, f"energy {energy:.3f} of the law's"
+
+
+@pytest.mark.thorough
+@pytest.mark.usefixtures("variant")
+def test_energy_at_every_delay_is_that_of_the_simulator() -> None:
+    """Fifths of the taps within 0.3 dB of the law's, four receivers at 300 poses over cells; near nadir and aside."""
+    law = ResponseCovariance(SONAR, SONAR.receivers[0], HEIGHT, 0.05)  # of all receivers, in their own axes
+    rng, poses = np.random.default_rng(1), np.zeros((300, 6))
+    poses[:, :2], poses[:, 2], poses[:, 5] = rng.uniform(-7, 7, (300, 2)), HEIGHT, rng.uniform(0, 6, 300)
+    received = np.concatenate([part.response for part in simulator_over(12.0, 7).pings(poses)])[:, :, law.taps]
+    found: NDArray[np.float64] = (np.abs(received) ** 2).mean(axis=(0, 1))
+    told = 0.5 * np.diag(law.covariance(Motion(0.0, 0.0, 0.0), 0)).real
+    pairs = zip(*(np.array_split(power, 5) for power in (found, told)), strict=True)
+    fifths = [10 * np.log10(of_simulator.sum() / of_law.sum()) for of_simulator, of_law in pairs]
+    assert np.abs(fifths).max() < 0.3, f"{np.round(fifths, 2)} dB"
 
 
 def test_covariance_is_that_of_one_ground() -> None:

@@ -1,0 +1,135 @@
+"""Beam pattern, pulse and losses of the model ``physical``, on the sums of its hard boxes.
+
+The rays are binned in boxes that tile sine and range without gap, beyond the field of view and the window too. Matrices of
+the squared pattern and the squared pulse then spread the levels: what many pings of the model ``coherent`` have on average.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.sonar_losses import loss_of, sonar_absorption, undone_absorption
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import RAYS, Sonar
+from mitsonar.instruments.pulse import Pulse
+from mitsonar.instruments.views import View, Whole
+from mitsonar.simulation.beam_former import PULSE_LENGTHS, elevation_end, side_lobes
+
+__all__ = ["ExpectedFormer", "expected_former"]
+
+PARTS = 16
+"""Points of the integral over a box."""
+
+
+@dataclass(frozen=True)
+class ExpectedFormer:
+    """Spread levels as beams and pulse do.
+
+    Attributes:
+        sonar: of the model ``physical``, with a pattern.
+    """
+
+    sonar: Sonar
+
+    @cached_property
+    def beams_beside(self) -> int:
+        """Return the boxes traced beside the fan, on each side."""
+        sonar = self.sonar
+        edge = math.radians(sonar.azimuth_fov_deg) / 2
+        if sonar.beam_layout == "sine":
+            wanted = side_lobes(sonar.aperture) / (2 * math.sin(edge) / sonar.beams)
+            most = (1 / math.sin(edge) - 1) / 2 * sonar.beams
+        else:
+            wanted = side_lobes(sonar.aperture) / sonar.beam_spacing_rad
+            most = (math.pi / 2 / edge - 1) / 2 * sonar.beams
+        return max(0, math.floor(min(math.ceil(wanted), most)))
+
+    @cached_property
+    def bins_beside(self) -> tuple[int, int]:
+        """Return the bins traced before the window and after it."""
+        wanted = math.ceil(PULSE_LENGTHS / 2 * self.sonar.resolution_m / self.sonar.bin_m)
+        return min(wanted, math.floor(self.sonar.range_min / self.sonar.bin_m)), wanted
+
+    @cached_property
+    def traced(self) -> Sonar:
+        """Return the sonar whose hard boxes are traced."""
+        sonar, beside = self.sonar, self.beams_beside
+        before, after = self.bins_beside
+        beams = sonar.beams + 2 * beside
+        if sonar.beam_layout == "sine":
+            part = math.sin(math.radians(sonar.azimuth_fov_deg) / 2) * beams / sonar.beams
+            fov = 2 * math.degrees(math.asin(min(1.0, part)))
+        else:
+            fov = sonar.azimuth_fov_deg * beams / sonar.beams
+        elevation = 2 * math.degrees(elevation_end(sonar))
+        given = {name: getattr(sonar, name) for name in RAYS if name in sonar.model_fields_set}
+        if "rays_per_beam" in given:
+            given["rays_per_beam"] = math.ceil(sonar.rays_per_beam * elevation / sonar.elevation_fov_deg / 2) * 2
+        return sonar.replace(
+            azimuth_fov_deg=fov,
+            elevation_fov_deg=elevation,
+            beams=beams,
+            beam_width_deg=None,
+            range_min=sonar.range_min - before * sonar.bin_m,
+            range_max=sonar.range_max + after * sonar.bin_m,
+            range_bins=sonar.range_bins + before + after,
+            **given,
+        )
+
+    @cached_property
+    def over_beams(self) -> NDArray[np.float32]:
+        """Return the part of each box in each beam ``(boxes, beams)``."""
+        sonar, traced = self.sonar, self.traced
+        aperture, width = sonar.aperture, traced.beam_width_rad
+        share = (np.arange(PARTS) + 0.5) / PARTS - 0.5
+        line = np.sin(traced.bearing_rad[:, None] + share * width)
+        slope = np.cos(traced.bearing_rad[:, None] + share * width)  # of the sine by the angle
+        away = np.sin(sonar.bearing_rad)[None, :, None] - line[:, None, :]
+        power = (aperture.pattern(away) ** 2 * slope[:, None, :]).mean(axis=2)
+        return np.asarray(power * sonar.beam_width_rad / aperture.equivalent_width, dtype=np.float32)
+
+    @cached_property
+    def over_bins(self) -> NDArray[np.float32]:
+        """Return the part of each traced bin in each bin, after losses and gain ``(bins, traced bins)``."""
+        sonar, traced, pulse = self.sonar, self.traced, Pulse(self.sonar.resolution_m)
+        share = ((np.arange(PARTS) + 0.5) / PARTS - 0.5) * sonar.bin_m
+        away = sonar.range_m[:, None, None] - traced.range_m[None, :, None] - share
+        power = (pulse.shape(away) ** 2).mean(axis=2) * sonar.bin_m / pulse.equivalent_m
+        kept = loss_of(sonar) * undone_absorption(sonar)
+        return np.asarray(power * kept[:, None], dtype=np.float32)
+
+    def levels(self, boxes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the levels ``(pings, bins, beams)`` of the traced boxes."""
+        return np.asarray(self.over_bins @ (boxes @ self.over_beams), dtype=np.float32)
+
+    def crop(self, boxes: NDArray[Any]) -> NDArray[Any]:
+        """Return the boxes of the sonar's own bins and beams."""
+        before, beside = self.bins_beside[0], self.beams_beside
+        return boxes[:, before : before + self.sonar.range_bins, beside : beside + self.sonar.beams]
+
+
+def expected_former(sonar: Sonar, views: Sequence[View] | None) -> ExpectedFormer | None:
+    """Return what spreads the levels of a sonar of the model ``physical``; None where nothing is spread or lost.
+
+    Raises:
+        MitsonarError: portions of the field of view, or receivers elsewhere; absorption without a pattern.
+    """
+    if sonar.model != "physical" or sonar.beam_pattern == "box":
+        if sonar.model == "physical" and sonar_absorption(sonar):
+            raise MitsonarError(
+                "the model physical loses sound to absorption with a pattern of the beams only: give pattern two_way as well"
+            )
+        return None
+    if views is not None and any(not isinstance(view, Whole) for view in views):
+        raise MitsonarError(
+            "portions of the field of view and receivers elsewhere have hard edges: leave pattern out, or render the whole "
+            "view"
+        )
+    return ExpectedFormer(sonar)
