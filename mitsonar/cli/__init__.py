@@ -38,6 +38,7 @@ def application() -> typer.Typer:
         presets_command,
         render_command,
         reproduce_command,
+        sonar_command,
         train_command,
         world_command,
     )
@@ -66,5 +67,6 @@ def application() -> typer.Typer:
     app.command()(export_command.export)
     app.command()(reproduce_command.reproduce)
     app.add_typer(world_command.worlds(), name="world")
+    app.add_typer(sonar_command.sonars(), name="sonar")
     app.add_typer(dataset_command.datasets(), name="dataset")
     return app

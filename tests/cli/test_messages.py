@@ -46,6 +46,9 @@ SLIPS = [
     ("odometry none.npz", "there are no frames at none.npz"),
     ("height none.npz --by drect", "got 'drect'; did you mean direct?"),
     ("mosaic none.npz treu", "or `true`; did you mean true?"),
+    ("sonar fit none.npz", "there are no frames at none.npz"),
+    ("sonar fit none.npz --sonar didson30", "did you mean didson300?"),
+    ("sonar fit none.npz --set frequency_hz", "--set takes KEY=VALUE"),
     (f"world mesh {AMPHORA} --reflectivity luminence", "--reflectivity must be", "did you mean luminance?"),
 ]
 

@@ -1,0 +1,219 @@
+"""Real frames beside simulated ones: statistics in one table, pictures in one figure, and a sheet for a blind sorting.
+
+    python benchmarks/bench_realism.py --recordings FOLDER [--out FOLDER] [--quick] [--only NAME]
+
+Recordings are read from the folder, or from the one that MITSONAR_RECORDINGS names. Their sonars are fitted
+(`mitsonar sonar fit`), and the model coherent renders scenes that resemble theirs. Noise and gain are set so that noise and
+brightest thousandth lie as far below full scale as in the recording.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from real_recordings import FOLDER, RECORDINGS, as_recorded, recordings_folder
+from realism_scenes import STAGES, Stage
+
+from mitsonar.acoustics import image_statistics as statistics
+from mitsonar.acoustics.coding import decoded
+from mitsonar.errors import MitsonarWarning
+from mitsonar.estimation.sonar_fit import SonarFit, fit_sonar
+from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.variant import ensure_variant
+
+SHOWN_DB = 50.0
+"""Span of the pictures below the 99.9th percentile [dB]."""
+
+LEAST_NU = 2.0
+"""Smallest shape of the speckle's law that is rendered. Below, objects count, and scenes have their own."""
+
+SEED = 20
+"""Of the order of the sheet."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A statistic of both: name, band of the difference (None where it is only shown), values."""
+
+    name: str
+    band: float | None
+    real: float
+    simulated: float
+
+    def cell(self) -> str:
+        """Return real / simulated, bold where they are farther apart than the band."""
+        digits = 2 if self.band is not None and self.band < 1 else 1
+        both = f"{self.real:.{digits}f} / {self.simulated:.{digits}f}"
+        return f"**{both}**" if self.band is not None and abs(self.simulated - self.real) > self.band else both
+
+
+def main() -> None:
+    """Compare, print the table, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--recordings", help=f"folder of the recordings; default: ${FOLDER}")
+    parser.add_argument("--out", type=Path, help="folder of the pictures; default: none are drawn")
+    parser.add_argument("--only", default="", help="only recordings whose name contains this")
+    parser.add_argument("--quick", action="store_true", help="two frames of one recording")
+    asked = parser.parse_args()
+    folder = recordings_folder(asked.recordings)
+    if folder is None:
+        return print(f"no recordings: name their folder by --recordings or {FOLDER}; nothing is compared")
+    warnings.simplefilter("ignore", MitsonarWarning)
+    names = [name for name in RECORDINGS if asked.only in name]
+    drawn: dict[str, tuple[SonarFrames, SonarFrames]] = {}
+    for name in ["ARIS 3000 tyre"] if asked.quick else names:
+        real = RECORDINGS[name](folder)
+        if asked.quick:
+            real = real.select(slice(2))
+        fit = fit_sonar(real)
+        simulated = simulate(STAGES[name], fit, len(real), folder)
+        print(f"\n{name}, fitted:\n" + "\n".join(f"    {line}" for line in [*fit.lines(), *fit.notes]), flush=True)
+        drawn[name] = real, simulated
+    print("\n" + table({name: compare(*pair) for name, pair in drawn.items()}))
+    if asked.out is not None:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        draw(drawn, asked.out)
+
+
+# ---------------------------------------------------------------- simulation
+
+
+def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFrames:
+    """Return as many frames of a stage, with the fitted sonar, after the recording's way."""
+    nu = fit.sonar.speckle_nu if (fit.sonar.speckle_nu or 0.0) >= LEAST_NU else None
+    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu, noise_level_db=None)
+    ensure_variant()
+    poses = stage.start + np.arange(frames)[:, None] * stage.step
+    with tempfile.TemporaryDirectory() as made:
+        scene = stage.build(Path(made))
+        silent = Simulator(scene, sonar, mirrors=stage.mirrors)
+        bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels, 99.9)
+        assert silent.coherent is not None
+        middle = silent.coherent.gain[sonar.range_bins // 2]
+        if fit.noise_db is not None:
+            below = fit.noise_db - fit.bright_db
+            level = 10 * math.log10(bright / middle) + below + sonar.source_level_db
+            sonar = sonar.replace(noise_level_db=level)
+        made_frames = Simulator(scene, sonar, mirrors=stage.mirrors).render(
+            poses, gain=float(10 ** (fit.bright_db / 10) / bright)
+        )
+    image = np.rint(made_frames.image * 255).astype(np.float32) / 255
+    if stage.pictures:
+        image = as_recorded(image, folder, stage.pictures, stage.video)
+    made_frames.image = image
+    return made_frames
+
+
+# ---------------------------------------------------------------- table
+
+
+def levels(frames: SonarFrames) -> NDArray[np.float64]:
+    """Return the levels of frames relative to full scale, zeros 3 dB below the least [dB]."""
+    intensity = decoded(frames.image, frames.sonar)
+    least = float(statistics.decibels(intensity[intensity > 0].min()))
+    return statistics.decibels(intensity, least - 3)
+
+
+def compare(real: SonarFrames, simulated: SonarFrames) -> list[Row]:
+    """Return all statistics of both."""
+    one, other = measured(real), measured(simulated)
+    return [Row(name, band, one[name][0], other[name][0]) for name, (_, band) in one.items()]
+
+
+def table(found: dict[str, list[Row]]) -> str:
+    """Return the statistics of all recordings in Markdown: real / simulated, bold where out of the band."""
+    lines = [f"| real / simulated | band | {' | '.join(found)} |", "|---" * (len(found) + 2) + "|"]
+    for rows in zip(*found.values(), strict=True):
+        band = "" if rows[0].band is None else f"±{rows[0].band:g}"
+        lines.append(f"| {rows[0].name} | {band} | {' | '.join(row.cell() for row in rows)} |")
+    judged = [row for rows in found.values() for row in rows if row.band is not None]
+    inside = sum(abs(row.simulated - row.real) <= row.band for row in judged if row.band is not None)
+    return "\n".join([*lines, f"\n{inside} of {len(judged)} numbers with a band are in it; bold ones are out."])
+
+
+def measured(frames: SonarFrames) -> dict[str, tuple[float, float | None]]:
+    """Return each statistic with its band, None where it is only shown."""
+    level = levels(frames)
+    by_level = statistics.correlation_by_level(level)[1]
+    over_range, over_beams = (statistics.autocorrelation(level, axis) for axis in (1, 2))
+    rise, fall = statistics.edge_steps_db(level)
+    glow = statistics.near_glow_db(level)
+    profile = statistics.range_profile_db(level)
+    third = [float(part.mean() - profile.max()) for part in np.array_split(profile, 3)]
+    found: dict[str, tuple[float, float | None]] = {
+        "span 1..99.9 %, dB": (statistics.percentile_span_db(level), 6.0),
+        "exact zeros, %": (100 * statistics.zero_share(frames.image), None),
+        "local std, dB": (statistics.local_std_db(level), 0.7),
+        "contrast, median": (float(np.median(statistics.intensity_contrast(10 ** (level / 10)))), None),
+        "frames, raw": (statistics.frame_correlation(level), None),
+        "frames, detrended, darkest 3 tenths": (float(by_level[:3].mean()), 0.1),
+        "frames, detrended, middle 4 tenths": (float(by_level[3:7].mean()), 0.1),
+        "frames, detrended, brightest 3 tenths": (float(by_level[7:].mean()), 0.1),
+        "range, lag 1": (float(over_range[0]), 0.1),
+        "range, lag 2": (float(over_range[1]), 0.1),
+        "beams, lag 1": (float(over_beams[0]), 0.1),
+        "beams, lag 2": (float(over_beams[1]), 0.1),
+        "stripes, dB": (statistics.beam_stripes_db(level), None),
+        "smear of the brightest, dB": (statistics.smear_db(level), None),
+        "99.9 % over median, dB": (statistics.bright_over_median_db(level), None),
+        "near glow, dB": (float(glow.max()), None),
+        "steepest rise in 5 % of range, dB": (rise, None),
+        "steepest fall in 5 % of range, dB": (fall, None),
+    }
+    return found | {f"profile, third {k + 1}, below its top, dB": (value, None) for k, value in enumerate(third)}
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def fan(frames: SonarFrames, index: int = 0) -> NDArray[np.float32]:
+    """Return a frame as a fan of grey 0..1, the upper 50 dB; white outside."""
+    level = levels(frames)[index]
+    top = float(np.percentile(level, 99.9))
+    grey = np.clip((level - top) / SHOWN_DB + 1, 0, 1).astype(np.float32)
+    drawn = to_cartesian(grey, frames.range_m, frames.bearing_rad).image
+    return np.asarray(np.where(np.isfinite(drawn), drawn, 1.0), dtype=np.float32)
+
+
+def panels(pictures: Iterable[NDArray[np.float32]], titles: Iterable[str], columns: int, path: Path) -> None:
+    """Write pictures side by side, each as high as the others."""
+    from matplotlib.figure import Figure
+
+    shown, named = list(pictures), list(titles)
+    figure = Figure(figsize=(3 * columns, 5 * math.ceil(len(shown) / columns)), layout="constrained")
+    axes = figure.subplots(math.ceil(len(shown) / columns), columns, squeeze=False).ravel()
+    for one, axis in enumerate(axes):
+        axis.axis("off")
+        if one < len(shown):
+            axis.imshow(shown[one], cmap="gray", vmin=0, vmax=1, interpolation="antialiased", aspect="equal")
+            axis.set_title(named[one], fontsize=9)
+    figure.savefig(path, dpi=110)
+
+
+def draw(drawn: dict[str, tuple[SonarFrames, SonarFrames]], folder: Path) -> None:
+    """Write the figure with names, real above simulated, and the sheet without them with its key apart."""
+    both = [[fan(pair[side]) for pair in drawn.values()] for side in (0, 1)]
+    titles = [f"{side}: {name}" for side in ("real", "simulated") for name in drawn]
+    panels(both[0] + both[1], titles, len(drawn), folder / "realism.png")
+    order = np.random.default_rng(SEED).permutation(2 * len(drawn))
+    letters = [chr(ord("A") + place) for place in range(len(order))]
+    mixed = both[0] + both[1]
+    panels([mixed[k] for k in order], letters, len(drawn), folder / "sheet.png")
+    key = {letter: titles[k] for letter, k in zip(letters, order, strict=True)}
+    (folder / "key.json").write_text(json.dumps(key, indent=1) + "\n", encoding="utf-8")
+    print(f"\npictures in {folder}: realism.png; sheet.png without names, its key in key.json")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+"""Scenes that resemble what the real recordings show, and how their sonars stood: a guess, since none is documented."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["STAGES", "Stage"]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene and a sonar in it.
+
+    Attributes:
+        build: makes the scene in a folder.
+        start: pose of the first frame [m, rad].
+        step: motion from frame to frame.
+        sonar: fields that the recording does not tell.
+        pictures: whether frames pass through fan pictures of 8 bit, as the recording did.
+        video: whether these pass through MPEG-4.
+        mirrors: reflection coefficient and rms height [m] of smooth shapes.
+    """
+
+    build: Callable[[Path], mi.Scene]
+    start: NDArray[np.float64]
+    step: NDArray[np.float64]
+    sonar: dict[str, Any]
+    pictures: str = ""
+    video: bool = False
+    mirrors: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def pose(height: float, pitch_deg: float, y: float = 0.0, x: float = 0.0, heading_deg: float = 0.0) -> NDArray[np.float64]:
+    """Return a pose: x, y, z [m], pitch, roll, heading [rad]."""
+    return np.array([x, y, height, math.radians(pitch_deg), 0.0, math.radians(heading_deg)])
+
+
+STILL = np.zeros(6)
+
+
+Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+
+
+def ground(size: tuple[float, float], step: float, rms: float, longest: float, seed: int, shape: Shape) -> trimesh.Trimesh:
+    """Make rough ground ahead of the origin: heights of a power law of 3 over the wavenumber, on a shape.
+
+    Args:
+        size: across and ahead [m].
+        step: of the grid [m].
+        rms: of the roughness [m].
+        longest: wavelength from which its spectrum is flat [m].
+        seed: of the roughness.
+        shape: mean height at x and y [m].
+    """
+    across, ahead = (round(length / step) for length in size)
+    fx, fy = np.meshgrid(np.fft.fftfreq(across, step), np.fft.rfftfreq(ahead, step), indexing="ij")
+    weight = (1 + (np.hypot(fx, fy) * longest) ** 2) ** -1.1
+    white = np.random.default_rng(seed).normal(size=(across, ahead))
+    height = np.fft.irfft2(np.fft.rfft2(white) * weight, (across, ahead))
+    x, y = np.meshgrid((np.arange(across) - across / 2) * step, np.arange(ahead) * step, indexing="ij")
+    vertices = np.stack([x, y, height / height.std() * rms + shape(x, y)], axis=-1).reshape(-1, 3)
+    corner = (np.arange(across - 1)[:, None] * ahead + np.arange(ahead - 1)).ravel()
+    one = np.stack([corner, corner + ahead, corner + ahead + 1], axis=1)
+    other = np.stack([corner, corner + ahead + 1, corner + 1], axis=1)
+    return trimesh.Trimesh(vertices, np.concatenate([one, other]), process=False)
+
+
+def beside(x: NDArray[np.float64], y: NDArray[np.float64], half: float, wander: float, seed: int) -> NDArray[np.float64]:
+    """Return how far a place lies outside a strip whose two edges wander [m]."""
+    phase = np.random.default_rng(seed).uniform(0, 2 * math.pi, (2, 6))
+    side = [sum(wander / k**0.7 * np.sin(1.1 * k**1.1 * y + phase[one, k - 1]) for k in range(1, 7)) for one in (0, 1)]
+    return np.asarray(np.abs(x) - half - np.where(x < 0, side[0], side[1]))
+
+
+def hull(points: NDArray[np.float64]) -> trimesh.Trimesh:
+    """Make the convex hull of points."""
+    found = ConvexHull(points)
+    one, other = (points[found.simplices[:, k]] - points[found.simplices[:, 0]] for k in (1, 2))
+    outward = (np.cross(one, other) * found.equations[:, :3]).sum(axis=1) > 0
+    faces = np.where(outward[:, None], found.simplices, found.simplices[:, ::-1])
+    return trimesh.Trimesh(points, faces, process=False)
+
+
+def stones(
+    count: int, across: float, ahead: tuple[float, float], size: tuple[float, float], seed: int, shape: Shape
+) -> trimesh.Trimesh:
+    """Make stones that lie on a shape: convex bodies of random points, more small ones than large ones."""
+    rng, made = np.random.default_rng(seed), []
+    for _ in range(count):
+        edge = size[0] * (size[1] / size[0]) ** (rng.random() ** 2)
+        body = hull(rng.normal(size=(24, 3)) * edge / 3 * [1, 1, 0.6])
+        x, y = rng.uniform(-across / 2, across / 2), rng.uniform(*ahead)
+        made.append(placed(body, (x, y, float(shape(np.array(x), np.array(y)))), (0, 0, 360 * rng.random())))
+    return merged(made)
+
+
+def loaded(parts: dict[str, tuple[trimesh.Trimesh, float]], folder: Path, **others: dict[str, Any]) -> mi.Scene:
+    """Load meshes with their reflectivities, and other shapes."""
+    import mitsuba as mi
+
+    shapes = {name: mesh(body, folder / f"{name}.ply", value) for name, (body, value) in parts.items()}
+    scene: mi.Scene = mi.load_dict({"type": "scene", **shapes, **others})
+    return scene
+
+
+def river_bed(folder: Path) -> mi.Scene:
+    """Make a gravel bed that falls off to the left, with a pit."""
+
+    def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        pit = np.hypot((x + 0.05) / 0.4, (y - 3.3) / 0.45)
+        rim = 0.1 * np.exp(-(((pit - 1.1) / 0.35) ** 2)) - 0.16 * np.exp(-((pit / 0.8) ** 4))
+        strip = beside(x - 0.05 * (y - 3), y, 0.9, 0.1, 11)
+        return np.asarray(0.6 * rim - 4.0 / (1 + np.exp(-strip * 9)) - 0.02 * (y - 3))
+
+    parts = {
+        "bed": (ground((6, 12), 0.015, 0.012, 0.4, 3, shape), 0.03),
+        "stones": (stones(220, 3, (1.5, 10), (0.03, 0.14), 4, shape), 0.06),
+    }
+    return loaded(parts, folder / "river")
+
+
+def far_bed(folder: Path) -> mi.Scene:
+    """Make a bed of bars across the flow, lit in a strip."""
+
+    def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        bars = 0.006 * np.sin(2 * math.pi * (y + 0.6 * x + 0.5 * np.sin(1.7 * x) + 0.3 * np.sin(2.3 * y)) / 0.45)
+        strip = beside(x - 0.35, y, 0.9, 0.15, 12)
+        return np.asarray(bars - 4.0 / (1 + np.exp(-strip * 9)))
+
+    parts = {
+        "bed": (ground((10, 17), 0.02, 0.012, 0.4, 6, shape), 0.05),
+        "stones": (stones(160, 3, (5, 15), (0.04, 0.15), 7, shape), 0.05),
+    }
+    return loaded(parts, folder / "far")
+
+
+def sparse_bottom(folder: Path) -> mi.Scene:
+    """Make a flat bottom with low ridges."""
+
+    def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        one = np.exp(-(((y - 13.5 + 1.2 * x) / 0.12) ** 2)) * (x < 0.6)
+        other = np.exp(-(((y - 16.0 - 0.9 * x) / 0.12) ** 2)) * (x > -1.0)
+        return np.asarray(0.1 * (one + other))
+
+    return loaded({"bottom": (ground((8, 26), 0.03, 0.004, 1.0, 8, shape), 0.05)}, folder / "sparse")
+
+
+def placed(body: trimesh.Trimesh, at: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> trimesh.Trimesh:
+    """Turn a body about x, y, z and move it."""
+    turn = Rotation.from_euler("xyz", turn_deg, degrees=True)
+    return trimesh.Trimesh(turn.apply(body.vertices) + np.asarray(at), body.faces, process=False)
+
+
+def merged(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Merge bodies into one mesh."""
+    first = np.cumsum([0, *(len(body.vertices) for body in bodies)])
+    faces = [body.faces + start for body, start in zip(bodies, first[:-1], strict=True)]
+    return trimesh.Trimesh(np.concatenate([body.vertices for body in bodies]), np.concatenate(faces), process=False)
+
+
+def mesh(body: trimesh.Trimesh, path: Path, reflectivity: float) -> dict[str, Any]:
+    """Write a mesh and return it as Mitsuba's dictionary."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    body.export(path)
+    return {"type": "ply", "filename": str(path), "face_normals": True, "bsdf": paint(reflectivity)}
+
+
+def paint(reflectivity: float) -> dict[str, Any]:
+    """Return a diffuse surface."""
+    return {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectivity}}
+
+
+def floor(reflectivity: float, half: float = 6.0) -> dict[str, Any]:
+    """Return level ground."""
+    import mitsuba as mi
+
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half), "bsdf": paint(reflectivity)}
+
+
+def flat(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return level ground."""
+    return np.zeros(np.broadcast(x, y).shape)
+
+
+def tank_with_tyre(folder: Path) -> mi.Scene:
+    """Make a dark smooth floor, a tyre on its side, a box and a wall's corner."""
+    tyre = placed(trimesh.creation.torus(0.11, 0.04, major_sections=96, minor_sections=32), (0.12, 2.4, 0.05), (12, 0, 25))
+    box = placed(trimesh.creation.box((0.05, 0.3, 0.12)), (-0.3, 3.1, 0.06), (0, 0, 35))
+    lid = placed(trimesh.creation.box((0.25, 0.04, 0.1)), (-0.28, 2.95, 0.05), (0, 0, -25))
+    wall = placed(trimesh.creation.box((1.5, 0.05, 0.8)), (1.2, 3.75, 0.4), (0, 0, -40))
+    parts = {"tyre": (tyre, 0.03), "box": (box, 0.3), "lid": (lid, 0.2), "wall": (wall, 0.1)}
+    return loaded(parts, folder / "tyre", floor=floor(1e-4))
+
+
+def tank_with_chain(folder: Path) -> mi.Scene:
+    """Make a dark smooth floor, a chain that lies in two bows, and beams of wood."""
+    links = []
+    for k, along in enumerate(np.linspace(0, 1, 96)):
+        x = -0.3 + 0.5 * math.sin(2.2 * along) ** 2 + 0.35 * along
+        y = 2.75 + 0.22 * math.sin(7.5 * along + 0.9) - 0.25 * along
+        turn = (90.0 * (k % 2) + 20 * math.sin(5.0 * k), 20 * math.cos(3.0 * k), 137.0 * k)
+        links.append(placed(trimesh.creation.torus(0.028, 0.009, major_sections=32, minor_sections=12), (x, y, 0.03), turn))
+    beams = [placed(trimesh.creation.box((0.08, 0.9, 0.1)), (0.2 + 0.4 * k, 3.6, 0.05), (0, 0, 12 - 80 * k)) for k in (0, 1)]
+    parts = {"chain": (merged(links), 0.6), "beams": (merged(beams), 0.15)}
+    return loaded(parts, folder / "chain", floor=floor(1e-4))
+
+
+def small_tank(folder: Path) -> mi.Scene:
+    """Make a rough floor, a low body with a shadow, and a seam."""
+    body = placed(trimesh.creation.capsule(0.1, 0.012, count=[24, 24]), (0.05, 0.95, 0.01), (90, 0, 60))
+    seam = placed(trimesh.creation.box((1.2, 0.01, 0.012)), (0.2, 1.45, 0.0), (0, 0, -20))
+    parts = {
+        "floor": (ground((3, 2.4), 0.006, 0.0015, 0.25, 9, flat), 0.2),
+        "body": (body, 0.1),
+        "seam": (seam, 0.4),
+    }
+    return loaded(parts, folder / "small")
+
+
+STAGES = {
+    "DIDSON lamprey2": Stage(
+        river_bed, pose(0.9, 10), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey2", video=True
+    ),
+    "DIDSON lamprey4": Stage(
+        far_bed, pose(1.9, 11.5), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey4", video=True
+    ),
+    "ARIS 1200": Stage(sparse_bottom, pose(1.3, 7), STILL, {"elevation_fov_deg": 14.0, "absorption_db_per_m": 0.37}),
+    "ARIS 3000 tyre": Stage(
+        tank_with_tyre,
+        pose(1.3, 29),
+        np.array([0.0, 0.0055, 0.0, 0.0, 0.0, math.radians(0.16)]),
+        {"absorption_db_per_m": 2.34},
+        pictures="translate_tyre",
+        mirrors={"tyre": (0.5, 5e-5), "box": (0.5, 5e-5), "lid": (0.5, 5e-5), "wall": (0.5, 8e-5)},
+    ),
+    "ARIS 3000 chain": Stage(
+        tank_with_chain,
+        pose(1.3, 29),
+        np.array([0.0, 0.0068, 0.0, 0.0, 0.0, math.radians(0.09)]),
+        {"absorption_db_per_m": 2.34},
+        pictures="forward_chain",
+        mirrors={"chain": (0.9, 3e-5), "beams": (0.5, 8e-5)},
+    ),
+    "Oculus 2.1 MHz": Stage(small_tank, pose(0.27, 21), STILL, {"absorption_db_per_m": 1.14}),
+}
+"""By the name of the recording."""

@@ -1,0 +1,332 @@
+"""Statistics of sonar frames that tell real images from simulated ones: grain, memory, stripes, smear, edges.
+
+Frames are ``(frames, bins, beams)``. Levels are in dB, finite; intensities are linear, 0 and more. *Detrended* means that
+the local mean of the levels over :data:`WINDOW` cells is removed, so that grain is left and the picture is not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage, optimize, stats
+
+__all__ = [
+    "RAYLEIGH_DB",
+    "WINDOW",
+    "autocorrelation",
+    "beam_stripes_db",
+    "bright_over_median_db",
+    "correlation_by_level",
+    "decibels",
+    "detrended",
+    "edge_steps_db",
+    "frame_correlation",
+    "intensity_contrast",
+    "leak_power",
+    "local_mean",
+    "local_std_db",
+    "near_glow_db",
+    "percentile_span_db",
+    "range_profile_db",
+    "smear_db",
+    "window_values",
+    "zero_share",
+]
+
+Array = NDArray[np.float64]
+
+WINDOW = (31, 9)
+"""Bins and beams of the local mean."""
+
+RAYLEIGH_DB = 10 / np.log(10) * np.pi / np.sqrt(6)
+"""Standard deviation of exponential intensities in dB: 5.57."""
+
+STRIPE_BLOCKS = 8
+"""Blocks of bins whose stripes must agree, so that speckle does not count as stripes."""
+
+GLOW_BINS, TREND_BINS = 20, 60
+"""Bins of the near glow, and bins behind them that give the trend."""
+
+LEAK_GUARD, LEAK_BINS, LEAK_ROWS, LEAK_SURE = 8, 8, 12, 3
+"""Of the smear: bins between a row and the rows that it is compared with, how many of these there are on either side, and
+rows of a frame that are compared, those that exceed theirs most; standard errors that a leak must exceed."""
+
+LEAK_CONTRAST = 1000.0
+"""Least ratio of a row's brightest cell to its quiet beams: below 30 dB no leak of 50 dB shows."""
+
+MEDIAN_ABOVE_MEAN_DB = float(10 * np.log10(np.log(2)) + 10 / np.log(10) * np.euler_gamma)
+"""Median of exponential intensities in dB less the mean of their dB: 0.91."""
+
+
+def decibels(intensity: ArrayLike, least_db: float = -200.0) -> Array:
+    """Return levels of intensities [dB], not below ``least_db``, of the same shape."""
+    value = np.maximum(np.asarray(intensity, dtype=float), 10 ** (least_db / 10))
+    return np.asarray(10 * np.log10(value), dtype=np.float64)
+
+
+# ---------------------------------------------------------------- range of levels
+
+
+def percentile_span_db(level_db: ArrayLike, low: float = 1.0, high: float = 99.9) -> float:
+    """Return the distance of two percentiles of all levels [dB]."""
+    below, above = np.percentile(np.asarray(level_db, dtype=float), [low, high])
+    return float(above - below)
+
+
+def bright_over_median_db(level_db: ArrayLike) -> float:
+    """Return how far the 99.9th percentile of all levels is above their median [dB]."""
+    return percentile_span_db(level_db, 50.0, 99.9)
+
+
+def zero_share(values: ArrayLike) -> float:
+    """Return the part of the cells whose value is exactly 0."""
+    return float(np.mean(np.asarray(values) == 0))
+
+
+# ---------------------------------------------------------------- grain
+
+
+def local_mean(values: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
+    """Return the mean over a window of bins and beams around each cell, of the same shape. Edges repeat their values."""
+    values = np.asarray(values, dtype=float)
+    size = (*(1 for _ in values.shape[:-2]), *window)
+    return np.asarray(ndimage.uniform_filter(values, size, mode="nearest"), dtype=np.float64)
+
+
+def detrended(level_db: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
+    """Return levels less their local mean [dB], of the same shape."""
+    return np.asarray(np.asarray(level_db, dtype=float) - local_mean(level_db, window), dtype=np.float64)
+
+
+def local_std_db(level_db: ArrayLike, window: tuple[int, int] = WINDOW) -> float:
+    """Return the root of the mean square of detrended levels [dB]; 5.57 of exponential intensities.
+
+    The mean of n cells takes 1 / n of the variance of grain without memory, which is put back.
+    """
+    cells = window[0] * window[1]
+    return float(np.sqrt(np.mean(detrended(level_db, window) ** 2) * cells / (cells - 1)))
+
+
+def window_values(values: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
+    """Return the values of windows that do not overlap ``(windows, cells)``; what is left at the ends is dropped."""
+    values = np.asarray(values, dtype=float)
+    frames, bins, beams = values.shape
+    tall, wide = min(window[0], bins), min(window[1], beams)
+    whole = values[:, : bins // tall * tall, : beams // wide * wide]
+    parts = whole.reshape(frames, bins // tall, tall, beams // wide, wide).transpose(0, 1, 3, 2, 4)
+    return np.asarray(parts.reshape(-1, tall * wide), dtype=np.float64)
+
+
+def intensity_contrast(intensity: ArrayLike, window: tuple[int, int] = WINDOW) -> Array:
+    """Return standard deviation over mean of the intensities of each window ``(windows,)``, those without any left out.
+
+    Exponential intensities have 1. The median over windows is the number of a picture.
+    """
+    parts = window_values(intensity, window)
+    mean = parts.mean(axis=1)
+    kept = mean > 0
+    return np.asarray(parts[kept].std(axis=1, ddof=1) / mean[kept], dtype=np.float64)
+
+
+# ---------------------------------------------------------------- memory
+
+
+def _correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two arrays; 0 where one of them does not vary."""
+    one, other = one - one.mean(), other - other.mean()
+    power = float(np.sqrt(np.mean(one * one) * np.mean(other * other)))
+    return float(np.mean(one * other)) / power if power > 0 else 0.0
+
+
+def frame_correlation(level_db: ArrayLike) -> float:
+    """Return the mean correlation of consecutive frames, of levels as they are (or detrended before); nan of one frame."""
+    level = np.asarray(level_db, dtype=float)
+    pairs = [_correlation(one, other) for one, other in pairwise(level)]
+    return float(np.mean(pairs)) if pairs else float("nan")
+
+
+def correlation_by_level(level_db: ArrayLike, parts: int = 10, window: tuple[int, int] = WINDOW) -> tuple[Array, Array]:
+    """Return the correlation of consecutive detrended frames, by the local mean of the level.
+
+    Cells are sorted by their local mean over both frames, so that the grain itself does not choose.
+
+    Returns:
+        Mean level of each part [dB], and correlation within it ``(parts,)``, darkest first.
+    """
+    level = np.asarray(level_db, dtype=float)
+    mean = local_mean(level, window)
+    grain = level - mean
+    found = []
+    for k in range(len(level) - 1):
+        around = ((mean[k] + mean[k + 1]) / 2).ravel()
+        one, other = grain[k].ravel(), grain[k + 1].ravel()
+        cells = np.array_split(np.argsort(around, kind="stable"), parts)
+        found.append([(float(around[at].mean()), _correlation(one[at], other[at])) for at in cells])
+    table = np.mean(found, axis=0) if found else np.full((parts, 2), np.nan)
+    return np.asarray(table[:, 0]), np.asarray(table[:, 1])
+
+
+def autocorrelation(level_db: ArrayLike, axis: int, lags: tuple[int, ...] = (1, 2)) -> Array:
+    """Return the correlation of detrended levels with those some cells away ``(lags,)``.
+
+    The coherence c of a complex Gaussian field gives Li2(c^2) / (pi^2 / 6) here, with the dilogarithm Li2.
+
+    Args:
+        level_db: ``(frames, bins, beams)``.
+        axis: 1 over range, 2 over beams.
+        lags: cells.
+    """
+    grain = detrended(level_db)
+    cells = grain.shape[axis]
+    pairs = [(np.take(grain, range(lag, cells), axis), np.take(grain, range(cells - lag), axis)) for lag in lags]
+    return np.array([_correlation(one, other) for one, other in pairs])
+
+
+# ---------------------------------------------------------------- the instrument
+
+
+def beam_stripes_db(level_db: ArrayLike, window: int = 9) -> float:
+    """Return the standard deviation of the beams' own gains [dB], 0 where beams agree.
+
+    A beam's gain is what its mean over a block of bins exceeds that of its neighbours by. Only what blocks of bins agree on
+    counts: speckle differs from block to block.
+    """
+    level = np.asarray(level_db, dtype=float).mean(axis=0)
+    blocks = np.stack([np.median(part, axis=0) for part in np.array_split(level, STRIPE_BLOCKS)])
+    blocks = blocks - ndimage.uniform_filter1d(blocks, window, axis=1, mode="nearest")
+    blocks -= blocks.mean(axis=1, keepdims=True)
+    products = blocks @ blocks.T / blocks.shape[1]
+    shared = float(np.median(products[np.triu_indices(len(blocks), 1)])) if len(blocks) > 1 else 0.0
+    return float(np.sqrt(max(shared, 0.0) * window / (window - 1)))
+
+
+def range_profile_db(level_db: ArrayLike) -> Array:
+    """Return the level of the mean intensity of each bin over frames and beams ``(bins,)`` [dB]."""
+    return decibels(np.mean(10 ** (np.asarray(level_db, dtype=float) / 10), axis=(0, 2)))
+
+
+def near_glow_db(level_db: ArrayLike) -> Array:
+    """Return how far the first bins exceed the trend of the bins behind them ``(GLOW_BINS,)`` [dB].
+
+    The level of a bin is the median over frames and beams, the trend a straight line through the next ones.
+    """
+    profile = np.median(np.asarray(level_db, dtype=float), axis=(0, 2))
+    glow = min(GLOW_BINS, len(profile) // 3)
+    behind = np.arange(glow, min(glow + TREND_BINS, len(profile)))
+    slope, start = np.polyfit(behind, profile[behind], 1)
+    return np.asarray(profile[:glow] - (start + slope * np.arange(glow)), dtype=np.float64)
+
+
+def edge_steps_db(level_db: ArrayLike, part: float = 0.05) -> tuple[float, float]:
+    """Return the largest rise and the largest fall of the range profile over a part of the window, both positive [dB].
+
+    These are the edges of the lit patch. The first bins, where real sonars glow, are left out.
+    """
+    profile = ndimage.uniform_filter1d(range_profile_db(level_db), 5, mode="nearest")[GLOW_BINS:]
+    lag = max(1, round(part * len(profile)))
+    step = profile[lag:] - profile[:-lag]
+    return float(max(step.max(), 0.0)), float(max(-step.min(), 0.0))
+
+
+# ---------------------------------------------------------------- smear
+
+
+def _rows_and_neighbours(values: Array) -> tuple[Array, Array, Array]:
+    """Return rows that have neighbours on both sides, and two means of these, ``(frames, rows, beams)`` each.
+
+    The means are of every other neighbour: one chooses quiet beams, the other is what rows are compared with. A single mean
+    would choose beams by its own grain.
+    """
+    reach = LEAK_GUARD + LEAK_BINS
+    rows = values.shape[1] - 2 * reach
+    away = [-reach + k for k in range(LEAK_BINS)] + [LEAK_GUARD + 1 + k for k in range(LEAK_BINS)]
+    one, other = (sum(values[:, reach + k : reach + k + rows] for k in half) for half in (away[::2], away[1::2]))
+    return values[:, reach : reach + rows], np.asarray(one) / LEAK_BINS, np.asarray(other) / LEAK_BINS
+
+
+class _Rows(NamedTuple):
+    """Rows that may leak most, ``(rows,)`` each, and what rows do by chance.
+
+    Attributes:
+        excess: of the sum over the other beams.
+        lift: median of the quiet beams over their neighbours, in medians of exponential intensities of mean 1.
+        level: mean of the quiet beams' neighbours.
+        top: the largest cell.
+        chance: standard error of the median lift.
+    """
+
+    excess: Array
+    lift: Array
+    level: Array
+    top: Array
+    chance: float
+
+
+def _leaking_rows(intensity: Array) -> _Rows | None:
+    """Return the rows of each frame that may leak most; None where none can leak."""
+    if intensity.shape[1] < 4 * (LEAK_GUARD + LEAK_BINS):
+        return None
+    row, chooser, around = _rows_and_neighbours(intensity)
+    quiet = (chooser <= np.percentile(chooser, 40, axis=2, keepdims=True)) & (around > 0)
+    excess = np.where(quiet, 0, row - around).sum(axis=2)
+    ratio = np.divide(row, around, out=np.full_like(row, np.nan), where=quiet)
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a row without a quiet beam is nan, and not used
+        median, level = np.nanmedian(ratio, axis=2), np.nanmean(np.where(quiet, around, np.nan), axis=2)
+    top = row.max(axis=2)
+    can = np.isfinite(median) & (level > 0) & (excess > 0) & (top > LEAK_CONTRAST * level)
+    if not can.any():
+        return None
+    lift = median * np.log(2) / np.nanmedian(median)  # the mean of few neighbours lifts all ratios
+    spread = 1.4826 * np.nanmedian(np.abs(lift - np.log(2)))
+    score = np.where(can, excess / np.where(level > 0, level, 1), -np.inf)
+    best = np.argsort(score, axis=1)[:, -LEAK_ROWS:]
+    kept = np.take_along_axis(can, best, axis=1)
+    excess, lift, level, top = (np.take_along_axis(table, best, axis=1)[kept] for table in (excess, lift, level, top))
+    return _Rows(excess, lift, level, top, float(1.25 * spread / np.sqrt(LEAK_ROWS)))
+
+
+def _steady_power(median: float) -> float:
+    """Return the power of a steady wave that lifts the median of exponential intensities of mean 1 to ``median``."""
+    if median <= np.log(2):
+        return 0.0
+    miss = lambda power: stats.ncx2.median(2, 2 * power) / 2 - median  # noqa: E731
+    return float(optimize.brentq(miss, 0.0, median + 10))
+
+
+def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
+    """Return the power that leaks into every beam over the sum of the intensities of all beams.
+
+    In rows with a strong target the quiet beams are compared with the same beams in rows before and behind. Of complex
+    Gaussian noise and a steady wave the median tells the wave. Rows with a cell at ``limit`` or above it are left out: what
+    is clipped is not known.
+
+    Returns:
+        The median over the strongest rows; 0 where quiet beams rise by no more than chance.
+    """
+    intensity = np.asarray(intensity, dtype=float)
+    rows = _leaking_rows(intensity)
+    if rows is None or not (open_ := rows.top < limit).any():
+        return 0.0
+    if np.median(rows.lift[open_]) < np.log(2) + LEAK_SURE * rows.chance:
+        return 0.0
+    leaked = np.array([_steady_power(one) for one in rows.lift[open_]]) * rows.level[open_]
+    return float(np.median(leaked / rows.excess[open_]))
+
+
+def smear_db(level_db: ArrayLike) -> float:
+    """Return what the quiet beams beside the brightest target of each frame exceed the rows around by, the median [dB]."""
+    level = np.asarray(level_db, dtype=float)
+    if level.shape[1] < 4 * (LEAK_GUARD + LEAK_BINS):
+        return 0.0
+    row, chooser, around = _rows_and_neighbours(level)
+    brightest = row.max(axis=2).argmax(axis=1)
+    found = []
+    for k, at in enumerate(brightest):
+        quiet = chooser[k, at] <= np.percentile(chooser[k, at], 60)
+        found.append(float(np.median((row[k, at] - around[k, at])[quiet])))
+    return float(np.median(found)) - MEDIAN_ABOVE_MEAN_DB

@@ -1,0 +1,311 @@
+"""What a recording tells of its sonar: noise, coding, stripes, crosstalk, speckle, near glow, as the simulator reads it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy import ndimage, optimize, special
+
+from mitsonar.acoustics import image_statistics as statistics
+from mitsonar.acoustics.coding import decoded
+from mitsonar.acoustics.sonar_losses import gain_of, loss_of
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["SonarFit", "fit_sonar"]
+
+Array = NDArray[np.float64]
+
+GEOMETRY = (
+    "azimuth_fov_deg", "beams", "beam_layout", "bearing", "range_min", "range_max", "range_bins", "sound_speed",
+    "gain_exponent", "gain_absorption", "absorption_db_per_m", "temperature_c", "salinity_psu", "water_depth_m", "ph",
+    "source_level_db", "frame_rate_hz",
+)  # fmt: skip
+"""Fields that the recording knows better than a named sonar."""
+
+LEAST_SHAPE = (96, 16)
+"""Least bins and beams of a frame."""
+
+DARKEST, WITHIN = 2.0, 2.0
+"""Percentile of the windows' means that is noise, and the factor above it up to which windows are noise too."""
+
+STILL = 0.5
+"""Correlation of frames above which the darkest parts are no noise."""
+
+FLAT_WINDOW, FLAT_ABOVE, MOST_CLIPPED = (64, 24), 10.0, 0.005
+"""Windows of the speckle's law: bins and beams, least ratio to the noise, most of their cells at full scale."""
+
+STRUCTURED = 0.5
+"""Shape of the K law below which it is the scene's structure."""
+
+NEAR_RAYLEIGH = 0.02
+"""Excess of the squared contrast below which intensities are exponential: a nu of 100."""
+
+GRAIN_PART, LEAST_WINDOWS = 20.0, 8
+"""Percentile of the windows' means below which the grain tells the coding, and the fewest windows."""
+
+FULL = 0.996
+"""Value from which a cell may be clipped."""
+
+FACE, SLANT = 0.5, 0.5
+"""Where levels have no scale: reflectivity of what the brightest thousandth shows, and the squared cosine of its slant."""
+
+
+@dataclass(frozen=True)
+class SonarFit:
+    """A sonar fitted to a recording.
+
+    Attributes:
+        sonar: of the model coherent, with the fitted fields.
+        noise_db: noise in a cell at the middle of the window, relative to full scale [dB]; None where it was not seen.
+        bright_db: 99.9th percentile of the levels behind the near glow, relative to full scale [dB].
+        speckle_span_db: span of the coding dB by which grain of 5.57 dB has the spread of these values [dB]; None in others.
+        speckle_gamma: of value = amplitude^gamma, by the coefficient of variation of the values; None in dB.
+        glow_db: of the first bins over the trend behind them [dB], for which the sonar has no field.
+        notes: sentences on what was assumed or not found.
+    """
+
+    sonar: Sonar
+    noise_db: float | None
+    bright_db: float
+    speckle_span_db: float | None
+    speckle_gamma: float | None
+    glow_db: Array
+    notes: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """Return what was found, a line each, with units."""
+        sonar = self.sonar
+        noise = "not seen" if self.noise_db is None else f"{self.noise_db:.1f} dB at mid range"
+        grain = (
+            f"a span of {self.speckle_span_db:.1f} dB"
+            if self.speckle_span_db is not None
+            else f"gamma {self.speckle_gamma:.2f} (linear is 2)"
+        )
+        coding = {"dB": f"dB, span {sonar.coding_db:g} dB", "gamma": f"gamma {sonar.coding_gamma:g}"}
+        level = "not fitted" if sonar.noise_level_db is None else f"{sonar.noise_level_db:.1f} dB"
+        leak = "none seen" if sonar.crosstalk_db is None else f"{sonar.crosstalk_db:.1f} dB"
+        law = "none: exponential intensities" if sonar.speckle_nu is None else f"{sonar.speckle_nu:.2g}"
+        return [
+            f"noise over full scale   {noise} (noise_level_db: {level})",
+            f"99.9th percentile       {self.bright_db:.1f} dB over full scale",
+            f"coding                  {coding.get(sonar.value_coding, 'linear')}; the grain says {grain}",
+            f"stripes_db              {sonar.stripes_db:.2f}",
+            f"crosstalk_db            {leak}",
+            f"speckle_nu              {law}",
+            f"near glow               {self.glow_db.max():.1f} dB at most, {self.glow_db[:2].mean():.1f} dB in bins 0 and 1",
+        ]
+
+    def yaml(self) -> str:
+        """Return the sonar's file: the fields that differ from their defaults."""
+        default = Sonar()
+        fields = {k: v for k, v in self.sonar.model_dump().items() if v != getattr(default, k) and k in _written(self.sonar)}
+        about = "".join(f"# {line}\n" for line in [*self.lines(), *self.notes])
+        return about + yaml.safe_dump(fields, sort_keys=False, allow_unicode=True)
+
+
+def _written(sonar: Sonar) -> set[str]:
+    """Return the fields that a file needs: numbers of rays follow from the quality."""
+    return set(type(sonar).model_fields) - {"rays_per_beam", "rays_across"}
+
+
+def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding: bool = False, **given: Any) -> SonarFit:
+    """Fit a sonar of the model coherent to a recording.
+
+    Args:
+        frames: of a real or simulated sonar, resting or slow; linear, dB or gamma.
+        base: what the recording does not tell: carrier, beam width, patterns; default: the sonar of the frames.
+        measure_coding: take the coding from the grain, instead of the one that the frames state. It assumes one look.
+        given: fields that are known, which replace those of the base.
+
+    Raises:
+        MitsonarError: frames that are too small or empty; fields that the model coherent lacks.
+    """
+    _check(frames)
+    told = frames.sonar
+    known = {name: getattr(told, name) for name in GEOMETRY}
+    coded = {"coding": frames.level, "coding_db": told.coding_db, "coding_gamma": told.coding_gamma}
+    sonar = (told if base is None else base).replace(**{"model": "coherent", **known, **coded, **given})
+    value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
+    notes: list[str] = []
+    span, gamma = (_span(value), None) if frames.level == "dB" else (None, _gamma(value))
+    sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
+    intensity = decoded(value, sonar)
+    level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)
+    flat = intensity / gain_of(sonar)[:, None]
+    noise = _noise(flat, value, level, notes)
+    nu = _nu(flat, value, noise or 0.0)
+    if nu is not None and nu < STRUCTURED:
+        notes.append(f"a speckle_nu of {nu:g} is more than a bottom's texture: objects and edges of the scene count in it")
+    leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL, sonar))) / _lobe_sum(sonar)
+    fitted: dict[str, Any] = {
+        "stripes_db": round(statistics.beam_stripes_db(level), 2),
+        "crosstalk_db": round(float(np.clip(10 * math.log10(leak), -120, 0)), 1) if leak > 0 else None,
+        "speckle_nu": nu,
+    }
+    if noise is not None:
+        fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + _full_scale_db(frames, sonar, flat, notes), 1)
+    middle = float(gain_of(sonar)[len(frames.range_m) // 2])
+    return SonarFit(
+        sonar=sonar.replace(**fitted),
+        noise_db=None if noise is None else float(10 * math.log10(noise * middle)),
+        bright_db=float(np.percentile(level[:, statistics.GLOW_BINS :], 99.9)),
+        speckle_span_db=span,
+        speckle_gamma=gamma,
+        glow_db=statistics.near_glow_db(level),
+        notes=notes,
+    )
+
+
+def _check(frames: SonarFrames) -> None:
+    """Refuse frames that tell nothing."""
+    shape = frames.image.shape
+    if len(frames) == 0 or shape[1] < LEAST_SHAPE[0] or shape[2] < LEAST_SHAPE[1]:
+        raise MitsonarError(
+            f"a fit needs at least one frame of {LEAST_SHAPE[0]} bins x {LEAST_SHAPE[1]} beams: got "
+            f"{shape[0]} of {shape[1]} x {shape[2]}; record a longer or wider window"
+        )
+    if not np.ptp(frames.image):
+        raise MitsonarError("a fit needs frames that vary: all cells have one value; give frames with echoes")
+
+
+# ---------------------------------------------------------------- coding
+
+
+def _mode(values: Array) -> float:
+    """Return the half-sample mode: where values lie most densely, whatever their tails."""
+    values = np.sort(values)
+    while len(values) > 3:
+        half = (len(values) + 1) // 2
+        start = int(np.argmin(values[half - 1 :] - values[: len(values) - half + 1]))
+        values = values[start : start + half]
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _grain_windows(value: Array) -> tuple[Array, Array]:
+    """Return windows and their detrended values ``(windows, cells)`` from which a coding is measured.
+
+    These are the darkest ones in which hardly a cell has the least or the largest value: noise has grain of one law, which
+    texture of the bottom does not change.
+    """
+    parts, rest = (statistics.window_values(one) for one in (value, statistics.detrended(value)))
+    inside = ((parts > 0) & (parts < FULL)).mean(axis=1) > 1 - MOST_CLIPPED
+    if inside.sum() >= LEAST_WINDOWS:
+        parts, rest = parts[inside], rest[inside]
+    mean = parts.mean(axis=1)
+    dark = mean <= max(np.percentile(mean, GRAIN_PART), np.sort(mean)[min(LEAST_WINDOWS, len(mean)) - 1])
+    return parts[dark], rest[dark]
+
+
+def _span(value: Array) -> float:
+    """Return the span of the coding dB for which the grain of dark windows has 5.57 dB."""
+    rest = _grain_windows(value)[1]
+    return float(statistics.RAYLEIGH_DB / max(_mode(rest.std(axis=1, ddof=1)), 1e-3))
+
+
+def _variation(gamma: float) -> float:
+    """Return the coefficient of variation of amplitude^gamma of exponential intensities; 0.2805 for 0.5."""
+    return math.sqrt(special.gamma(1 + gamma) / special.gamma(1 + gamma / 2) ** 2 - 1)
+
+
+def _gamma(value: Array) -> float:
+    """Return the gamma whose coefficient of variation dark windows have; 2 is linear."""
+    parts = _grain_windows(value)[0]
+    mean = parts.mean(axis=1)
+    found = _mode(parts.std(axis=1, ddof=1)[mean > 0] / mean[mean > 0])
+    low, high = 0.05, 4.0
+    if not _variation(low) < found < _variation(high):
+        return low if found <= _variation(low) else high
+    return float(optimize.brentq(lambda gamma: _variation(gamma) - found, low, high))
+
+
+def _with_coding(sonar: Sonar, span: float | None, gamma: float | None, measure: bool, notes: list[str]) -> Sonar:
+    """Return the sonar with the coding that was measured, or a note where it is another than the stated one."""
+    if span is not None:
+        stated, found, changed = sonar.coding_db, span, {"coding": "dB", "coding_db": round(span, 1)}
+    else:
+        assert gamma is not None
+        stated = sonar.coding_gamma if sonar.value_coding == "gamma" else 2.0
+        found, changed = gamma, {"coding": "gamma", "coding_gamma": round(gamma, 2)}
+    if measure:
+        return sonar.replace(**changed)
+    if abs(math.log(found / stated)) > 0.15:
+        notes.append(
+            f"the grain says {found:.3g} where the frames state {stated:g}: several looks, compression, or another coding "
+            "(--measure-coding takes the grain's)"
+        )
+    return sonar
+
+
+# ---------------------------------------------------------------- levels
+
+
+def _noise(flat: Array, value: Array, level: Array, notes: list[str]) -> float | None:
+    """Return the mean intensity of the darkest windows, if it can be noise: not below the coding, and new in each frame."""
+    beyond = slice(statistics.GLOW_BINS, None)
+    parts = statistics.window_values(flat[:, beyond])
+    mean = parts.mean(axis=1)
+    dark = mean <= np.percentile(mean, DARKEST) * WITHIN
+    empty = statistics.window_values(value[:, beyond] <= 0)[dark].mean()
+    if empty > 0.2:
+        notes.append("the noise is below the least level of the coding: noise_level_db is left out")
+        return None
+    if len(level) > 1 and (still := float(statistics.correlation_by_level(level)[1][0])) > STILL:
+        notes.append(
+            f"the darkest tenth correlates by {still:.2f} from frame to frame, so it is no noise: noise_level_db is left out"
+        )
+        return None
+    return float(np.median(mean[dark]))
+
+
+def _full_scale_db(frames: SonarFrames, sonar: Sonar, flat: Array, notes: list[str]) -> float:
+    """Return the level that full scale stands for [dB re 1 uPa, or relative to the source], without the gain over range.
+
+    Recordings without a scale get one: their brightest thousandth is taken for a face of reflectivity 0.5 at 45 deg.
+    """
+    if frames.level_scale != 1.0:
+        return float(10 * np.log10(frames.level_scale)) + sonar.source_level_db
+    flat = flat[:, statistics.GLOW_BINS :]
+    bright = np.percentile(flat, 99.9)
+    at = np.nonzero(flat >= bright)[1] + statistics.GLOW_BINS
+    range_m = float(np.median(sonar.range_m[at]))
+    face = FACE * SLANT * sonar.beam_width_rad * sonar.bin_m / range_m**3 * math.log(1000)
+    lost = -float(10 * np.log10(np.interp(range_m, sonar.range_m, loss_of(sonar))))
+    notes.append(
+        f"levels have no scale: noise_level_db takes the brightest thousandth, at {range_m:.3g} m, for a face "
+        f"of reflectivity {FACE:g} at 45 deg"
+    )
+    return float(10 * np.log10(face / bright)) - lost + sonar.source_level_db
+
+
+def _nu(flat: Array, value: Array, noise: float) -> float | None:
+    """Return the shape of the K law in bright, flat windows; None where intensities are exponential or nothing is bright.
+
+    Of a K law with noise N and signal S the mean square is 2 (S + N)^2 (1 + (S / (S + N))^2 / nu).
+    """
+    smooth = ndimage.uniform_filter1d(flat.mean(axis=(0, 2)), statistics.WINDOW[0], mode="nearest")
+    parts, levels = (statistics.window_values(one, FLAT_WINDOW) for one in (flat / smooth[:, None], flat))
+    clipped = statistics.window_values(value >= FULL, FLAT_WINDOW).mean(axis=1)
+    mean = levels.mean(axis=1)
+    kept = (mean > (1 + FLAT_ABOVE) * noise) & (clipped <= MOST_CLIPPED) & (mean > 0)
+    if not kept.any():
+        return None
+    excess = (parts[kept] ** 2).mean(axis=1) / (2 * parts[kept].mean(axis=1) ** 2) - 1
+    found = float(np.median(excess * (mean[kept] / (mean[kept] - noise)) ** 2))
+    return None if found < NEAR_RAYLEIGH else round(float(np.clip(1 / found, 0.1, 100)), 2)
+
+
+def _lobe_sum(sonar: Sonar) -> float:
+    """Return the power of the sum over beams over the sum of their powers, for a point and for speckle.
+
+    It is the squared integral of the pattern over that of its square, in beams.
+    """
+    spacing = float(np.diff(np.sin(sonar.bearing_rad)).mean())
+    u = np.linspace(-40, 40, 400_001) / sonar.aperture.length
+    return float(np.trapezoid(sonar.aperture.pattern(u), u) ** 2 / sonar.aperture.equivalent_width / spacing)

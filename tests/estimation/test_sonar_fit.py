@@ -1,0 +1,149 @@
+"""A sonar is fitted to what a simulated one recorded: what was put in must come out."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import Array, Command, diffuse, floor, refused, scene, sphere
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.sonar_fit import fit_sonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.records.sonar_frames import SonarFrames
+
+PLAIN = Sonar.create(model="coherent", frequency_hz=1.8e6, range_min=1.4, range_max=5.6, bearing="cone", gain_exponent=2,
+                     beam_width_deg=0.3, absorption_db_per_m=0.0)  # fmt: skip
+
+FITTED = {"noise_level_db": None, "stripes_db": 0.0, "crosstalk_db": None, "speckle_nu": None}
+
+
+@pytest.fixture(scope="module")
+def recordings(variant: str) -> dict[str, SonarFrames]:
+    """Six frames over a floor behind a buoy, black water before it; the sonar that frames state is plain."""
+    import warnings
+
+    from mitsonar.errors import MitsonarWarning
+    from mitsonar.simulation.imaging import Simulator
+
+    loaded = scene(floor=floor(diffuse(0.3)), buoy=sphere((0.15, 1.75, 1.27), 0.06, diffuse(1.0)))
+    poses = np.array([0, 0, 2.5, math.radians(35), 0, 0]) + np.arange(6)[:, None] * np.array([0.06, 0.02, 0, 0, 0, 0])
+    made = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MitsonarWarning)
+        for name, fields in TRUE.items():
+            frames = Simulator(loaded, PLAIN.replace(**fields)).render(poses)
+            frames.sonar = frames.sonar.replace(**FITTED)
+            made[name] = frames
+    return made
+
+
+TRUE: dict[str, dict[str, Any]] = {
+    "dB": {"noise_level_db": -98.0, "stripes_db": 0.5, "crosstalk_db": -45.0, "speckle_nu": 2.0},
+    "70 dB": {"noise_level_db": -102.0, "stripes_db": 1.0, "crosstalk_db": -50.0, "speckle_nu": 1.0, "coding_db": 70.0},
+    "gamma": {"noise_level_db": -95.0, "stripes_db": 0.3, "coding": "gamma", "coding_gamma": 0.5},
+    "linear": {"noise_level_db": -98.0, "coding": "linear", "absorption_db_per_m": 0.5, "gain_absorption": True},
+}
+
+
+def stripes(sonar: Sonar, spread: float) -> float:
+    """The spread that the gains drawn from the seed do have."""
+    return float(np.random.default_rng([sonar.seed, 0x57121]).normal(0, spread, sonar.beams).std())
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str) -> None:
+    found, true = fit_sonar(recordings[name]), TRUE[name]
+    sonar = found.sonar
+    assert sonar.noise_level_db == pytest.approx(true["noise_level_db"], abs=1.0)
+    assert sonar.stripes_db == pytest.approx(stripes(sonar, true.get("stripes_db", 0.0)), abs=0.15)
+    if "crosstalk_db" in true:
+        assert sonar.crosstalk_db == pytest.approx(true["crosstalk_db"], abs=3.0)
+    else:
+        assert sonar.crosstalk_db is None
+    if "speckle_nu" in true:
+        assert sonar.speckle_nu == pytest.approx(true["speckle_nu"], rel=0.3)
+    else:
+        assert sonar.speckle_nu is None or sonar.speckle_nu > 20
+    assert np.abs(found.glow_db[2:]).max() < 4
+    assert found.bright_db == pytest.approx(10 * math.log10(0.9), abs=0.5)
+    assert found.noise_db is not None
+    assert -50 < found.noise_db < -25
+    assert found.notes == []
+
+
+def test_the_grain_tells_the_coding(recordings: dict[str, SonarFrames]) -> None:
+    """Frames that state another coding than theirs."""
+    frames = recordings["70 dB"].select(slice(None))
+    frames.sonar = frames.sonar.replace(coding_db=90.0)
+    stated, measured = fit_sonar(frames), fit_sonar(frames, measure_coding=True)
+    assert stated.sonar.coding_db == 90
+    assert "where the frames state 90" in stated.notes[0]
+    assert measured.sonar.coding_db == pytest.approx(70, rel=0.08)
+    gamma = recordings["gamma"].select(slice(None))
+    gamma.sonar = gamma.sonar.replace(coding_gamma=1.0)
+    assert fit_sonar(gamma, measure_coding=True).sonar.coding_gamma == pytest.approx(0.5, abs=0.05)
+    assert fit_sonar(recordings["linear"]).speckle_gamma == pytest.approx(2, abs=0.15)
+
+
+def test_eight_bit_and_a_named_sonar_do(recordings: dict[str, SonarFrames]) -> None:
+    """Counts of uint8; what the frames do not tell comes from the preset, the window from the frames."""
+    frames = recordings["dB"].select(slice(None))
+    frames.image = np.rint(frames.image * 255).astype(np.uint8)
+    found = fit_sonar(frames, load_sonar("aris3000"), frequency_hz=3e6, beam_width_deg=0.3)
+    assert found.sonar.frequency_hz == 3e6
+    assert (found.sonar.beams, found.sonar.range_min, found.sonar.name) == (96, 1.4, "aris3000")
+    assert found.sonar.noise_level_db == pytest.approx(-98, abs=1.0)
+
+
+def test_a_recording_without_scale_gets_one(recordings: dict[str, SonarFrames]) -> None:
+    frames = recordings["dB"].select(slice(None))
+    frames.level_scale = 1.0
+    found = fit_sonar(frames)
+    assert "levels have no scale" in found.notes[0]
+    assert found.sonar.noise_level_db == pytest.approx(-98, abs=15)  # a reflectivity is assumed
+
+
+def test_noise_that_does_not_show_is_not_invented(recordings: dict[str, SonarFrames]) -> None:
+    frames = recordings["dB"].select(slice(None))
+    still = frames.select(np.zeros(3, dtype=int))
+    assert "it is no noise" in fit_sonar(still).notes[0]
+    assert fit_sonar(still).sonar.noise_level_db is None
+    frames.image = np.where(frames.image < 0.6, 0, frames.image).astype(np.float32)
+    assert any("below the least level" in note for note in fit_sonar(frames).notes)
+
+
+def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> SonarFrames:
+    sonar = Sonar.create(beams=beams, range_bins=bins)
+    image = np.zeros((2, bins, beams), np.float32) + np.float32(value)
+    return SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
+
+
+def test_frames_that_tell_nothing_are_refused() -> None:
+    with pytest.raises(MitsonarError, match="at least one frame of 96 bins x 16 beams: got 2 of 64 x 32"):
+        fit_sonar(blank(bins=64))
+    with pytest.raises(MitsonarError, match="all cells have one value"):
+        fit_sonar(blank())
+    varied = np.random.default_rng(0).exponential(0.05, (2, 128, 32)).clip(0, 1)
+    with pytest.raises(MitsonarError, match="needs the carrier: give frequency_hz"):
+        fit_sonar(blank(value=varied))
+
+
+def test_the_command_writes_what_the_simulator_reads(
+    recordings: dict[str, SonarFrames], mitsonar: Command, tmp_path: Path
+) -> None:
+    recordings["dB"].save(tmp_path / "frames.npz")
+    done = mitsonar("sonar", "fit", tmp_path / "frames.npz", "-o", tmp_path / "mine.yaml", "--set", "focus_m=4")
+    assert done.returncode == 0, done.stderr
+    assert "crosstalk_db" in done.stdout
+    assert "--sonar" in done.stdout
+    read = load_sonar(tmp_path / "mine.yaml")
+    assert read == fit_sonar(recordings["dB"], focus_m=4).sonar.replace(name=read.name)
+    refused(mitsonar("sonar", "fit", tmp_path / "frames.npz", "-o", tmp_path / "mine.yaml"), "exists", "--overwrite")
+    refused(mitsonar("sonar", "fit", tmp_path / "none.npz", "-o", tmp_path / "x.yaml"), "there are no frames at")
+    blank().save(tmp_path / "flat.npz")
+    refused(mitsonar("sonar", "fit", tmp_path / "flat.npz", "-o", tmp_path / "x.yaml"), "all cells have one value")
