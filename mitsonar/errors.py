@@ -42,6 +42,9 @@ EXTRAS = {
 }
 """Optional packages: the extra that installs each, and what needs it."""
 
+LONGEST_KEY = 60
+"""Letters of a key in a message; those of a stranger's file may be of any length."""
+
 MARK = "\x1f"
 """Marks the begin and the end of an argument's name in a message; never shown."""
 
@@ -119,7 +122,7 @@ def complaint(error: ValidationError, model: type[BaseModel], what: str, see: st
     """
     first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")  # a mistyped key explains a missing one
     where = [str(part) for part in first["loc"]]
-    key = ".".join(where)
+    key = ".".join(part if len(part) <= LONGEST_KEY else f"{part[:LONGEST_KEY]}..." for part in where)
     if first["type"] == "extra_forbidden":
         known = _fields_of(model, where[:-1]) or model.model_fields
         return f"unknown {what} key {key}: {nearest_names(where[-1], known)}"

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.special import ndtr
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, meant, nearest_names, shortened
+from mitsonar.errors import MitsonarError, complaint, meant, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_yaml
 
@@ -351,12 +351,12 @@ def load_noise(text: str) -> NoiseModel:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise MitsonarError(f"unknown noise key {key}: {nearest_names(key, NoiseModel.model_fields)}") from None
+            raise MitsonarError(complaint(error, NoiseModel, "noise")) from None
         raise MitsonarError(f"noise {key} must be a fraction 0..1 of the maximum: got {shortened(first['input'])}") from None
     except (ValueError, TypeError) as error:
         if isinstance(error, MitsonarError):
             raise
         raise MitsonarError(
-            f"noise must be {', '.join(NOISE_MODELS)}, three fractions mean,std,scale, or a YAML file: got {text!r}"
+            f"noise must be {', '.join(NOISE_MODELS)}, three fractions mean,std,scale, or a YAML file: got {shortened(text)}"
             f"{meant(text, NOISE_MODELS)}"
         ) from None

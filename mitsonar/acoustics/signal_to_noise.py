@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 
 __all__ = ["snr_of", "snr_said"]
 
@@ -17,7 +17,9 @@ def snr_of(text: str) -> float | None:
     """
     found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d+)?)\s*dB\s*", text)
     if text != "none" and not found:
-        raise MitsonarError(f"noise of impulse responses is a signal to noise ratio such as '20 dB', or none: got {text!r}")
+        raise MitsonarError(
+            f"noise of impulse responses is a signal to noise ratio such as '20 dB', or none: got {shortened(text)}"
+        )
     return float(found[1]) if found else None
 
 

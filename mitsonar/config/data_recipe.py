@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, complaint, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
@@ -77,7 +77,7 @@ RESERVED = ("frames", "label")
 
 def _fits_name(name: str) -> str:
     if not name.isidentifier():
-        raise ValueError(f"a name is letters, digits and _ : got {name!r}")
+        raise ValueError(f"a name is letters, digits and _ : got {shortened(name)}")
     if name in RESERVED or name.startswith("nonzero"):
         raise ValueError(f"{name} means something else in a data set: choose another name")
     return name
@@ -219,7 +219,8 @@ class Recipe(_Part):
             MitsonarError: keys contradict each other.
         """
         if len({view.name for view in self.views}) < len(self.views):
-            raise MitsonarError(f"receivers and segments must have names of their own: got {[v.name for v in self.views]}")
+            names = shortened([view.name for view in self.views])
+            raise MitsonarError(f"receivers and segments must have names of their own: got {names}")
         if len({(view.sonar.range_min, view.sonar.range_max, view.sonar.range_bins) for view in self.views}) > 1:
             raise MitsonarError("all receivers must have the same window: range_min, range_max and range_bins")
         if self.labels and self.store == "vectors":

@@ -15,7 +15,7 @@ from mitsonar.acoustics.noise import load_noise
 from mitsonar.acoustics.signal_to_noise import snr_of
 from mitsonar.config.data_recipe import Split, split_from
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError, complaint, shortened
 
 __all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
 
@@ -215,7 +215,7 @@ class TrainingRecipe(_Part):
         for level in {*self.noises, *self.validate_.noise} - {"none"}:
             if level.endswith("dB") != decibels:
                 allowed = "a signal to noise ratio such as '20 dB'" if decibels else "low, high, chapter2 or mean,std,scale"
-                raise ValueError(f"noise of input.kind {self.input.kind} is {allowed}, or none: got {level!r}")
+                raise ValueError(f"noise of input.kind {self.input.kind} is {allowed}, or none: got {shortened(level)}")
         if self.augment and not self.input.ground:
             raise ValueError("augment is for inputs with ground: set input.ground: true, or leave augment out")
         if isinstance(self.split, dict):

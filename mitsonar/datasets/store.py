@@ -19,7 +19,7 @@ from mitsonar.datasets.modality import Fields, Modality, Values
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.datasets.store_arrays import SEAL, ShardLayout, create_arrays, planned_arrays, write_planned
 from mitsonar.datasets.store_attributes import check_attributes
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.io.plain_data import check_plain
 from mitsonar.io.provenance import other_versions
 from mitsonar.io.storage import Storage
@@ -119,7 +119,7 @@ class DataStore:
             raise MitsonarError(f"{storage.url} is a Zarr group but no data set of mitsonar")
         if known != FORMAT:
             raise MitsonarError(
-                f"{storage.url} has format {known}, this mitsonar reads {FORMAT}: use the version that made it"
+                f"{storage.url} has format {shortened(known)}, this mitsonar reads {FORMAT}: use the version that made it"
             )
         try:
             store = cls(storage, group)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsonar.arrays import AnyArray
+from mitsonar.errors import shortened
 from mitsonar.instruments.imaging_sonar import FieldValue, Instrument
 
 __all__ = [
@@ -115,9 +116,9 @@ class Hydrophone(BaseModel):
     @model_validator(mode="after")
     def _near(self) -> Self:
         if not (np.isfinite(self.position).all() and math.dist(self.position, (0, 0, 0)) <= 100):
-            raise ValueError(f"receiver {self.name}: position must be finite and within 100 m: got {self.position}")
+            raise ValueError(f"receiver {self.name[:40]}: position must be finite and within 100 m: got {self.position}")
         if not self.name.isidentifier():
-            raise ValueError(f"a receiver's name is letters, digits and _ : got {self.name!r}")
+            raise ValueError(f"a receiver's name is letters, digits and _ : got {shortened(self.name)}")
         return self
 
 

@@ -23,7 +23,7 @@ from typing import Annotated, Literal, NamedTuple
 import yaml
 from pydantic import BeforeValidator
 
-from mitsonar.errors import nearest_names
+from mitsonar.errors import nearest_names, shortened
 
 __all__ = ["FAR_GRAZING_RAD", "QUALITIES", "Measured", "Quality", "measured_errors", "rays_across", "rays_over_elevation"]
 
@@ -60,7 +60,7 @@ QUALITIES: dict[str, RayCounts] = {
 
 def _known(name: object) -> object:
     if not isinstance(name, str) or name not in QUALITIES:
-        raise ValueError(f"unknown quality {name!r}: {nearest_names(str(name)[:40], QUALITIES)}")
+        raise ValueError(f"unknown quality {shortened(name)}: {nearest_names(str(name)[:40], QUALITIES)}")
     return name
 
 

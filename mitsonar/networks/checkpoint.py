@@ -125,7 +125,7 @@ class Checkpoint:
         Raises:
             MitsonarError: an unknown network or option, or weights that do not fit it.
         """
-        written = f"the checkpoint was written by mitsonar {self.version}, this is {version('mitsonar')}"
+        written = f"the checkpoint was written by mitsonar {self.version[:40]}, this is {version('mitsonar')}"
         self._check_fit(written)
         with torch.random.fork_rng(devices=[]):
             try:
@@ -133,12 +133,15 @@ class Checkpoint:
             except MitsonarError as error:
                 raise MitsonarError(f"{error} ({written})") from None
             except Exception as error:  # wrong options may raise anything
-                raise MitsonarError(f"no {self.network} has these options, {self.options}: {first_line(error)}") from None
+                raise MitsonarError(
+                    f"no {self.network} has these options, {shortened(self.options)}: {first_line(error)}"
+                ) from None
         try:
             network.load_state_dict(self.weights)
         except RuntimeError as error:
             raise MitsonarError(
-                f"the weights do not fit a {self.network} with options {self.options}: {_mismatch(error)} ({written})"
+                f"the weights do not fit a {self.network} with options {shortened(self.options)}: "
+                f"{_mismatch(error)} ({written})"
             ) from None
         return network.eval().requires_grad_(False)
 
@@ -325,9 +328,9 @@ class Checkpoint:
             raise MitsonarError(f"{source} is not a checkpoint of mitsonar, it holds {held}: give a {FILE}")
         if table.get("format") != FORMAT:
             raise MitsonarError(
-                f"{source} is a checkpoint of format {table.get('format')!r}, written by mitsonar {table.get('version')}; "
-                f"this is mitsonar {version('mitsonar')}, which reads format {FORMAT}: use the version that wrote it, or "
-                "train again"
+                f"{source} is a checkpoint of format {shortened(table.get('format'))}, written by mitsonar "
+                f"{str(table.get('version'))[:40]}; this is mitsonar {version('mitsonar')}, which reads format {FORMAT}: "
+                "use the version that wrote it, or train again"
             )
         names = [one.name for one in fields(cls)]
         faults = faults_of({key: value for key, value in table.items() if key != "kind"}, names)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mitsonar.datasets.arrangement import LABELS, Coordinates, Layout
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.plain_data import check_plain
@@ -42,6 +42,10 @@ LATER: dict[str, type | tuple[type, ...]] = {"range_levels": (int, type(None)), 
 
 LARGEST = 8 * 2**30
 """Largest size of a checkpoint that is unpacked [bytes]."""
+
+
+LONGEST_NAME = 80
+"""Letters of a name in a message; those of a stranger's file may be of any length."""
 
 
 def unpacked(content: bytes, source: str) -> Table:
@@ -86,7 +90,7 @@ def faults_of(table: Table, names: Collection[str]) -> list[str]:
         names: of the fields that a checkpoint has.
     """
     found = [f"it lacks {name}" for name in sorted(set(names) - set(table))]
-    found += [f"{key!r} is unknown" for key in table if key not in names]
+    found += [f"{shortened(key)} is unknown" for key in table if key not in names]
     if found:
         return found
     try:
@@ -114,11 +118,11 @@ def faults_of(table: Table, names: Collection[str]) -> list[str]:
 def _faults_of_weights(name: str, values: object) -> list[str]:
     """Check one of the weights."""
     if not isinstance(values, Tensor):
-        return [f"weights {name} are not numbers"]
+        return [f"weights {name[:LONGEST_NAME]} are not numbers"]
     if not _stored_whole(values):
-        return [f"weights {name} promise more numbers than the file holds"]
+        return [f"weights {name[:LONGEST_NAME]} promise more numbers than the file holds"]
     if not torch.isfinite(values).all():
-        return [f"weights {name} hold nan or inf"]
+        return [f"weights {name[:LONGEST_NAME]} hold nan or inf"]
     return []
 
 
@@ -130,7 +134,9 @@ def _faults_of_types(words: Fields) -> list[str]:
         if not isinstance(words.get(word), kind)
     ]
     known = {**WORDS, **LATER}
-    found += [f"arrangement {word} is unknown ({nearest_names(word, known)})" for word in words if word not in known]
+    found += [
+        f"arrangement {word[:LONGEST_NAME]} is unknown ({nearest_names(word, known)})" for word in words if word not in known
+    ]
     later = [word for word in LATER if word in words]
     return found + [
         f"arrangement {word} is missing or of another type" for word in later if not isinstance(words[word], LATER[word])
@@ -169,7 +175,7 @@ def _faults_of_labels(labels: Fields) -> list[str]:
     """Check kind, names and limits of the labels."""
     ends, names = [labels.get("low"), labels.get("high")], labels.get("names")
     if labels.get("kind") not in LABELS:
-        return [f"labels are {labels.get('kind')!r}, not one of {', '.join(LABELS)}"]
+        return [f"labels are {shortened(labels.get('kind'))}, not one of {', '.join(LABELS)}"]
     if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
         return ["labels have no names"]
     if not all(are_numbers(end, len(names)) for end in ends):
@@ -183,11 +189,11 @@ def _faults_of_sonar(sonar: Fields, trained_at: Fields, receives: bool) -> list[
         return ["sonar has no channel"]
     for view, own in sonar.items():
         if not isinstance(own, dict):
-            return [f"sonar {view} is not a table"]
+            return [f"sonar {view[:LONGEST_NAME]} is not a table"]
         try:
             (ChannelSonar if receives else Sonar).create(**own)
         except (MitsonarError, TypeError) as error:
-            return [f"sonar {view}: {error}"]
+            return [f"sonar {view[:LONGEST_NAME]}: {error}"]
     angles = [trained_at.get("pitch_deg"), trained_at.get("roll_deg")]
     if not (are_numbers(trained_at.get("height_m"), 2) and are_numbers(angles, 2)):
         return ["trained_at must hold height_m (low, high), pitch_deg and roll_deg"]
@@ -202,5 +208,5 @@ def are_numbers(values: object, count: int) -> TypeGuard[list[float]]:
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of an error's message, or its class."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    """Return the first line of an error's message, cut where it is long, or its class."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:300]

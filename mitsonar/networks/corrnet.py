@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.matching import Matching, channels_last, quiet
 from mitsonar.networks.slopes import STEP, Slopes
@@ -70,7 +70,8 @@ class CorrNet(nn.Module):
         counts = all(isinstance(count, int) and count >= 1 for count in (looks, finer))
         if not isinstance(width, int | float) or not 0 < width < math.inf or not counts:
             raise MitsonarError(
-                f"corrnet takes a width above 0, looks and finer of at least 1: got {width!r}, {looks!r} and {finer!r}"
+                f"corrnet takes a width above 0, looks and finer of at least 1: got {shortened(width)}, {shortened(looks)} "
+                f"and {shortened(finer)}"
             )
         self.options: Fields = {"width": width, "looks": looks, "finer": finer, "relief": relief}
         first, second, channels, hidden, filters = (max(2, round(width * count)) for count in (12, 24, 16, 16, 6))

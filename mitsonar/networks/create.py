@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mitsonar.datasets.batches import Inputs
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.networks.cnn1b import Cnn1b
 from mitsonar.networks.cnn4b import Cnn4b
 from mitsonar.networks.cnn4posenet import Cnn4PoseNet
@@ -56,7 +56,7 @@ def create_network(name: str, **options: object) -> nn.Module:
     known = options_of(name)
     for option in options:
         if option not in known:
-            raise MitsonarError(f"unknown option {option!r} of {name}: {nearest_names(option, known)}")
+            raise MitsonarError(f"unknown option {shortened(option)} of {name}: {nearest_names(option, known)}")
     network: nn.Module = NETWORKS[name](**options)
     return network
 
@@ -73,7 +73,7 @@ def options_of(name: str) -> list[str]:
         MitsonarError: unknown name.
     """
     if name not in NETWORKS:
-        raise MitsonarError(f"unknown network {name!r}: {nearest_names(str(name), NETWORKS)}")
+        raise MitsonarError(f"unknown network {shortened(name)}: {nearest_names(str(name), NETWORKS)}")
     return list(inspect.signature(NETWORKS[name]).parameters)
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mitsonar.datasets.modality import Fields
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.networks.blocks import Network, SameAverage, Size, column_convolutions, glorot, scaled
 
 __all__ = ["CHANNELS", "KERNELS", "LAYERS", "ImpulsePoseNet"]
@@ -58,11 +58,11 @@ class ImpulsePoseNet(Network):
     ) -> None:
         super().__init__(outputs=outputs, width=width, dropout=dropout, size=size)
         if not isinstance(layers, int) or not LAYERS[0] <= layers <= LAYERS[1]:
-            raise MitsonarError(f"layers must be {LAYERS[0]} to {LAYERS[1]}, as in table 5.2: got {layers!r}")
+            raise MitsonarError(f"layers must be {LAYERS[0]} to {LAYERS[1]}, as in table 5.2: got {shortened(layers)}")
         if not isinstance(receivers, int) or receivers < 1 or size[1] % (2 * receivers):
             raise MitsonarError(
-                f"size {list(size)} must have real and imaginary columns for each receiver: got receivers {receivers!r}; "
-                "leave out receivers and size, which the data define"
+                f"size {list(size)} must have real and imaginary columns for each receiver: got receivers "
+                f"{shortened(receivers)}; leave out receivers and size, which the data define"
             )
         self.options |= {"layers": layers, "receivers": receivers}
         self.nets = nn.ModuleList(_pose_net(layers, width, dropout) for _ in range(receivers))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.coding import decoded
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_npz, refuse_beyond_memory
 from mitsonar.records.columns import Column, check_column, number_of, open_group, table_in, text_of
@@ -91,7 +91,7 @@ class SonarFrames:
                 f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
             )
         if self.level not in ("linear", "dB", "gamma"):
-            raise MitsonarError(f"level must be linear, dB or gamma: got {self.level!r}")
+            raise MitsonarError(f"level must be linear, dB or gamma: got {shortened(self.level)}")
         for name in PER_FRAME:
             values = getattr(self, name)
             if values is not None and len(values) != frames:

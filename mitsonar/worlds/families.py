@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import ValidationError
 
-from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.errors import MitsonarError, complaint, nearest_names, shortened
 from mitsonar.worlds.flat_objects import FlatObjects
 from mitsonar.worlds.pattern import Pattern
 from mitsonar.worlds.rocky_field import RockyField
@@ -37,7 +37,7 @@ def create_family(name: str, **fields: object) -> Family:
     """
     known: dict[str, type[Family]] = {**FAMILIES, "scene": SceneFile}
     if name not in known:
-        raise MitsonarError(f"unknown world {name!r}: {nearest_names(name, known)}")
+        raise MitsonarError(f"unknown world {shortened(name)}: {nearest_names(name, known)}")
     family = known[name]
     try:
         return family(**fields)

@@ -640,6 +640,8 @@ HOSTILE_YAML = {
     "an empty integer": "beams: !!int ''",
     "a date that cannot be": "beams: 2001-99-99",
     "keys of numbers": "1: 2",
+    "a key of 900 letters": "x" * 900 + ": 1",
+    "a key of 5,000 letters": "? " + "x" * 5000 + "\n: 1",
     "a byte of 0": "beams: \0",
     "large": "name: " + "x" * 2**21,
     "nan": "range_min: .nan",
@@ -680,6 +682,41 @@ def test_values_of_a_recipe_that_cannot_be(key: str, value: Any) -> None:
     fields = copy.deepcopy(TINY)
     set_key(fields, key, value)
     assert len(refusal(lambda: recipe_from(fields))) < 1000
+
+
+LONG = "long" * 2000
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("world.family", LONG), ("receivers", [{"name": f"{LONG} "}]), ("segments", [LONG]), ("sonar.quality", LONG)),
+        *((f"sonar.{LONG}", 1), (f"flight.{LONG}", 1), (f"world.{LONG}", 1), ("sonar.preset", LONG)),
+    ],
+    ids=lambda value: shortened(value)[:20],
+)
+def test_long_words_of_a_recipe_are_cut(key: str, value: Any) -> None:
+    """A refusal repeated a stranger's word whole."""
+    import copy
+
+    from mitsonar.config.data_recipe import recipe_from
+    from mitsonar.config.recipe_keys import set_key
+
+    fields = copy.deepcopy(TINY)
+    set_key(fields, key, value)
+    assert len(refusal(lambda: recipe_from(fields))) < 1000
+
+
+def test_long_words_of_frames_and_data_sets_are_cut(spoilt: Path, tmp_path: Path) -> None:
+    from mitsonar.datasets.store import DataStore
+
+    path = tmp_path / "frames.npz"
+    frames().save(path)
+    with np.load(path) as table:
+        path.write_bytes(npz({**table, "level": np.array(LONG)}))
+    assert len(refusal(lambda: SonarFrames.load(path))) < 1000
+    set_attributes(spoilt, format=LONG)
+    assert len(refusal(lambda: DataStore.open(spoilt))) < 1000
 
 
 def test_aliases_that_help_are_read(tmp_path: Path) -> None:

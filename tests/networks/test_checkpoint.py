@@ -209,6 +209,30 @@ def test_fields_are_checked(checkpoint: Checkpoint, change: dict[str, Any], word
     assert words in refusal(packed({**unpacked(checkpoint), **change}))
 
 
+@pytest.mark.parametrize("change", ["format", "version", "options", "width", "size", "labels", "sonar", "more"])
+def test_long_words_are_cut(checkpoint: Checkpoint, change: str) -> None:
+    """A refusal repeated a stranger's word whole."""
+    long, table = "long" * 2000, unpacked(checkpoint)
+    match change:
+        case "format":
+            table |= {"format": long, "version": long}
+        case "version":
+            table |= {"version": long, "options": {**table["options"], "width": -1}}
+        case "options":
+            table["options"] = {**table["options"], long: 1}
+        case "width" | "size":
+            table["options"] = {**table["options"], change: long}
+        case "labels":
+            table["labels"] = {**table["labels"], "kind": long}
+        case "sonar":
+            table["sonar"] = {long: 1}
+        case _:
+            table[long] = 1
+    with pytest.raises(MitsonarError) as caught:
+        Checkpoint.from_bytes(packed(table)).build()
+    assert len(str(caught.value)) < 1000
+
+
 def test_fields_that_lack(checkpoint: Checkpoint) -> None:
     table = unpacked(checkpoint)
     for name in ("weights", "labels", "data_recipe"):
