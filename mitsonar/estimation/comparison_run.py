@@ -211,9 +211,10 @@ def _key(level: str, model: NoiseModel | None) -> str:
 
 
 def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
-    """Return the bound by model of the noise, over some pairs; empty if not asked for, or for impulse responses."""
+    """Return the bound by model of the noise, over some pairs; empty if not asked for, for responses, and for speckle."""
     model, samples = bench.levels[level], bench.samples[level]
-    if not limit or model is None or isinstance(samples, ImpulseSamples):
+    speckle = modality_of(bench.first.recipe).sonar.model == "coherent"
+    if not limit or model is None or isinstance(samples, ImpulseSamples) or speckle:
         return {}
     found = kept.load_bounds(_key(level, model), limit)
     if found is None:

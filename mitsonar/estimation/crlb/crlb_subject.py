@@ -73,11 +73,25 @@ def subject_of_scene(
     Raises:
         MitsonarError: a pose over nothing.
     """
+    refuse_speckle(sonar)
     heights = np.concatenate([batch.height_m for batch in Simulator(scene, sonar).pings(poses)])
     if not np.isfinite(heights).all():
         raise MitsonarError("nothing is below the sonar at some pose: give a pose over the scene with --from")
     place = Place(scene, poses, heights)
     return Subject(sonar, lambda other: _views(other, segments), lambda: iter([place]), len(heights), gain)
+
+
+def refuse_speckle(sonar: Sonar) -> None:
+    """Refuse a sonar whose images are speckle: the bound is that of expected levels and noise of pixels.
+
+    Raises:
+        MitsonarError: the model ``coherent``.
+    """
+    if sonar.model == "coherent":
+        raise MitsonarError(
+            "the Cramer-Rao bound knows noise of pixels, not speckle: got the model coherent; give --model physical for the "
+            "bound of the expected levels"
+        )
 
 
 def subject_of_data(
@@ -99,6 +113,7 @@ def subject_of_data(
         raise MitsonarError(f"--pairs must be at least 1: got {pairs}")
     store = DataStore.open(source)
     recipe = store.recipe
+    refuse_speckle(recipe.instrument)
     scene, sequence, pose, height = (store.read(name) for name in ("scene", "sequence", "pose", "height_m"))
     part = part or recipe.split.unseen
     mine = np.flatnonzero(deal(world_of(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height))
