@@ -15,6 +15,7 @@ from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
@@ -42,7 +43,7 @@ class SceneRenderer:
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self.recipe, self.scene = recipe, scene
-        self.simulator = Simulator(loaded_world(recipe, scene), recipe.instrument, views=recipe.views)
+        self.simulator = Simulator(loaded_world(recipe, scene), instrument_in(recipe, scene), views=recipe.views)
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
@@ -95,6 +96,14 @@ class SceneRenderer:
                     values[f"nonzero{suffix}"][number] = np.count_nonzero(image, axis=1)
             for label in self.recipe.labels:
                 values[f"{label}{suffix}"][:] = pings.labels[label]
+
+
+def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
+    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it."""
+    sonar = recipe.instrument
+    if sonar.model != "coherent":
+        return sonar
+    return sonar.replace(seed=int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0]))
 
 
 def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
