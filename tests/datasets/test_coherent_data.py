@@ -17,9 +17,6 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.simulation.rendered_pings import to_image
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside|.*too few for")]
-    pytest.mark.usefixtures("variant"),
-    pytest.mark.filterwarnings("ignore:.*lie outside the window|.*too few for"),
-]
 
 SONAR = {
     **{"preset": "didson300", "beams": 16, "azimuth_fov_deg": 4.8, "range_bins": 64, "pulse_m": 0.03, "quality": "draft"},
