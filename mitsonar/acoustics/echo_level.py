@@ -7,18 +7,35 @@ reflects all has C = 1 / pi.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from mitsonar.arrays import AnyArray
 from mitsonar.instruments.imaging_sonar import Sonar
 
-if TYPE_CHECKING:
-    from mitsonar.records.echoes import Echoes
-
-__all__ = ["largest_level", "level"]
+__all__ = ["LevelParts", "largest_level", "level"]
 
 
-def level(echoes: Echoes, sonar: Sonar, where: Callable[..., AnyArray]) -> AnyArray:
+class LevelParts(Protocol):
+    """What a level is made of."""
+
+    @property
+    def reflectivity(self) -> AnyArray:
+        """Lambert's mu."""
+
+    @property
+    def cosine(self) -> AnyArray:
+        """Of the angle between ray and normal."""
+
+    @property
+    def solid_angle_sr(self) -> AnyArray:
+        """Of the ray's cell [sr]."""
+
+    @property
+    def range_m(self) -> AnyArray:
+        """To the surface [m]."""
+
+
+def level(echoes: LevelParts, sonar: Sonar, where: Callable[..., AnyArray]) -> AnyArray:
     """Compute the level of each echo, float64, by plain IEEE products: NumPy and Dr.Jit agree to the bit.
 
     ``thesis``: C L, reflectivity times cosine (Almanza-Medina, eq. 2.2).

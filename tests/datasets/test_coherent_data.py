@@ -26,12 +26,13 @@ SONAR = {
 
 def coherent_recipe() -> Recipe:
     """A few pings over two scenes of rocks."""
-    return tiny_recipe(sonar=SONAR)
+    made: Recipe = tiny_recipe(sonar=SONAR)
+    return made
 
 
 def test_workers_do_not_change_bits(tmp_path: Path) -> None:
     for workers in (1, 2):
-        make_dataset(coherent_recipe(), tmp_path / f"{workers}.zarr", workers=workers)
+        make_dataset(coherent_recipe(), str(tmp_path / f"{workers}.zarr"), workers=workers)
     one, two = (files_of(tmp_path / f"{workers}.zarr") for workers in (1, 2))
     assert one == two
     image = DataStore.open(str(tmp_path / "1.zarr")).read("image")
