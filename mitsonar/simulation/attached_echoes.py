@@ -60,7 +60,7 @@ def attached_echoes(scene: mi.Scene, sonar: Sonar, pose: list[mi.Float]) -> Atta
     rays = Rays(still, Rays.numbered(still, 1))
     fan = tracer.sensor.fan(rays.column, rays.row, mi.UInt32(0))
     ray = mi.Ray3f(mi.Point3f(*pose[:3]), turned(pose, fan.d))
-    si = scene.ray_intersect(ray)
+    si: DeviceArray = scene.ray_intersect(ray)
     valid = si.is_valid()
     cosine = dr.abs(dr.dot(si.n, ray.d))
     echoes = _Echo(_reflectivity(si, valid), cosine, fan.solid_angle, dr.select(valid, si.t, still.range_max))
