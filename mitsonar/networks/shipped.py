@@ -7,7 +7,7 @@ from pathlib import Path
 
 __all__ = ["SHIPPED", "shipped_path"]
 
-SHIPPED = ("corrnet",)
+SHIPPED = ("corrnet", "corrnet-coherent")
 """Their names. The recipe of the same name defines how each was trained."""
 
 

@@ -26,6 +26,7 @@ IMAGES = {
     "pattern-runs": 9_300,
     "rocky-field-physical": 200_000,
     "ship-hull-physical": 100_000,
+    "rocky-field-coherent": 50_000,
 }
 """Pings of the whole set, from Almanza-Medina: 3.2, 3.4.5, 3.6 and 4.2 (pairs times 5/4), 4.4.4, 4.5, 2.3."""
 
@@ -55,9 +56,9 @@ def test_shipped_recipes_hold_the_thesis_s_numbers(name: str) -> None:
         assert recipe.mount.pitch_deg == 35
         assert flight.heights == (2.5, 2.5)
         assert (sonar.range_min, sonar.range_max) == (3.2, 5.6)
-    physical = name.endswith("physical")
-    assert sonar.model == ("physical" if physical else "thesis")
-    assert (recipe.split.by == "scene") == physical
+    own = next((model for model in ("physical", "coherent") if name.endswith(model)), None)
+    assert sonar.model == (own or "thesis")
+    assert (recipe.split.by == "scene") == (own is not None)
     if physical:
         assert sonar.jittered
         assert sonar.rays_across > 1

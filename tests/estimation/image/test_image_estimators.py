@@ -44,6 +44,7 @@ ALLOWED = {
     "phase": [5.0, 2.0, 0.10],
     "flow": [8.0, 4.0, 0.25],
     "corrnet": [3.0, 1.5, 0.07],
+    "corrnet-coherent": [4.0, 2.0, 0.10],
 }
 """Errors on flat objects in mm, mm, deg. Large plates of one reflectivity, whose brightness belongs to the range and not to
 the ground, hold estimates back."""
