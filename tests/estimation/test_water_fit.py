@@ -53,7 +53,7 @@ def test_a_glow_far_out_keeps_its_height_where_it_is_seen() -> None:
     """A line of more than 120 dB at range 0 is laid through the middle of what is seen."""
     from mitsonar.estimation.water_fit import near_glow
 
-    at: Array = 2 + 0.01 * np.arange(400)
+    at: Array = np.linspace(2, 5.99, 400)
     excess: Array = np.maximum(0, 60 - 200 * (at - 2))
     found = near_glow(np.broadcast_to(10 ** (excess / 10)[None, :, None] * math.log(2), (1, 400, 8)), 1.0, at)
     assert found is not None
@@ -65,7 +65,7 @@ def test_a_glow_may_begin_behind_the_first_bins() -> None:
     """Some windows begin with darker bins."""
     from mitsonar.estimation.water_fit import near_glow
 
-    at: Array = 1 + 0.01 * np.arange(400)
+    at: Array = np.linspace(1, 4.99, 400)
     excess: Array = np.where(np.arange(400) < 8, 10.0, np.maximum(0, 60 * (1 - at / 1.5)))
     found = near_glow(np.broadcast_to(10 ** (excess / 10)[None, :, None] * math.log(2), (1, 400, 8)), 1.0, at)
     assert found == pytest.approx((60, 1.5), rel=0.02)
