@@ -4,7 +4,7 @@
 
 Recordings are read from the folder, or from the one that MITSONAR_RECORDINGS names. Their sonars are fitted
 (`mitsonar sonar fit`), and the model coherent renders scenes that resemble theirs. Noise and gain are set so that noise and
-brightest thousandth lie as far below full scale as in the recording.
+brightest thousandth lie as far below full scale as in the recording. Where volume is bright, the fit says the gain.
 """
 
 from __future__ import annotations
@@ -34,9 +34,6 @@ from mitsonar.simulation.variant import ensure_variant
 
 SHOWN_DB = 50.0
 """Span of the pictures below the 99.9th percentile [dB]."""
-
-LEAST_NU = 2.0
-"""Smallest shape of the speckle's law that is rendered. Below, objects count, and scenes have their own."""
 
 SEED = 20
 """Of the order of the sheet."""
@@ -76,7 +73,7 @@ def main() -> None:
         real = RECORDINGS[name](folder)
         if asked.quick:
             real = real.select(slice(2))
-        fit = fit_sonar(real)
+        fit = fit_sonar(real, **STAGES[name].sonar)
         simulated = simulate(STAGES[name], fit, len(real), folder)
         print(f"\n{name}, fitted:\n" + "\n".join(f"    {line}" for line in [*fit.lines(), *fit.notes]), flush=True)
         drawn[name] = real, simulated
@@ -91,23 +88,24 @@ def main() -> None:
 
 def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFrames:
     """Return as many frames of a stage, with the fitted sonar, after the recording's way."""
-    nu = fit.sonar.speckle_nu if (fit.sonar.speckle_nu or 0.0) >= LEAST_NU else None
-    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu, noise_level_db=None)
+    nu = fit.sonar.speckle_nu if stage.patchy else None
+    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu)
+    quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0, volume_db=None)
     ensure_variant()
     poses = stage.start + np.arange(frames)[:, None] * stage.step
     with tempfile.TemporaryDirectory() as made:
         scene = stage.build(Path(made))
-        silent = Simulator(scene, sonar, mirrors=stage.mirrors)
-        bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels, 99.9)
+        silent = Simulator(scene, quiet, mirrors=stage.mirrors)
+        bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels[:, statistics.GLOW_BINS :], 99.9)
         assert silent.coherent is not None
-        middle = silent.coherent.gain[sonar.range_bins // 2]
-        if fit.noise_db is not None:
-            below = fit.noise_db - fit.bright_db
-            level = 10 * math.log10(bright / middle) + below + sonar.source_level_db
+        gain = float(10 ** (fit.bright_db / 10) / bright)
+        if fit.noise_db is not None and sonar.volume_db is None:
+            middle = silent.coherent.gain[sonar.range_bins // 2]
+            level = 10 * math.log10(bright / middle) + fit.noise_db - fit.bright_db + sonar.source_level_db
             sonar = sonar.replace(noise_level_db=level)
-        made_frames = Simulator(scene, sonar, mirrors=stage.mirrors).render(
-            poses, gain=float(10 ** (fit.bright_db / 10) / bright)
-        )
+        elif sonar.volume_db is not None:
+            gain = 10 ** ((sonar.source_level_db - fit.full_scale_db) / 10)
+        made_frames = Simulator(scene, sonar, mirrors=stage.mirrors).render(poses, gain=gain)
     image = np.rint(made_frames.image * 255).astype(np.float32) / 255
     if stage.pictures:
         image = as_recorded(image, folder, stage.pictures, stage.video)

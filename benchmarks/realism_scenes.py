@@ -31,6 +31,7 @@ class Stage:
         sonar: fields that the recording does not tell.
         pictures: whether frames pass through fan pictures of 8 bit, as the recording did.
         video: whether these pass through MPEG-4.
+        patchy: whether the ground is of patches, by the fitted ``speckle_nu``. Elsewhere that number is of objects.
         mirrors: reflection coefficient and rms height [m] of smooth shapes.
     """
 
@@ -40,6 +41,7 @@ class Stage:
     sonar: dict[str, Any]
     pictures: str = ""
     video: bool = False
+    patchy: bool = False
     mirrors: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -81,7 +83,7 @@ def ground(size: tuple[float, float], step: float, rms: float, longest: float, s
 def beside(x: NDArray[np.float64], y: NDArray[np.float64], half: float, wander: float, seed: int) -> NDArray[np.float64]:
     """Return how far a place lies outside a strip whose two edges wander [m]."""
     phase = np.random.default_rng(seed).uniform(0, 2 * math.pi, (2, 6))
-    side = [sum(wander / k**0.7 * np.sin(1.1 * k**1.1 * y + phase[one, k - 1]) for k in range(1, 7)) for one in (0, 1)]
+    side = [sum(wander / k**1.2 * np.sin(1.1 * k**1.1 * y + phase[one, k - 1]) for k in range(1, 7)) for one in (0, 1)]
     return np.asarray(np.abs(x) - half - np.where(x < 0, side[0], side[1]))
 
 
@@ -155,7 +157,7 @@ def sparse_bottom(folder: Path) -> mi.Scene:
         other = np.exp(-(((y - 16.0 - 0.9 * x) / 0.12) ** 2)) * (x > -1.0)
         return np.asarray(0.1 * (one + other))
 
-    return loaded({"bottom": (ground((8, 26), 0.03, 0.004, 1.0, 8, shape), 0.05)}, folder / "sparse")
+    return loaded({"bottom": (ground((8, 26), 0.03, 0.004, 1.0, 8, shape), 0.2)}, folder / "sparse")
 
 
 def placed(body: trimesh.Trimesh, at: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -223,7 +225,7 @@ def small_tank(folder: Path) -> mi.Scene:
     body = placed(trimesh.creation.capsule(0.1, 0.012, count=[24, 24]), (0.05, 0.95, 0.01), (90, 0, 60))
     seam = placed(trimesh.creation.box((1.2, 0.01, 0.012)), (0.2, 1.45, 0.0), (0, 0, -20))
     parts = {
-        "floor": (ground((3, 2.4), 0.006, 0.0015, 0.25, 9, flat), 0.2),
+        "floor": (ground((3, 2.4), 0.006, 0.004, 0.3, 9, flat), 0.2),
         "body": (body, 0.1),
         "seam": (seam, 0.4),
     }
@@ -232,10 +234,10 @@ def small_tank(folder: Path) -> mi.Scene:
 
 STAGES = {
     "DIDSON lamprey2": Stage(
-        river_bed, pose(0.9, 10), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey2", video=True
+        river_bed, pose(0.9, 10), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey2", video=True, patchy=True
     ),
     "DIDSON lamprey4": Stage(
-        far_bed, pose(1.9, 11.5), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey4", video=True
+        far_bed, pose(1.9, 11.5), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey4", video=True, patchy=True
     ),
     "ARIS 1200": Stage(sparse_bottom, pose(1.3, 7), STILL, {"elevation_fov_deg": 14.0, "absorption_db_per_m": 0.37}),
     "ARIS 3000 tyre": Stage(

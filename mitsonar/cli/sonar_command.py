@@ -39,10 +39,10 @@ def fit(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Fit noise, coding, stripes, crosstalk and speckle to a recording, and write a sonar that the simulator reads.
+    """Fit noise, water, coding, stripes, crosstalk and speckle to a recording, and write a sonar that the simulator reads.
 
-    Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. The near glow is printed:
-    a sonar has no field for it.
+    Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. Bright speckle
+    that is new in every frame counts as volume scattering: that holds for a sonar that rests.
     """
     from mitsonar.estimation.sonar_fit import fit_sonar
     from mitsonar.instruments.named_sonars import load_sonar

@@ -1,4 +1,4 @@
-"""What a recording tells of its sonar: noise, coding, stripes, crosstalk, speckle, near glow, as the simulator reads it."""
+"""What a recording tells of its sonar: noise, water, coding, stripes, crosstalk, speckle, as the simulator reads it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mitsonar.acoustics import image_statistics as statistics
 from mitsonar.acoustics.coding import decoded
 from mitsonar.acoustics.sonar_losses import gain_of, loss_of
 from mitsonar.errors import MitsonarError
+from mitsonar.estimation.water_fit import near_glow, volume
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -64,15 +65,17 @@ class SonarFit:
     Attributes:
         sonar: of the model coherent, with the fitted fields.
         noise_db: noise in a cell at the middle of the window, relative to full scale [dB]; None where it was not seen.
+        full_scale_db: level that full scale stands for, before the gain, as ``noise_level_db`` takes it.
         bright_db: 99.9th percentile of the levels behind the near glow, relative to full scale [dB].
         speckle_span_db: span of the coding dB by which grain of 5.57 dB has the spread of these values [dB]; None in others.
         speckle_gamma: of value = amplitude^gamma, by the coefficient of variation of the values; None in dB.
-        glow_db: of the first bins over the trend behind them [dB], for which the sonar has no field.
+        glow_db: of the first bins over the trend behind them [dB].
         notes: sentences on what was assumed or not found.
     """
 
     sonar: Sonar
     noise_db: float | None
+    full_scale_db: float
     bright_db: float
     speckle_span_db: float | None
     speckle_gamma: float | None
@@ -92,6 +95,10 @@ class SonarFit:
         level = "not fitted" if sonar.noise_level_db is None else f"{sonar.noise_level_db:.1f} dB"
         leak = "none seen" if sonar.crosstalk_db is None else f"{sonar.crosstalk_db:.1f} dB"
         law = "none: exponential intensities" if sonar.speckle_nu is None else f"{sonar.speckle_nu:.2g}"
+        glow = "none seen"
+        if sonar.near_glow_db > 0:
+            glow = f"{sonar.near_glow_db:.1f} dB at range 0, gone at {sonar.near_glow_m:.3g} m"
+        drifting = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
         return [
             f"noise over full scale   {noise} (noise_level_db: {level})",
             f"99.9th percentile       {self.bright_db:.1f} dB over full scale",
@@ -99,7 +106,8 @@ class SonarFit:
             f"stripes_db              {sonar.stripes_db:.2f}",
             f"crosstalk_db            {leak}",
             f"speckle_nu              {law}",
-            f"near glow               {self.glow_db.max():.1f} dB at most, {self.glow_db[:2].mean():.1f} dB in bins 0 and 1",
+            f"near glow over noise    {glow}",
+            f"volume_db               {drifting}",
         ]
 
     def yaml(self) -> str:
@@ -145,22 +153,40 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         notes.append(f"a speckle_nu of {nu:g} is more than a bottom's texture: objects and edges of the scene count in it")
     leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL, sonar))) / _lobe_sum(sonar)
     fitted: dict[str, Any] = {
+        "near_glow_db": 0.0,
+        "volume_db": None,
         "stripes_db": round(statistics.beam_stripes_db(level), 2),
         "crosstalk_db": round(float(np.clip(10 * math.log10(leak), -120, 0)), 1) if leak > 0 else None,
         "speckle_nu": nu,
     }
+    told_notes: list[str] = []
+    full_scale_db = _full_scale_db(frames, sonar, flat, told_notes)
     if noise is not None:
-        fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + _full_scale_db(frames, sonar, flat, notes), 1)
+        fitted |= _water(flat, level, noise, sonar, full_scale_db, notes)
+        notes += told_notes
     middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
         sonar=sonar.replace(**fitted),
         noise_db=None if noise is None else float(10 * math.log10(noise * middle)),
+        full_scale_db=full_scale_db,
         bright_db=float(np.percentile(level[:, statistics.GLOW_BINS :], 99.9)),
         speckle_span_db=span,
         speckle_gamma=gamma,
         glow_db=statistics.near_glow_db(level),
         notes=notes,
     )
+
+
+def _water(flat: Array, level: Array, noise: float, sonar: Sonar, full_scale_db: float, notes: list[str]) -> dict[str, Any]:
+    """Return the fields of noise, near glow and volume."""
+    found: dict[str, Any] = {"noise_level_db": round(float(statistics.decibels(noise)) + full_scale_db, 1)}
+    glow = near_glow(flat, noise, sonar.range_m)
+    if glow is not None:
+        found |= {"near_glow_db": round(glow[0], 1), "near_glow_m": round(glow[1], 4)}
+    drifting = volume(flat, level, noise, sonar, notes)
+    if drifting is not None:
+        found["volume_db"] = round(float(np.clip(drifting + full_scale_db - sonar.source_level_db, -200, 0)), 1)
+    return found
 
 
 def _check(frames: SonarFrames) -> None:

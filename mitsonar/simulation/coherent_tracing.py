@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.speckle import patch_amplitudes
+from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit, Surfaces
@@ -76,7 +76,7 @@ class CoherentTracer:
         self.surfaces = Surfaces.of(scene).heard_by(sonar)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.pitch = point_pitch(sonar)
-        table = patch_amplitudes(sonar.speckle_nu)
+        table = patch_amplitudes(None if sonar.speckle_nu is None else BLENDED * sonar.speckle_nu)
         self.patch_entries, self.patches = len(table), mi.Float(np.resize(table, max(2, len(table))))
         nearest = max(former.first_range, sonar.bin_m)
         loudest = LARGEST_WEIGHT * float(table.max()) * self.pitch / nearest**2

@@ -59,7 +59,7 @@ class HashedPoints:
         place: these points [m].
         over_column, over_row: change of the point by one step to the next ray, on the tangent plane [m].
         pitch: of the lattice [m].
-        patch: side of a patch of equal mean strength [m].
+        patch: side of a patch of one mean strength, which goes evenly over into its neighbours' [m].
         seed: of the hash.
 
     Attributes:
@@ -121,10 +121,19 @@ class HashedPoints:
         first = _mixed(place ^ mi.UInt32(0x68BC21EB))
         amplitude = dr.sqrt(-dr.log(_unit(first)))
         if many > 1:
-            patch_i, patch_j = (mi.Int32(dr.floor(v * (1 / self.patch))) for v in (p, q))
+            patch_i, patch_j = self._soft_patch(p, q, _mixed(first ^ mi.UInt32(0x1B56C4E9)))
             patch = _hash(patch_i, patch_j, self.key + 17)
             amplitude = amplitude * dr.gather(mi.Float, patches, patch >> (32 - int(math.log2(many))))
         return Point(p, q, a, amplitude, _unit(_mixed(first + mi.UInt32(0x2545F491))))
+
+    def _soft_patch(self, p: DeviceArray, q: DeviceArray, bits: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
+        """Return the patch of a point: of the four whose middles are nearest, each by its bilinear weight.
+
+        The points of a cell are so many that their mean power goes evenly from patch to patch: no edge shows.
+        """
+        moved = (mi.Float(bits & 0xFFFF) * 2.0**-16 - 0.5, mi.Float(bits >> 16) * 2.0**-16 - 0.5)
+        one, other = (mi.Int32(dr.floor(v * (1 / self.patch) + by)) for v, by in zip((p, q), moved, strict=True))
+        return one, other
 
 
 def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:

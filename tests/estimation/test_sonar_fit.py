@@ -19,7 +19,8 @@ from mitsonar.records.sonar_frames import SonarFrames
 PLAIN = Sonar.create(model="coherent", frequency_hz=1.8e6, range_min=1.4, range_max=5.6, bearing="cone", gain_exponent=2,
                      beam_width_deg=0.3, absorption_db_per_m=0.0)  # fmt: skip
 
-FITTED = {"noise_level_db": None, "stripes_db": 0.0, "crosstalk_db": None, "speckle_nu": None}
+FITTED = {"noise_level_db": None, "stripes_db": 0.0, "crosstalk_db": None, "speckle_nu": None,
+          "near_glow_db": 0.0, "volume_db": None}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,8 @@ def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str
         assert sonar.speckle_nu == pytest.approx(true["speckle_nu"], rel=0.3)
     else:
         assert sonar.speckle_nu is None or sonar.speckle_nu > 20
+    assert sonar.near_glow_db == 0
+    assert sonar.volume_db is None
     assert np.abs(found.glow_db[2:]).max() < 4
     assert found.bright_db == pytest.approx(10 * math.log10(0.9), abs=0.5)
     assert found.noise_db is not None
