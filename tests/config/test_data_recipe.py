@@ -59,7 +59,7 @@ def test_shipped_recipes_hold_the_thesis_s_numbers(name: str) -> None:
     own = next((model for model in ("physical", "coherent") if name.endswith(model)), None)
     assert sonar.model == (own or "thesis")
     assert (recipe.split.by == "scene") == (own is not None)
-    if physical:
+    if own == "physical":
         assert sonar.jittered
         assert sonar.rays_across > 1
         assert sonar.beam_width_rad == sonar.beam_spacing_rad
