@@ -88,6 +88,13 @@ class Tally:
                 f"{_percent(self.saturated / self.pixels)} % of pixels are at the maximum (more than 1 %): the gain, "
                 f"{self.gain_from}, is too high for the rest"
             )
+        reach = rounding_reach_m(sonar)
+        if reach is not None and np.abs(poses[:, :3]).max() > reach:
+            found["far"] = (
+                f"a pose lies {np.abs(poses[:, :3]).max():,.0f} m from the origin, where coordinates round to more than an "
+                f"eighth of the wavelength: speckle loses its place; move the scene so that poses lie within {reach:.0f} m "
+                "of the origin"
+            )
         if sonar.model == "thesis" and 0 < rays["inside"] < 10 * self.filled:
             found["rays"] = (
                 f"{rays['inside'] / self.filled:.1f} rays a bin on average, below 10: point deposits make the levels "
@@ -124,6 +131,13 @@ class Tally:
             whole_number(number, "a frame of the tally", 0, max(0, frames - 1))
         tuples = {name: tuple(state[name]) for name in ("worst", "first_empty")}
         return cls(sonar, **{**state, "rays": dict(state["rays"]), **tuples})
+
+
+def rounding_reach_m(sonar: Sonar) -> float | None:
+    """Return the distance at which single precision rounds to an eighth of the wavelength; None for other models."""
+    if sonar.model != "coherent" or sonar.frequency_hz is None:
+        return None
+    return sonar.sound_speed / sonar.frequency_hz / 8 * 2.0**24
 
 
 def _percent(share: float) -> str:
