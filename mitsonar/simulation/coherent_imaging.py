@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache, cached_property
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,6 +49,7 @@ class CoherentImager:
 
     def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
+        self._kept_waves: dict[int, NDArray[np.float32]] = {}
         parts = mirror_of(scene, mirrors)
         self.tracer = CoherentTracer(scene, sonar, self.former, parts)
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
@@ -122,7 +123,9 @@ class CoherentImager:
 
     def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
         """Return complex Gaussian noise of unit power ``(bins, beams)`` that has passed array and matched filter."""
-        waves = self._waves(ways)
+        if ways not in self._kept_waves:
+            self._kept_waves[ways] = self._waves(ways)
+        waves = self._kept_waves[ways]
         shape = 1, self.former.ranges, len(waves)
         first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
         radius = np.sqrt(-np.log(first[0]))
@@ -131,7 +134,6 @@ class CoherentImager:
         real, imag = (np.ascontiguousarray(part) @ waves for part in np.split(filtered, 2, axis=1))
         return np.asarray(real + 1j * imag, dtype=np.complex64)
 
-    @cache  # noqa: B019  an imager lives as long as its matrices
     def _waves(self, ways: int) -> NDArray[np.float32]:
         """Return the amplitude of plane waves in each beam ``(waves, beams)``, by the pattern one way or both ways.
 
