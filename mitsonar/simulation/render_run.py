@@ -263,6 +263,8 @@ class StoredEchoes:
         self.traced = frames.sonar
         change: dict[str, Any] = {} if bins is None else {"range_bins": bins}
         change |= {} if window is None else {"range_min": window[0], "range_max": window[1]}
+        if frames.sonar.model == "coherent":  # echoes have no phase: what can be binned are expected levels in hard boxes
+            change |= {"model": "physical", "pattern": "box"}
         self.sonar = frames.sonar.replace(**change)
         self.notes: list[str] = []
 

@@ -13,6 +13,7 @@ from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
+from mitsonar.estimation.crlb.image_crlb import refuse_speckle
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.simulation.imaging import Simulator
@@ -79,19 +80,6 @@ def subject_of_scene(
         raise MitsonarError("nothing is below the sonar at some pose: give a pose over the scene with --from")
     place = Place(scene, poses, heights)
     return Subject(sonar, lambda other: _views(other, segments), lambda: iter([place]), len(heights), gain)
-
-
-def refuse_speckle(sonar: Sonar) -> None:
-    """Refuse a sonar whose images are speckle: the bound is that of expected levels and noise of pixels.
-
-    Raises:
-        MitsonarError: the model ``coherent``.
-    """
-    if sonar.model == "coherent":
-        raise MitsonarError(
-            "the Cramer-Rao bound knows noise of pixels, not speckle: got the model coherent; give --model physical for the "
-            "bound of the expected levels"
-        )
 
 
 def subject_of_data(

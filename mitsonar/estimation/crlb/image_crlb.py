@@ -28,7 +28,7 @@ from mitsonar.simulation.imaging import Simulator
 
 __all__ = [
     *("ALL", "KINDS", "LAWS", "VARIABLES", "Bound", "bound", "cramer_rao_bound", "bounds_at", "bounds_of_views"),
-    *("fisher", "floor_ranges", "overall", "together", "varied"),
+    *("fisher", "floor_ranges", "overall", "refuse_speckle", "together", "varied"),
 ]
 
 KINDS: dict[str, str] = {"image": "all pixels", "vector": "sums over the beams"}
@@ -262,6 +262,19 @@ def bounds_at(
         yield found
 
 
+def refuse_speckle(sonar: Sonar) -> None:
+    """Refuse a sonar whose images are speckle: the bound is that of expected levels and noise of pixels.
+
+    Raises:
+        MitsonarError: the model ``coherent``.
+    """
+    if sonar.model == "coherent":
+        raise MitsonarError(
+            "the Cramer-Rao bound knows noise of pixels, not speckle: got the model coherent; give --model physical for the "
+            "bound of the expected levels"
+        )
+
+
 def cramer_rao_bound(
     simulator: Simulator,
     poses: ArrayLike,
@@ -289,9 +302,10 @@ def cramer_rao_bound(
         pings: as for :func:`bounds_at`.
 
     Raises:
-        MitsonarError: unknown words; several portions that overlap, and none named.
+        MitsonarError: unknown words; several portions that overlap, and none named; the model ``coherent``.
     """
     _check(kind, law)
+    refuse_speckle(simulator.sonar)
     portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
     found = []
     for one in bounds_at(simulator, poses, noise, gain, pings=pings):
