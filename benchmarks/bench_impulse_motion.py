@@ -311,7 +311,7 @@ def strangers(one: ImpulseResponses, other: ImpulseResponses) -> ImpulseResponse
 def course_of(asked: argparse.Namespace, name: str, around: Pose) -> Trajectory:
     """Return a course, or its first positions."""
     flown = course(name, around)
-    return Trajectory(flown.poses[:4], flown.time_s[:4]) if asked.quick else flown
+    return Trajectory(flown.poses[:9], flown.time_s[:9]) if asked.quick else flown
 
 
 def courses(asked: argparse.Namespace) -> None:
