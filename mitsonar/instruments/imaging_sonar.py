@@ -245,6 +245,12 @@ class Sonar(Instrument):
             )
         if self.beam_pattern == "box":
             raise ValueError("the model coherent needs a pattern of the beams: give pattern receive or two_way")
+        band = Pulse(self.resolution_m).bandwidth_hz(self.sound_speed)
+        if band > 2 * self.frequency_hz:
+            raise ValueError(
+                f"a range resolution of {self.resolution_m:.3g} m takes a band of {band:.3g} Hz, more than twice the carrier: "
+                f"got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger pulse_m"
+            )
         if self.aperture.length < LEAST_APERTURE:
             raise ValueError(
                 f"an aperture is at least half a wavelength: a beam of {math.degrees(self.beam_width_rad):.3g} deg takes "

@@ -33,6 +33,10 @@ class Pulse:
         """
         return cls(half_power(HANN, 2) * sound_speed / bandwidth_hz)
 
+    def bandwidth_hz(self, sound_speed: float) -> float:
+        """Return the band that the pulse fills [Hz]: the inverse of :meth:`of_band`."""
+        return half_power(HANN, 2) * sound_speed / self.resolution_m
+
     def shape(self, r: ArrayLike) -> NDArray[np.float64]:
         """Return the amplitude at a range ``r`` [m] from the echo, 1 at 0, of the same shape."""
         return shaded_sinc(np.asarray(r, dtype=float) * (2 * half_power(HANN, 2) / self.resolution_m), HANN)

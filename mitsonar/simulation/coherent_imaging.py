@@ -137,7 +137,7 @@ class CoherentImager:
     def _waves(self, ways: int) -> NDArray[np.float32]:
         """Return the amplitude of plane waves in each beam ``(waves, beams)``, by the pattern one way or both ways.
 
-        Waves are half a wavelength over the aperture apart, which resolves both patterns. Each beam has unit power.
+        Waves are 1 / (ways x length) apart, which resolves that pattern. Each beam has unit power.
         """
         length = self.former.aperture.length
         reach = math.sin(math.radians(self.sonar.azimuth_fov_deg) / 2) + 4 / length

@@ -173,6 +173,7 @@ def test_patterns_and_coding_follow_from_the_model() -> None:
     [
         ({}, "needs the carrier"),
         ({"frequency_hz": 1e6, "azimuth_fov_deg": 180}, "at most 170 x 170 deg"),
+        ({"frequency_hz": 1.8}, "give it in Hz, at least 1.15e"),  # MHz taken for Hz
         ({"frequency_hz": 1e6, "pattern": "box"}, "give pattern receive or two_way"),
         ({"frequency_hz": 1e6, "azimuth_fov_deg": 160, "beams": 1}, "at least half a wavelength"),
         ({"frequency_hz": 1e6, "pulse_m": 0.1, "bandwidth_hz": 1e4}, "give one of them"),

@@ -17,6 +17,7 @@ def test_half_power_at_half_the_resolution() -> None:
 def test_it_is_the_transform_of_its_band() -> None:
     band, speed = 30e3, 1480.0
     pulse = Pulse.of_band(band, speed)
+    assert pulse.bandwidth_hz(speed) == pytest.approx(band)
     f = (np.arange(4001) / 4000 - 0.5) * band
     weight = 1 + np.cos(2 * np.pi * f / band)
     r = np.linspace(-0.1, 0.1, 101)
