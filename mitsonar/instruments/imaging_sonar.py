@@ -249,7 +249,8 @@ class Sonar(Instrument):
         if band > 2 * self.frequency_hz:
             raise ValueError(
                 f"a range resolution of {self.resolution_m:.3g} m takes a band of {band:.3g} Hz, more than twice the "
-                f"carrier: got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger pulse_m"
+                f"carrier: got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger "
+                "pulse_m"
             )
         if self.aperture.length < LEAST_APERTURE:
             raise ValueError(
