@@ -26,8 +26,8 @@ class ChannelSensor(mi.Sensor):
     Properties: those of :class:`mitsonar.instruments.channel_sonar.ChannelSonar` (``carrier_hz`` [Hz, 80000],
     ``bandwidth_hz`` [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max``
     [m, 25], ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``,
-    ``points_per_m2`` [1700], ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front, left, back, right]: names with
-    commas between; ``to_world``: of the vehicle, local +z forward, +y up.
+    ``points_per_m2`` [1700], ``scatterer_spacing_m`` [m], ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front,
+    left, back, right]: names with commas between; ``to_world``: of the vehicle, local +z forward, +y up.
 
     Fields of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg``
     [deg, 50], ``taper`` [0.5]. Of one receiver: the same and ``heading_deg``, with the receiver's name before, as in

@@ -179,8 +179,11 @@ class ChannelSonar(Instrument):
     points_per_m2: float = Field(
         1700.0, gt=0, le=1e7, description="scatterers of surfaces without cells of their own [1/m2]"
     )
+    scatterer_spacing_m: float | None = Field(
+        None, gt=0, le=10, description="pitch of the points on all surfaces [m], as of an imaging sonar; default: cells"
+    )
     rays: int = Field(50_000, ge=1, le=10**8, description="rays within each receiver's field of view, model rays")
-    seed: int = Field(0, ge=0, lt=2**31, description="of the places and amplitudes of scatterers without cells")
+    seed: int = Field(0, ge=0, lt=2**31, description="of the places and weights of scatterers without cells")
     transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="its field of view")
     receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
 
@@ -232,6 +235,11 @@ class ChannelSonar(Instrument):
     def wavelength_m(self) -> float:
         """Return the wavelength of the carrier [m]."""
         return self.sound_speed / self.carrier_hz
+
+    @property
+    def lattice_pitch_m(self) -> float:
+        """Return the pitch of the points on surfaces without cells [m]."""
+        return self.points_per_m2**-0.5 if self.scatterer_spacing_m is None else self.scatterer_spacing_m
 
     @property
     def spreads(self) -> bool:

@@ -231,7 +231,7 @@ class _WorldScatterers:
         self.sonar = sonar
         self.scatterers: Scatterers
         self.stored: mi.Float
-        if like is not None and (like.sonar.points_per_m2, like.sonar.seed) == (sonar.points_per_m2, sonar.seed):
+        if like is not None and _points_of(like.sonar) == _points_of(sonar):
             self.scatterers, self.stored = like.scatterers, like.stored
             return
         self.scatterers = Scatterers.of(scene, sonar)
@@ -269,6 +269,11 @@ class _WorldScatterers:
         if self.sonar.spreads:
             amplitude /= sent * received
         return link.echo_batch(delay, amplitude, second.w, link.doppler(u_sent, u_received), seen)
+
+
+def _points_of(sonar: ChannelSonar) -> tuple[float | None, ...]:
+    """Return what the points of a scene follow from."""
+    return sonar.points_per_m2, sonar.scatterer_spacing_m, sonar.seed
 
 
 class _VehicleRays:

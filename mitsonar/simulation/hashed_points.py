@@ -16,7 +16,7 @@ import mitsuba as mi
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.device_arrays import DeviceArray
 
-__all__ = ["HashedPoints", "Point", "pick"]
+__all__ = ["HashedPoints", "Point", "lattice_key", "nearest_axis", "pick", "place_in_cell", "weight_of"]
 
 LEAST_COSINE = 4e-3
 """Grazing cosine below which a ray's cell is no longer stretched along the surface."""
@@ -80,13 +80,8 @@ class HashedPoints:
         patch: float,
         seed: int,
     ) -> None:
-        leans: DeviceArray = dr.abs(hit.n)
         self.pitch, self.patch = pitch, patch
-        self.axis = dr.select(
-            (leans.z >= leans.x) & (leans.z >= leans.y),
-            mi.UInt32(2),
-            dr.select(leans.x >= leans.y, mi.UInt32(0), mi.UInt32(1)),
-        )
+        self.axis = nearest_axis(hit.n)
         self.normal = pick(self.axis, hit.n)
         self.middle = pick(self.axis, place)
         across, down = pick(self.axis, over_column), pick(self.axis, over_row)
@@ -101,7 +96,7 @@ class HashedPoints:
         self.cut = hit.valid & (wanted > MOST_CANDIDATES)
         self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, wanted)), 0)
         side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))
-        self.key = _mixed(mi.UInt32(hit.shape_id) * 8 + self.axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
+        self.key = lattice_key(mi.UInt32(hit.shape_id), self.axis, side, seed)
         self.strength = dr.sqrt(hit.reflectivity * (pitch * pitch) / dr.abs(self.normal[2]))
 
     def point(self, number: DeviceArray, patches: mi.Float, many: int) -> Point:
@@ -113,18 +108,15 @@ class HashedPoints:
             many: entries of that table.
         """
         i, j = self.low[0] + number % self.wide, self.low[1] + number // self.wide
-        place = _hash(i, j, self.key)
-        p = (mi.Float(i) + (mi.Float(place & 0xFFFF) + 0.5) * 2.0**-16) * self.pitch
-        q = (mi.Float(j) + (mi.Float(place >> 16) + 0.5) * 2.0**-16) * self.pitch
+        p, q, bits = place_in_cell(i, j, self.key, self.pitch)
         slope = 1 / self.normal[2]
         a = self.middle[2] - slope * (self.normal[0] * (p - self.middle[0]) + self.normal[1] * (q - self.middle[1]))
-        first = _mixed(place ^ mi.UInt32(0x68BC21EB))
-        amplitude = dr.sqrt(-dr.log(_unit(first)))
+        amplitude, turn, bits = weight_of(bits)
         if many > 1:
-            patch_i, patch_j = self._soft_patch(p, q, _mixed(first ^ mi.UInt32(0x1B56C4E9)))
+            patch_i, patch_j = self._soft_patch(p, q, _mixed(bits ^ mi.UInt32(0x1B56C4E9)))
             patch = _hash(patch_i, patch_j, self.key + 17)
             amplitude = amplitude * dr.gather(mi.Float, patches, patch >> (32 - int(math.log2(many))))
-        return Point(p, q, a, amplitude, _unit(_mixed(first + mi.UInt32(0x2545F491))))
+        return Point(p, q, a, amplitude, turn)
 
     def _soft_patch(self, p: DeviceArray, q: DeviceArray, bits: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Return the patch of a point: of the four whose middles are nearest, each by its bilinear weight.
@@ -134,6 +126,48 @@ class HashedPoints:
         moved = (mi.Float(bits & 0xFFFF) * 2.0**-16 - 0.5, mi.Float(bits >> 16) * 2.0**-16 - 0.5)
         one, other = (mi.Int32(dr.floor(v * (1 / self.patch) + by)) for v, by in zip((p, q), moved, strict=True))
         return one, other
+
+
+def nearest_axis(normal: DeviceArray) -> DeviceArray:
+    """Return the axis of the world that normals lean on most, 0 to 2."""
+    leans: DeviceArray = dr.abs(normal)
+    others = dr.select(leans.x >= leans.y, mi.UInt32(0), mi.UInt32(1))
+    return dr.select((leans.z >= leans.x) & (leans.z >= leans.y), mi.UInt32(2), others)
+
+
+def lattice_key(shape: DeviceArray, axis: DeviceArray, side: DeviceArray, seed: int) -> DeviceArray:
+    """Return 32 bits that choose the hash of a lattice.
+
+    Args:
+        shape: index of the shape in the scene.
+        axis: of the world that its normal leans on most, 0 to 2.
+        side: 1 where the normal points along that axis, 0 where against it.
+        seed: of the hash.
+    """
+    return _mixed(shape * 8 + axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
+
+
+def place_in_cell(
+    i: DeviceArray, j: DeviceArray, key: DeviceArray, pitch: float
+) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Return where the point of a lattice's cell lies along both axes [m], and 32 bits for :func:`weight_of`.
+
+    Args:
+        i: of the cell along the first axis.
+        j: along the second.
+        key: of :func:`lattice_key`.
+        pitch: of the lattice [m].
+    """
+    place = _hash(i, j, key)
+    p = (mi.Float(i) + (mi.Float(place & 0xFFFF) + 0.5) * 2.0**-16) * pitch
+    q = (mi.Float(j) + (mi.Float(place >> 16) + 0.5) * 2.0**-16) * pitch
+    return p, q, place
+
+
+def weight_of(place: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+    """Return amplitude and phase (turns 0..1) of a point's complex Gaussian weight, and bits for what else is drawn."""
+    bits = _mixed(place ^ mi.UInt32(0x68BC21EB))
+    return dr.sqrt(-dr.log(_unit(bits))), _unit(_mixed(bits + mi.UInt32(0x2545F491))), bits
 
 
 def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:

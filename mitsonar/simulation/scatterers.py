@@ -1,10 +1,11 @@
 """Points of the world that scatter sound, and a search for those in a field of view.
 
 A surface whose reflectivity comes in cells (``cell_noise`` over uv, or a picture) has one point in each cell. Its position
-is a hash of the cell. Any other surface gets random points, ``points_per_m2`` of them, from the seed. The points do not
+is a hash of the cell. Any other surface has the points of a lattice of the world, as images of the model ``coherent`` have
+them. With ``scatterer_spacing_m`` all surfaces do: images and impulse responses then come from one field. The points do not
 depend on the sonar's pose, the time or the number of rays.
 
-Each point scatters with a complex Gaussian number zeta of its own, E|zeta|^2 = 1: a hash of its cell, or of its number.
+Each point scatters with a complex Gaussian number zeta of its own, E|zeta|^2 = 1: a hash of its cell.
 Echoes of many points then add in power, as those of rough ground do. Their energy does not depend on the density of points.
 """
 
@@ -26,8 +27,9 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
-from mitsonar.plugins.surfaces import facet_points, reflectances_of, reflectivity_at
+from mitsonar.plugins.surfaces import reflectances_of, reflectivity_at
 from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.lattice_points import SurfacePoints, lattice_points, lattice_size
 
 __all__ = ["Scatterers"]
 
@@ -104,8 +106,8 @@ class Scatterers:
         parts, closed = [], []
         for number, shape in enumerate(scene.shapes()):
             if shape.bsdf() is not None:
-                grid = _grid_of(shape)
-                parts.append(_in_cells(shape, grid, number) if grid else _at_random(shape, sonar, number))
+                grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
+                parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
         if not sum(map(len, closed)):
             raise MitsonarError(
@@ -199,15 +201,6 @@ def _grid_of(shape: mi.Shape) -> _Grid | None:
     return None
 
 
-class _Points(NamedTuple):
-    """The points of a shape; fields as of :class:`Scatterers`."""
-
-    place: NDArray[np.float32]
-    normal: NDArray[np.float32]
-    strength: NDArray[np.float32]
-    phase: NDArray[np.float32]
-
-
 class _Zeta(NamedTuple):
     """Complex Gaussian numbers of points on the device: |zeta|^2, and the phase [rad]."""
 
@@ -215,7 +208,7 @@ class _Zeta(NamedTuple):
     phase: DeviceArray
 
 
-def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> _Points:
+def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> SurfacePoints:
     """Place one point in each cell. Place and zeta are hashes of the cell and the texture's seed (of a picture: the shape's
     number).
     """
@@ -227,7 +220,7 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> _Points:
     corners = turn @ np.array([[0, 1, 0, 1], [0, 0, 1, 1], [1, 1, 1, 1.0]])
     low = np.floor(corners[:2].min(axis=1) * (columns, rows)).astype(int)
     wide, tall = np.ceil(corners[:2].max(axis=1) * (columns, rows)).astype(int) - low
-    _check_count(shape, float(wide) * float(tall))
+    _check_count(shape, float(wide) * float(tall), "give its texture fewer cells, or a scatterer_spacing_m")
     cell = dr.arange(mi.UInt32, int(wide * tall))
     column, row = mi.Int32(cell % int(wide)) + int(low[0]), mi.Int32(cell // int(wide)) + int(low[1])
     seed = (texture.seed, 1) if texture is not None else (number, 0)
@@ -241,56 +234,35 @@ def _in_cells(shape: mi.Shape, grid: _Grid, number: int) -> _Points:
     return _kept(shape, si, area, _zeta_of(bits[0], bits[1] ^ _key(*seed, ZETA)), inside & si.is_valid())
 
 
-def _at_random(shape: mi.Shape, sonar: ChannelSonar, number: int) -> _Points:
-    """Place random points on a surface; on a mesh each represents the same area, elsewhere its own part of the area.
-
-    Their zeta is a hash of the sonar's seed, the shape's number and the point's.
-    """
-    area = float(shape.surface_area()[0])
-    _check_count(shape, area * sonar.points_per_m2)
-    count = round(area * sonar.points_per_m2)
-    if count == 0:
-        return _Points(*np.empty((2, 0, 3), np.float32), *np.empty((2, 0), np.float32))
-    zeta = _zeta_of(dr.arange(mi.UInt32, count), _key(sonar.seed, number, ZETA_OF_RANDOM))
-    rng = np.random.default_rng([sonar.seed, number, 81])
-    u, v = (mi.Float(draw.astype(np.float32)) for draw in rng.random((2, count)))
-    if isinstance(shape, mi.Mesh):
-        share = np.cumsum(_facet_areas(shape))
-        facet = np.searchsorted(share, np.sort(rng.random(count)) * share[-1], side="right")
-        facet, root = np.minimum(facet, len(share) - 1).astype(np.uint32), dr.sqrt(u)
-        si = facet_points(shape, mi.UInt32(facet), mi.Point2f(root * v, 1 - root))
-        return _kept(shape, si, mi.Float(area / count), zeta, mi.Bool(True))
-    si = shape.eval_parameterization(mi.Point2f(u, v), mi.RayFlags.All)
-    return _kept(shape, si, dr.norm(dr.cross(si.dp_du, si.dp_dv)) / count, zeta, si.is_valid())
+def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoints:
+    """Return the points of the world's lattice on a surface, one in each cell."""
+    pitch = sonar.lattice_pitch_m
+    cells = lattice_size(shape, pitch) / 2
+    enough = pitch * math.sqrt(cells / MOST) * 1.1
+    mend = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
+    _check_count(shape, cells, f"{mend}; a spacing of {enough:.2g} m would do")
+    return lattice_points(shape, number, pitch, sonar.seed)
 
 
-def _facet_areas(mesh: mi.Mesh) -> NDArray[np.float64]:
-    """Return the area of each triangle ``(faces,)`` [m2]."""
-    facets = dr.arange(mi.UInt32, mesh.face_count())
-    corners = [np.array(facet_points(mesh, facets, mi.Point2f(*at)).p, dtype=float) for at in ((0, 0), (1, 0), (0, 1))]
-    return np.asarray(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0), axis=0) / 2)
-
-
-def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, zeta: _Zeta, valid: DeviceArray) -> _Points:
+def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, zeta: _Zeta, valid: DeviceArray) -> SurfacePoints:
     """Return the points whose strength is above 0."""
     strength = dr.select(valid, reflectivity_at(shape.bsdf(), si) * area * zeta.power, 0)
     dr.eval(si.p, si.n, strength, zeta.phase)
     found = np.array(strength)
     keep = np.flatnonzero((found > 0) & np.isfinite(found))
     place, normal = (np.broadcast_to(np.array(values).T, (len(found), 3))[keep] for values in (si.p, si.n))
-    return _Points(np.ascontiguousarray(place), np.ascontiguousarray(normal), found[keep], np.array(zeta.phase)[keep])
+    return SurfacePoints(np.ascontiguousarray(place), np.ascontiguousarray(normal), found[keep], np.array(zeta.phase)[keep])
 
 
-def _check_count(shape: mi.Shape, count: float) -> None:
+def _check_count(shape: mi.Shape, count: float, mend: str) -> None:
     if count > MOST:
         raise MitsonarError(
-            f"shape {shape.id()} would carry {count:,.0f} scatterers, more than {MOST:,}: give its texture fewer cells, or "
-            "lower points_per_m2"
+            f"shape {shape.id() or 'of merged meshes'} would carry {count:,.0f} scatterers, more than {MOST:,}: {mend}"
         )
 
 
-PLACE, ZETA, ZETA_OF_RANDOM = 82, 83, 84
-"""Last numbers of the keys that draw places within cells, zeta of cells and zeta of random points."""
+PLACE, ZETA = 82, 83
+"""Last numbers of the keys that draw places within cells, and zeta of cells."""
 
 
 def _key(seed: int, kind: int, drawn: int) -> DeviceArray:

@@ -38,7 +38,7 @@ __all__ = ["NOISES", "evaluate", "predictions"]
 NOISES = ("none", "low", "high")
 """Levels of noise, by default."""
 
-SAME_INSTRUMENT = ("name", "model", "seed", "rays", "points_per_m2")
+SAME_INSTRUMENT = ("name", "model", "seed", "rays", "points_per_m2", "scatterer_spacing_m")
 """Keys of a channel sonar that do not make it another instrument."""
 
 TIMED = 20

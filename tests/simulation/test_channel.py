@@ -58,7 +58,7 @@ def test_two_receivers_differ_in_phase_as_their_ways_do() -> None:
     sonar = ChannelSonar(
         receivers=(received_from(), received_from((0.12, 0, 0)).model_copy(update={"name": "two"})), points_per_m2=1e4
     )
-    made = simulator(sonar, plate=plate((6, 7, 0), (0, 0, 1), half=0.005))
+    made = simulator(sonar, plate=plate((6.005, 7.005, 0), (0, 0, 1), half=0.005))
     (place,) = points(made)
     way = [np.linalg.norm(place - np.array(LEVEL[:3]) - offset) for offset in sonar.offsets]
     first, second = one_response(made)

@@ -1,0 +1,161 @@
+"""Points of the lattice on whole shapes, and that images and impulse responses have the same ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from channel_scenes import CELLS, received_from, scatterers_of, simulator
+from helpers import box, diffuse, floor, plate, scene, sphere
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose, to_world_matrices
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from mitsonar.simulation.lattice_points import SurfacePoints
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+PITCH = 0.02
+
+SONAR = Sonar(
+    beams=16,
+    azimuth_fov_deg=24.0,
+    elevation_fov_deg=14.0,
+    range_min=2.0,
+    range_max=7.0,
+    range_bins=100,
+    frequency_hz=80e3,
+    pulse_m=0.1,
+    pattern="receive",
+    absorption_db_per_m=0.0,
+    scatterers_per_cell=4,
+    model="coherent",
+    scatterer_spacing_m=PITCH,
+    sound_speed=1500.0,
+)
+POSE = Pose(0.3, -0.2, 2.0, pitch=np.radians(30), heading=np.radians(20))
+
+
+def points_of(shape: mi.Shape, number: int = 0, seed: int = 0) -> SurfacePoints:
+    from mitsonar.simulation.lattice_points import lattice_points
+
+    return lattice_points(shape, number, PITCH, seed)
+
+
+def found(body: dict[str, Any], number: int = 0, seed: int = 0) -> SurfacePoints:
+    return points_of(scene(body=body).shapes()[0], number, seed)
+
+
+@pytest.mark.parametrize("name", ["plate", "box", "sphere"])
+def test_each_cell_has_one_point_on_the_surface(name: str) -> None:
+    """Their areas pitch^2 / |n_a| add up to the shape's; without zeta the error is that of cells at the edges alone."""
+    bodies = {
+        "plate": (plate((0.3, 0.2, 1), (0.3, 0.2, 0.9), 1.0), 4.0),
+        "box": (box((0.1, 0.2, 0.3), (0.5, 0.6, 0.7)), 8 * (0.5 * 0.6 + 0.5 * 0.7 + 0.6 * 0.7)),
+        "sphere": (sphere((0, 0, 0), 0.8), 4 * np.pi * 0.64),
+    }
+    body, area = bodies[name]
+    made = found(body)
+    side = PITCH**2 / np.abs(made.normal).max(axis=1)
+    assert side.sum() == pytest.approx(area, rel=0.01)
+    assert np.linalg.norm(made.normal, axis=1) == pytest.approx(np.ones(len(side)), abs=1e-5)
+    axis = np.abs(made.normal).argmax(axis=1)
+    for k in range(3):
+        for sign in (-1, 1):
+            here = (axis == k) & (np.sign(np.take_along_axis(made.normal, axis[:, None], 1)[:, 0]) == sign)
+            cell = np.floor(np.delete(made.place[here], k, axis=1).astype(float) / PITCH + 1e-6).astype(int)
+            assert len(np.unique(cell, axis=0)) == len(cell)
+    if name == "sphere":
+        assert np.linalg.norm(made.place, axis=1) == pytest.approx(np.full(len(side), 0.8), abs=1e-5)
+
+
+def test_points_follow_from_seed_and_shape() -> None:
+    one, again = found(sphere((0, 0, 0), 0.3)), found(sphere((0, 0, 0), 0.3))
+    assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))
+    for other in (found(sphere((0, 0, 0), 0.3), seed=1), found(sphere((0, 0, 0), 0.3), number=1)):
+        assert len(set(other.phase) & set(one.phase)) < 10  # of numbers of 24 bits, a few are equal by chance
+
+
+def test_the_back_of_a_body_behind_its_front_is_found() -> None:
+    """Rays go on behind what they hit. Mitsuba makes one shape of both sheets."""
+    (both,) = scene(low=plate((0, 0, 0), (0, 0, 1), 1.0), high=plate((0, 0, 0.3), (0, 0, 1), 1.0)).shapes()
+    made, one = points_of(both), found(plate((0, 0, 0), (0, 0, 1), 1.0))
+    height = np.round(made.place[:, 2], 4)
+    assert set(height) == {np.float32(0), np.float32(0.3)}
+    for low in (0, 0.3):
+        here = np.isclose(height, low)
+        assert np.array_equal(np.sort(made.phase[here]), np.sort(one.phase))
+
+
+def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex128]:
+    """The field of points that all lie in sight, written from the equations: waves, and shares of four cells."""
+    former, sonar, fan = tracer.former, tracer.sonar, tracer.fan
+    matrix = to_world_matrices(POSE)[0]
+    way = points.place.astype(float) - matrix[:3, 3]
+    range_m = np.linalg.norm(way, axis=1)
+    starboard, up, forward = (way @ matrix[:3, :3]).T * np.array([[-1], [1], [1]])
+    level = np.hypot(starboard, forward)
+    sine, tangent = starboard / level, up / level
+    cosine = np.abs((points.normal * way).sum(axis=1)) / range_m
+    import mitsuba as mi
+
+    from mitsonar.simulation.elevation_pattern import elevation_gain
+
+    gain = np.array(elevation_gain(sonar, mi.Float(tangent.astype(np.float32))), dtype=float)
+    size = np.sqrt(points.strength.astype(float)) * cosine / range_m**2 * gain
+    wave = size * np.exp(1j * (points.phase.astype(float) - 4 * np.pi * range_m / tracer.wavelength))
+    seen = (np.abs(sine) < fan.sine) & (np.abs(tangent) < fan.tangent) & (forward > 0)
+    x, y = (sine - former.first_sine) / former.sine_step, (range_m - former.first_range) / former.range_step
+    seen &= (x >= 0) & (x < former.sines - 1) & (y >= 0) & (y < former.ranges - 1)
+    total = np.zeros((former.sines, former.ranges), complex)
+    i, j = np.floor(x[seen]).astype(int), np.floor(y[seen]).astype(int)
+    a, b = x[seen] - i, y[seen] - j
+    for k, m, share in ((0, 0, (1 - a) * (1 - b)), (1, 0, a * (1 - b)), (0, 1, (1 - a) * b), (1, 1, a * b)):
+        np.add.at(total, (i + k, j + m), share * wave[seen])
+    return total
+
+
+@pytest.mark.parametrize("scenery", ["floor", "corner"])
+def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
+    """The points that a channel sonar stores, summed here in NumPy, give the field that the imaging sonar's rays find."""
+    from mitsonar.simulation.channel import ChannelSimulator
+    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.lattice_points import SurfacePoints
+
+    shapes = {"floor": {"floor": floor(diffuse(0.4), 8.0)}}
+    shapes["corner"] = {"ground": shapes["floor"]["floor"], "wall": plate((1, 5.5, 0), (-0.2, -1, 0.1), 6.0, diffuse(0.3))}
+    made = scene(**shapes[scenery])
+    channel = ChannelSonar(scatterer_spacing_m=PITCH, receivers=(received_from(),))
+    stored = scatterers_of(ChannelSimulator(made, channel))
+    points = SurfacePoints(stored.place, stored.normal, stored.strength, stored.phase)
+    if scenery == "corner":  # of what hides what, each point before the wall's plane and above the ground is in sight
+        before = ((points.place - [1, 5.5, 0]) @ np.array([-0.2, -1, 0.1])) > -1e-4
+        points = SurfacePoints(*(values[before & (points.place[:, 2] > -1e-4)] for values in points))
+    coherent = Simulator(made, SONAR).coherent
+    assert coherent is not None
+    got = coherent.tracer.field(np.array(POSE))[0].astype(complex)
+    wanted = spread_over_grid(points, coherent.tracer)
+    # at the seam of two surfaces a ray's cell holds points of one of them
+    assert np.linalg.norm(got - wanted) < {"floor": 1e-3, "corner": 0.02}[scenery] * np.linalg.norm(wanted)
+
+
+def test_a_texture_of_cells_joins_the_field() -> None:
+    textured = floor(diffuse({**CELLS, "cells": 64.0}), 2.0)
+    own, joined = (
+        scatterers_of(simulator(ChannelSonar(scatterer_spacing_m=pitch), floor=textured)) for pitch in (None, PITCH)
+    )
+    assert len(own) == 64**2
+    assert len(joined) == pytest.approx((4 / PITCH) ** 2, rel=0.01)
+    assert joined.strength.sum() == pytest.approx(own.strength.sum(), rel=0.05)
+
+
+def test_too_fine_a_lattice_is_refused() -> None:
+    with pytest.raises(MitsonarError, match="scatterer_spacing_m"):
+        simulator(ChannelSonar(scatterer_spacing_m=1e-4), floor=floor(diffuse(), 8.0))
