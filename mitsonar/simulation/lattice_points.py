@@ -68,16 +68,14 @@ def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int) -> Sur
         pitch: of the lattice [m].
         seed: of the hash.
     """
-    alone: mi.Scene = mi.load_dict({"type": "scene", "shape": shape})
-    surfaces = Surfaces.of(alone)
-    found = [
-        _on_rays(alone, surfaces, cells, np.arange(begin, min(begin + AT_A_TIME, count)), key, side, pitch)
-        for cells in _cells_of(shape, pitch)
-        for side in (1, 0)
-        for key in [lattice_key(mi.UInt32(number), mi.UInt32(cells.axis), mi.UInt32(side), seed)]
-        for count in [cells.wide * cells.tall]
-        for begin in range(0, count, AT_A_TIME)
-    ]
+    search = _Search(shape, pitch)
+    found = []
+    for cells in _cells_of(shape, pitch):
+        for side in (1, 0):
+            key = lattice_key(mi.UInt32(number), mi.UInt32(cells.axis), mi.UInt32(side), seed)
+            count = cells.wide * cells.tall
+            for begin in range(0, count, AT_A_TIME):
+                found += search.on_rays(cells, side, key, np.arange(begin, min(begin + AT_A_TIME, count), dtype=np.uint32))
     return SurfacePoints(*(np.concatenate(values) for values in zip(*found, strict=True)))
 
 
@@ -88,7 +86,7 @@ def _cells_of(shape: mi.Shape, pitch: float) -> Iterator[_Cells]:
         first = [math.floor(low[k] / pitch) for k in (one, other)]
         count = [math.floor(high[k] / pitch) - begin + 1 for k, begin in zip((one, other), first, strict=True)]
         margin = pitch + 1e-4 * (high[axis] - low[axis])
-        yield _Cells(axis, (first[0], first[1]), *count, (low[axis] - margin, high[axis] + margin))
+        yield _Cells(axis, (first[0], first[1]), count[0], count[1], (low[axis] - margin, high[axis] + margin))
 
 
 def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -100,60 +98,51 @@ def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.array(box.min, dtype=float).ravel(), np.array(box.max, dtype=float).ravel()
 
 
-def _on_rays(
-    scene: mi.Scene,
-    surfaces: Surfaces,
-    cells: _Cells,
-    numbers: NDArray[np.int64],
-    key: DeviceArray,
-    side: int,
-    pitch: float,
-) -> SurfacePoints:
-    """Return the points on the rays through some cells: where surfaces lean on the axis most, to the side given."""
-    made: list[SurfacePoints] = []
-    cell = mi.UInt32(numbers)
-    i = mi.Int32(cell % cells.wide) + cells.low[0]
-    j = mi.Int32(cell // cells.wide) + cells.low[1]
-    p, q, bits = place_in_cell(i, j, key, pitch)
-    amplitude, turn, _ = weight_of(bits)
-    # the outer side first: rays come from where the surface faces
-    begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)
-    a, left = dr.full(mi.Float, begin, len(numbers)), cells.ends[1] - cells.ends[0]
-    u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
-    while len(numbers):
-        hit = surfaces.hit(scene, mi.Ray3f(mi.Point3f(_along(cells.axis, p, q, a)), u))
-        at = a + way * hit.t
-        made.append(_kept(cells.axis, hit, (p, q, at), (amplitude, turn), side, pitch))
-        going = np.flatnonzero(np.array(hit.valid))
-        if not len(going):
-            break
-        kept = mi.UInt32(going.astype(np.uint32))
-        p, q, amplitude, turn, at = (dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at))
-        a = at + way * BEYOND * left
-        dr.eval(p, q, amplitude, turn, a)
-        numbers = numbers[going]
-    return SurfacePoints(*(np.concatenate(values) for values in zip(*made, strict=True)))
+class _Search:
+    """Follows rays through one shape."""
 
+    def __init__(self, shape: mi.Shape, pitch: float) -> None:
+        self.scene: mi.Scene = mi.load_dict({"type": "scene", "shape": shape})
+        self.surfaces = Surfaces.of(self.scene)
+        self.pitch = pitch
 
-def _kept(
-    axis: int,
-    hit: Hit,
-    place: tuple[DeviceArray, DeviceArray, DeviceArray],
-    weight: tuple[DeviceArray, DeviceArray],
-    side: int,
-    pitch: float,
-) -> SurfacePoints:
-    """Return the hits that are points of the lattice and scatter."""
-    along = pick(mi.UInt32(axis), hit.n)[2]
-    own = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
-    strength = hit.reflectivity * (pitch * pitch) / dr.abs(along) * weight[0] * weight[0]
-    at = _along(axis, *place)
-    dr.eval(own, at, hit.n, strength, weight[1])
-    keep = np.flatnonzero(np.array(own))
-    points, normals = (np.ascontiguousarray(np.array(v).T[keep], np.float32) for v in (at, hit.n))
-    turn = np.array(weight[1])[keep]
-    phase = np.asarray((turn - np.rint(turn)) * (2 * np.pi), np.float32)
-    return SurfacePoints(points, normals, np.array(strength)[keep], phase)
+    def on_rays(self, cells: _Cells, side: int, key: DeviceArray, numbers: NDArray[np.uint32]) -> list[SurfacePoints]:
+        """Return the points on the rays through some cells: those of first hits, of second ones, and so on."""
+        cell = mi.UInt32(numbers)
+        i = mi.Int32(cell % cells.wide) + cells.low[0]
+        j = mi.Int32(cell // cells.wide) + cells.low[1]
+        p, q, bits = place_in_cell(i, j, key, self.pitch)
+        amplitude, turn, _ = weight_of(bits)
+        begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)  # from where the surface faces
+        a, skip = dr.full(mi.Float, begin, len(numbers)), way * BEYOND * (cells.ends[1] - cells.ends[0])
+        u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
+        made: list[SurfacePoints] = []
+        while True:
+            hit = self.surfaces.hit(self.scene, mi.Ray3f(mi.Point3f(_along(cells.axis, p, q, a)), u))
+            at = a + way * hit.t
+            made.append(self._kept(cells.axis, side, hit, (p, q, at), (amplitude, turn)))
+            going = np.flatnonzero(np.array(hit.valid))
+            if not len(going):
+                return made
+            kept = mi.UInt32(going.astype(np.uint32))
+            p, q, amplitude, turn, at = (dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at))
+            a = at + skip
+            dr.eval(p, q, amplitude, turn, a)
+
+    def _kept(
+        self, axis: int, side: int, hit: Hit, place: tuple[DeviceArray, ...], weight: tuple[DeviceArray, ...]
+    ) -> SurfacePoints:
+        """Return the hits where the surface leans on the axis most, to the side given, and scatters."""
+        along = pick(mi.UInt32(axis), hit.n)[2]
+        own = hit.valid & (nearest_axis(hit.n) == axis) & ((along > 0) == bool(side)) & (hit.reflectivity > 0)
+        strength = hit.reflectivity * (self.pitch * self.pitch) / dr.abs(along) * weight[0] * weight[0]
+        at = _along(axis, *place)
+        dr.eval(own, at, hit.n, strength, weight[1])
+        keep = np.flatnonzero(np.array(own))
+        points, normals = (np.ascontiguousarray(np.array(values).T[keep], np.float32) for values in (at, hit.n))
+        turn = np.array(weight[1])[keep]
+        phase = np.asarray((turn - np.rint(turn)) * (2 * np.pi), np.float32)
+        return SurfacePoints(points, normals, np.array(strength)[keep], phase)
 
 
 def _along(axis: int, p: DeviceArray, q: DeviceArray, a: DeviceArray) -> mi.Vector3f:
