@@ -32,12 +32,13 @@ if TYPE_CHECKING:
     from mitsonar.instruments.channel_sonar import ChannelSonar
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.instruments.named_sonars import load_sonar
-    from mitsonar.mapping.frame_source import load_frames
     from mitsonar.mapping.mosaic import build_mosaic
     from mitsonar.mapping.odometry import odometry
+    from mitsonar.mapping.open_frames import load_frames
     from mitsonar.motion.composition import Motion
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.recordings.open_recording import open_recording
     from mitsonar.records.impulse_responses import ImpulseResponses
     from mitsonar.records.sonar_frames import SonarFrames
     from mitsonar.simulation.channel import ChannelSimulator
@@ -72,6 +73,7 @@ __all__ = [
     "load_sonar",
     "make_dataset",
     "odometry",
+    "open_recording",
 ]
 
 _MODULES = {
@@ -95,13 +97,14 @@ _MODULES = {
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
     "load_checkpoint": "estimation.named_estimators",
-    "load_frames": "mapping.frame_source",
+    "load_frames": "mapping.open_frames",
     "load_noise": "acoustics.noise",
     "load_recipe": "config.data_recipe",
     "load_scene": "simulation.scene",
     "load_sonar": "instruments.named_sonars",
     "make_dataset": "datasets.generation",
     "odometry": "mapping.odometry",
+    "open_recording": "recordings.open_recording",
 }
 
 plugins.install()

@@ -134,7 +134,7 @@ def make_frames_zarr(folder: Path) -> None:
 
 
 def read_frames_zarr(folder: Path) -> None:
-    from mitsonar.mapping.frame_source import open_frames
+    from mitsonar.mapping.open_frames import open_frames
 
     SonarFrames.load(folder / "frames.zarr")
     with warnings.catch_warnings():

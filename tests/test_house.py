@@ -23,6 +23,7 @@ ROOMS = (
     "geometry",
     "acoustics",
     "records",
+    "recordings",
     "plugins",
     "worlds",
     "config",

@@ -95,7 +95,7 @@ def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | Non
     """Return views and their kind, of a data set of vectors alone or of portions of a view; else None."""
     from mitsonar.config.data_recipe import array_names
     from mitsonar.datasets.store import DataStore
-    from mitsonar.mapping.frame_source import is_data_set
+    from mitsonar.mapping.open_frames import is_data_set
 
     if not is_data_set(where):
         return None

@@ -1,30 +1,27 @@
-"""Sonar frames of one run, read some at a time: ``frames.npz``, ``frames.zarr`` of a long run, a sequence of a data set."""
+"""Sonar frames of one run, read some at a time: of a simulated run, a data set or a recording."""
 
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.errors import MitsonarError
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import associated
-from mitsonar.records.columns import check_column, open_group
-from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
+from mitsonar.recordings.recording import Part
+from mitsonar.records.sonar_frames import LABELS, SonarFrames
 
 if TYPE_CHECKING:
-    from mitsonar.datasets.store import DataStore
     from mitsonar.estimation.height.direct_height import HeightEstimator
 
-__all__ = ["FrameSource", "is_data_set", "load_frames", "open_frames", "sequence_in"]
+__all__ = ["FrameSource", "Pixels"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -32,16 +29,11 @@ Index = NDArray[np.intp]
 Pixels = NDArray[np.generic]
 """Images ``(n, bins, beams)``: uint8 in 0..255, or float32 in 0..1."""
 
-StoredArray = Any
-"""An array of Zarr, whichever form of its metadata; read by indices."""
-
 CHUNK_BYTES = 8 * 2**20
 """Approximate size of the pixels that are read at a time [bytes]."""
 
 PLANAR = 1e-6
 """Smallest change of height, pitch or roll along a path [m, rad]: files round them."""
-
-FINDING = "give frames.npz, frames.zarr, the folder of a run, or a data set"
 
 
 @dataclass(frozen=True)
@@ -54,6 +46,7 @@ class FrameSource:
         time_s: of the frames ``(frames,)`` [s]; where each beam has its own, their mean.
         images: reads the frames of given numbers ``(n,)``: ``(n, bins, beams)``.
         poses: true poses of the sonar ``(frames, 6)`` [m, rad], where known.
+        attitude_rad: pitch, roll, heading by the sonar's own sensors ``(frames, 3)`` [rad], where known; nan where not.
         height_m: over the ground ``(frames,)``, where known; nan where nothing is below.
         pitch_rad: of the sonar, where its poses are not known.
         told_height_m: the height that the user gave for frames without one.
@@ -69,6 +62,7 @@ class FrameSource:
     time_s: Array
     images: Callable[[Index], Pixels]
     poses: Array | None = None
+    attitude_rad: Array | None = None
     height_m: Array | None = None
     pitch_rad: float | None = None
     told_height_m: float | None = None
@@ -87,10 +81,18 @@ class FrameSource:
         """Take frames that are in memory; labels are not kept."""
         nothing: dict[str, Any] = dict.fromkeys(LABELS)
         frames = replace(frames, **nothing)
-        return cls._of(frames.select(slice(0)), frames.time_s, frames.poses, frames.height_m, frames.image.__getitem__, name)
+        like, images = frames.select(slice(0)), frames.image.__getitem__
+        source = cls.of_arrays(like, frames.time_s, frames.poses, frames.height_m, images, name)
+        return replace(source, attitude_rad=frames.attitude_rad)
 
     @classmethod
-    def _of(
+    def of_part(cls, part: Part, name: str, note: str = "") -> Self:
+        """Take a part of a recording."""
+        source = cls.of_arrays(part.like, part.time_s, part.poses, part.height_m, part.images, name, note=note)
+        return replace(source, attitude_rad=part.attitude_rad)
+
+    @classmethod
+    def of_arrays(
         cls,
         like: SonarFrames,
         time_s: Array,
@@ -102,9 +104,10 @@ class FrameSource:
         first_number: int = 0,
         note: str = "",
     ) -> Self:
+        """Take frames whose times, poses and heights are in memory, and whose images are read on demand."""
         time = np.asarray(time_s, dtype=float)
         time = time.mean(axis=1) if time.ndim == 2 else time
-        return cls(name, like, time, images, poses, height_m, first_number=first_number, note=note)
+        return cls(name, like, time, images, poses, None, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
         """Return the same frames with noise: a function of the seed and the number of each frame."""
@@ -204,6 +207,7 @@ class FrameSource:
             image=image,
             time_s=self.time_s[chosen],
             poses=self._attitudes(chosen),
+            attitude_rad=None,
             height_m=None if self.height_m is None else self.height_m[chosen],
         )
         return frames if self.altimeter is None else measured(frames, self.altimeter)[0]
@@ -212,7 +216,12 @@ class FrameSource:
         """Return poses without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
         if self.poses is not None:
             return self.poses[chosen] * [0, 0, 1, 1, 1, 0]
-        return None if self.pitch_rad is None else np.tile([0.0, 0, 0, self.pitch_rad, 0, 0], (len(chosen), 1))
+        if self.pitch_rad is not None:
+            return np.tile([0.0, 0, 0, self.pitch_rad, 0, 0], (len(chosen), 1))
+        if self.attitude_rad is None:
+            return None
+        pitch_roll = self.attitude_rad[chosen, :2]
+        return np.column_stack([np.zeros((len(chosen), 3)), pitch_roll, np.zeros(len(chosen))])
 
     def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
         """Read frames of these numbers, some at a time."""
@@ -259,147 +268,3 @@ class FrameSource:
             some = np.unique(np.linspace(0, len(self) - 1, 3).astype(np.intp))
             digest.update(np.ascontiguousarray(self.read(some).image).tobytes())
         return digest.hexdigest()
-
-
-def open_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> FrameSource:
-    """Open the frames at a path or URL.
-
-    Args:
-        where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, or a data set.
-        sequence: of a data set; default: the longest; of several, the first.
-        view: of a data set; default: the first.
-
-    Raises:
-        MitsonarError: no frames there; a sequence or view that is not there.
-    """
-    path = Path(where)
-    if is_data_set(where):
-        return _of_data_set(str(where), sequence, view)
-    if sequence is not None or view is not None:
-        raise MitsonarError(f"{where} is no data set: sequence and view choose among those of a data set; leave them out")
-    if path.is_dir() and not (path / "zarr.json").is_file():
-        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
-        if not found:
-            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
-        path = found[0]
-    return _of_zarr(path, str(where)) if path.is_dir() else FrameSource.of(SonarFrames.load(path), str(where))
-
-
-def load_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> SonarFrames:
-    """Load all frames at a path or URL into memory; see :func:`open_frames`.
-
-    Raises:
-        MitsonarError: no frames there; a sequence or view that is not there.
-    """
-    source = open_frames(where, sequence=sequence, view=view)
-    return source.read(np.arange(len(source)))
-
-
-def is_data_set(where: str | Path) -> bool:
-    """Return whether a data set is there. Every URL is one. Frames of a long run are Zarr too, with other attributes."""
-    path = Path(where)
-    if "://" in str(where):
-        return True
-    if not (path / "zarr.json").is_file():
-        return False
-    import zarr
-
-    try:
-        return bool(zarr.open_group(path, mode="r").attrs.get("kind") == "mitsonar data set")
-    except Exception:  # a damaged Zarr may raise anything
-        return False
-
-
-def _of_zarr(path: Path, name: str) -> FrameSource:
-    """Open the frames of a long run, also of one that is not finished."""
-    try:
-        found, done = open_group(path, COLUMNS, "time_s", "frames_done")
-        arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
-        arrays = {name: array for name, array in arrays.items() if name not in (*LABELS, "pitch_rad")}
-        image = arrays["image"]
-        table: dict[str, Any] = {
-            name: array[:done] if name in PER_FRAME else array[...] for name, array in arrays.items() if name != "image"
-        }
-        table |= {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
-        nothing = np.zeros((0, *image.shape[1:]), dtype=image.dtype)
-        none_of = {name: values[:0] for name, values in table.items() if name in PER_FRAME}
-    except Exception as error:
-        raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
-    like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
-    for known in ("poses", "height_m"):
-        if known in table:
-            check_column(table[known], known, COLUMNS[known], {"frames": done, "six": 6}, str(path))
-    times = table["time_s"]
-    if times.ndim == 1:
-        check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
-    if done < image.shape[0]:
-        message = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
-        warnings.warn(message, MitsonarWarning, stacklevel=3)
-    poses, height = table.get("poses"), table.get("height_m")
-
-    def images(index: Index) -> Pixels:
-        picked = _picked(image, index)
-        check_column(picked, "image", COLUMNS["image"], {}, str(path))
-        return picked
-
-    return FrameSource._of(like, table["time_s"], poses, height, images, name)
-
-
-def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
-    from mitsonar.config.data_recipe import array_names
-    from mitsonar.datasets.store import DataStore  # its import takes half a second
-
-    store = DataStore.open(url)
-    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
-    if not stored:
-        raise MitsonarError(f"{url} holds vectors, no images: give a data set of images")
-    views = {one.name: one for one in store.recipe.views}
-    name = next(iter(stored)) if view is None else view
-    if name not in stored:
-        raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
-    here, number, which = sequence_in(store, sequence)
-    image = store.array(stored[name])
-    like = SonarFrames(
-        image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
-        range_m=views[name].sonar.range_m,
-        bearing_rad=views[name].bearing_rad,
-        time_s=np.zeros(0),
-        sonar=views[name].sonar,
-        level_scale=float(store.about["level_scale"]),
-    )
-    return FrameSource._of(
-        like,
-        store.read("time_s", here),
-        store.read("pose", here),
-        store.read("height_m", here),
-        lambda index: _picked(image, index + here.start),
-        f"{url}, sequence {number}",
-        first_number=here.start,
-        note=which + (f", view {name}" if len(stored) > 1 else ""),
-    )
-
-
-def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
-    """Return the frames of a sequence of a data set, its number, and a description. Default: the longest, or the first such.
-
-    Raises:
-        MitsonarError: no such sequence.
-    """
-    sequences = store.read("sequence")
-    lengths = np.bincount(sequences)
-    number = int(lengths.argmax()) if sequence is None else sequence
-    if not (0 <= number < len(lengths) and lengths[number]):
-        raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
-    first = int(np.argmax(sequences == number))
-    which = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
-    return slice(first, first + int(lengths[number])), number, which
-
-
-def _picked(image: StoredArray, index: Index) -> Pixels:
-    """Read frames of a Zarr array; those at equal steps at once."""
-    if not len(index):
-        return np.asarray(image[:0])
-    steps = np.unique(np.diff(index))
-    if len(steps) <= 1 and (not len(steps) or steps[0] > 0):
-        return np.asarray(image[int(index[0]) : int(index[-1]) + 1 : int(steps[0]) if len(steps) else 1])
-    return np.stack([np.asarray(image[int(one)]) for one in index])

@@ -10,7 +10,8 @@ from mitsonar.acoustics.noise import load_noise
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.estimation.height.named_height_estimators import height_estimator_from
-from mitsonar.mapping.frame_source import FrameSource, open_frames
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.open_frames import open_frames
 from mitsonar.mapping.response_source import ResponseSource, holds_responses, open_responses
 from mitsonar.mapping.view_source import ViewSource, open_views
 from mitsonar.records.impulse_responses import ImpulseResponses

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.mapping.frame_source import sequence_in
 from mitsonar.mapping.measured_heights import measured
+from mitsonar.mapping.open_frames import sequence_in
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.view_frames import ViewFrames
 

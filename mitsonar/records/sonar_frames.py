@@ -22,7 +22,7 @@ __all__ = ["LABELS", "SonarFrames", "to_uint8"]
 LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
 """Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
 
-PER_FRAME = ("image", "time_s", "poses", "height_m", *LABELS)
+PER_FRAME = ("image", "time_s", "poses", "attitude_rad", "height_m", *LABELS)
 
 IMAGE = ("frames", "bins", "beams")
 
@@ -32,6 +32,7 @@ COLUMNS = {
     "bearing_rad": Column(("beams",), low=-math.pi, high=math.pi, order="strict"),
     "time_s": Column(("frames",), order="same"),
     "poses": Column(("frames", "six"), low=-1e9, high=1e9),
+    "attitude_rad": Column(("frames", "three"), low=-7, high=7, nan=True),
     "height_m": Column(("frames",), low=0, nan=True),
     "elevation_rad": Column(IMAGE, low=-math.pi, high=math.pi, nan=True),
     "shape_id": Column(IMAGE, "i", low=-1),
@@ -64,6 +65,7 @@ class SonarFrames:
             empty where they are not known.
         shadow: 0 not in shadow; 1 no echo here, but echoes before and sound or echoes beyond; 2 no echo here and all
             sound of the beam was intercepted before (an object's shadow that nothing ends, or past the lit floor).
+        attitude_rad: pitch, roll, heading [rad] of the sonar by its own sensors ``(frames, 3)``; nan where unknown.
     """
 
     image: NDArray[Any]
@@ -81,6 +83,7 @@ class SonarFrames:
     shadow: NDArray[np.uint8] | None = None
     shape_names: tuple[str, ...] = ()
     object_names: tuple[str, ...] = ()
+    attitude_rad: NDArray[np.float64] | None = None
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -114,6 +117,15 @@ class SonarFrames:
             level = 10 * np.log10(decoded(value, self.sonar, self.level) * self.level_scale)
         return float(level) + self.sonar.source_level_db
 
+    def to_linear(self) -> SonarFrames:
+        """Return the same frames with images that are levels: float32 in 0..1, relative to full scale.
+
+        Codings ``dB`` and ``gamma`` are undone with the numbers of the sonar. A value 0 of the coding dB becomes its least
+        level.
+        """
+        values = np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
+        return replace(self, image=decoded(values, self.sonar, self.level).astype(np.float32), level="linear")
+
     def matching_values(self) -> NDArray[np.float32]:
         """Return the images as float32 in 0..1, as estimators and mosaics match them, like ``image``.
 
@@ -143,7 +155,7 @@ class SonarFrames:
             "sonar": np.array(self.sonar.model_dump_json()),
             "about": np.array(json.dumps(self.about)),
         }
-        optional = ("poses", "height_m", *LABELS)
+        optional = ("poses", "attitude_rad", "height_m", *LABELS)
         table |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
         if self.shape_names or self.object_names:
             table["names"] = np.array(json.dumps({"shapes": self.shape_names, "objects": self.object_names}))
@@ -236,7 +248,7 @@ def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:
     column = COLUMNS["time_s"] if time.ndim != 2 else replace(COLUMNS["time_s"], dims=("frames", "beams"))
     check_column(time, "time_s", column, sizes, source)
     sizes["frames"] = len(time)
-    sizes["six"] = 6
+    sizes |= {"six": 6, "three": 3}
     for name in [name for name in values if name not in ("range_m", "bearing_rad", "time_s")]:
         check_column(values[name], name, COLUMNS[name], sizes, source)
     image = values["image"]

@@ -588,7 +588,7 @@ def test_frames_done_of_a_run_that_cannot_be(done: Any, tmp_path: Path) -> None:
 
 def test_a_run_without_frames_has_none_to_read(tmp_path: Path) -> None:
     """The index of a frame that is not there was a traceback."""
-    from mitsonar.mapping.frame_source import load_frames, open_frames
+    from mitsonar.mapping.open_frames import load_frames, open_frames
 
     make_frames_zarr(tmp_path)
     path = tmp_path / "frames.zarr"

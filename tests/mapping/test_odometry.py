@@ -23,10 +23,11 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping import odometry_run
-from mitsonar.mapping.frame_source import FrameSource, open_frames
+from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import bridged, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
+from mitsonar.mapping.open_frames import open_frames
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose

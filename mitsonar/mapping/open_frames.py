@@ -1,0 +1,193 @@
+"""Sonar frames at a path or URL: ``frames.npz``, ``frames.zarr`` of a long run, a sequence of a data set, a recording."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.mapping.frame_source import FrameSource, Pixels
+from mitsonar.recordings.open_recording import format_of, open_recording
+from mitsonar.records.columns import check_column, open_group
+from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.store import DataStore
+
+__all__ = ["is_data_set", "is_recording", "load_frames", "open_frames", "sequence_in"]
+
+Index = NDArray[np.intp]
+
+StoredArray = Any
+"""An array of Zarr, whichever form of its metadata; read by indices."""
+
+FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
+
+
+def open_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> FrameSource:
+    """Open the frames at a path or URL.
+
+    Args:
+        where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
+        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
+        view: of a data set; default: the first.
+
+    Raises:
+        MitsonarError: no frames there; a sequence or view that is not there.
+    """
+    path = Path(where)
+    if is_data_set(where):
+        return _of_data_set(str(where), sequence, view)
+    if is_recording(where):
+        return _of_recording(path, sequence, view)
+    if sequence is not None or view is not None:
+        raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
+    if path.is_dir() and not (path / "zarr.json").is_file():
+        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+        if not found:
+            raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
+        path = found[0]
+    return _of_zarr(path, str(where)) if path.is_dir() else FrameSource.of(SonarFrames.load(path), str(where))
+
+
+def load_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> SonarFrames:
+    """Load all frames at a path or URL into memory; see :func:`open_frames`.
+
+    Raises:
+        MitsonarError: no frames there; a sequence or view that is not there.
+    """
+    source = open_frames(where, sequence=sequence, view=view)
+    return source.read(np.arange(len(source)))
+
+
+def is_data_set(where: str | Path) -> bool:
+    """Return whether a data set is there. Every URL is one. Frames of a long run are Zarr too, with other attributes."""
+    path = Path(where)
+    if "://" in str(where):
+        return True
+    if not (path / "zarr.json").is_file():
+        return False
+    import zarr
+
+    try:
+        return bool(zarr.open_group(path, mode="r").attrs.get("kind") == "mitsonar data set")
+    except Exception:  # a damaged Zarr may raise anything
+        return False
+
+
+def is_recording(where: str | Path) -> bool:
+    """Return whether a recording of a real sonar is there."""
+    return "://" not in str(where) and format_of(where) is not None
+
+
+def _of_recording(path: Path, number: int | None, view: str | None) -> FrameSource:
+    """Open a part of a recording."""
+    if view is not None:
+        raise MitsonarError(f"{path} is a recording of one sonar: view chooses among those of a data set; leave it out")
+    recording = open_recording(path)
+    for note in recording.notes:
+        warnings.warn(f"{path}: {note}", MitsonarWarning, stacklevel=3)
+    part, which = recording.part(number), ""
+    if len(recording.parts) > 1:
+        chosen = recording.longest if number is None else number
+        which = f"part {chosen} of {len(recording.parts):,}{', the longest' if number is None else ''}: {len(part):,} frames"
+    return FrameSource.of_part(part, str(path), which)
+
+
+def _of_zarr(path: Path, name: str) -> FrameSource:
+    """Open the frames of a long run, also of one that is not finished."""
+    try:
+        found, done = open_group(path, COLUMNS, "time_s", "frames_done")
+        arrays = {name: one for name, one in found.items() if not isinstance(one, np.ndarray)}
+        arrays = {name: array for name, array in arrays.items() if name not in (*LABELS, "pitch_rad")}
+        image = arrays["image"]
+        table: dict[str, Any] = {
+            name: array[:done] if name in PER_FRAME else array[...] for name, array in arrays.items() if name != "image"
+        }
+        table |= {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+        nothing = np.zeros((0, *image.shape[1:]), dtype=image.dtype)
+        none_of = {name: values[:0] for name, values in table.items() if name in PER_FRAME}
+    except Exception as error:
+        raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
+    like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
+    for known in ("poses", "height_m"):
+        if known in table:
+            check_column(table[known], known, COLUMNS[known], {"frames": done, "six": 6}, str(path))
+    times = table["time_s"]
+    if times.ndim == 1:
+        check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
+    if done < image.shape[0]:
+        message = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
+        warnings.warn(message, MitsonarWarning, stacklevel=3)
+    poses, height = table.get("poses"), table.get("height_m")
+
+    def images(index: Index) -> Pixels:
+        picked = _picked(image, index)
+        check_column(picked, "image", COLUMNS["image"], {}, str(path))
+        return picked
+
+    return FrameSource.of_arrays(like, table["time_s"], poses, height, images, name)
+
+
+def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
+    from mitsonar.config.data_recipe import array_names
+    from mitsonar.datasets.store import DataStore  # its import takes half a second
+
+    store = DataStore.open(url)
+    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
+    if not stored:
+        raise MitsonarError(f"{url} holds vectors, no images: give a data set of images")
+    views = {one.name: one for one in store.recipe.views}
+    name = next(iter(stored)) if view is None else view
+    if name not in stored:
+        raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
+    here, number, which = sequence_in(store, sequence)
+    image = store.array(stored[name])
+    like = SonarFrames(
+        image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
+        range_m=views[name].sonar.range_m,
+        bearing_rad=views[name].bearing_rad,
+        time_s=np.zeros(0),
+        sonar=views[name].sonar,
+        level_scale=float(store.about["level_scale"]),
+    )
+    return FrameSource.of_arrays(
+        like,
+        store.read("time_s", here),
+        store.read("pose", here),
+        store.read("height_m", here),
+        lambda index: _picked(image, index + here.start),
+        f"{url}, sequence {number}",
+        first_number=here.start,
+        note=which + (f", view {name}" if len(stored) > 1 else ""),
+    )
+
+
+def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
+    """Return the frames of a sequence of a data set, its number, and a description. Default: the longest, or the first such.
+
+    Raises:
+        MitsonarError: no such sequence.
+    """
+    sequences = store.read("sequence")
+    lengths = np.bincount(sequences)
+    number = int(lengths.argmax()) if sequence is None else sequence
+    if not (0 <= number < len(lengths) and lengths[number]):
+        raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
+    first = int(np.argmax(sequences == number))
+    which = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
+    return slice(first, first + int(lengths[number])), number, which
+
+
+def _picked(image: StoredArray, index: Index) -> Pixels:
+    """Read frames of a Zarr array; those at equal steps at once."""
+    if not len(index):
+        return np.asarray(image[:0])
+    steps = np.unique(np.diff(index))
+    if len(steps) <= 1 and (not len(steps) or steps[0] > 0):
+        return np.asarray(image[int(index[0]) : int(index[-1]) + 1 : int(steps[0]) if len(steps) else 1])
+    return np.stack([np.asarray(image[int(one)]) for one in index])

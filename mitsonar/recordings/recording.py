@@ -1,0 +1,154 @@
+"""The currency of the readers: a recording of one sonar, in parts of one geometry each, whose pixels are read on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["Facts", "Part", "Pixels", "Recording", "in_time_order", "runs_of"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+Pixels = NDArray[np.generic]
+"""Images ``(n, bins, beams)``: uint8 in 0..255, or float32 in 0..1."""
+
+Facts: TypeAlias = dict[str, Any]
+"""Values of a file's headers by name: numbers, texts, lists of them."""
+
+CHUNK_BYTES = 8 * 2**20
+"""Approximate size of the pixels that are read at a time [bytes]."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Consecutive frames of one geometry: one window, one set of beams, one coding.
+
+    Attributes:
+        like: no frames, but all that is the same for each of them: sonar, ranges, bearings, level.
+        time_s: of the frames ``(frames,)`` [s], rising. Seconds since 1970 where the file tells the date.
+        images: reads the frames of given numbers ``(n,)``: ``(n, bins, beams)``, column 0 most to port.
+        poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
+        attitude_rad: pitch, roll, heading [rad] ``(frames, 3)`` by the sonar's own sensors; nan where unknown.
+        height_m: over the ground ``(frames,)``, where known.
+        gain_db: receiver gain of each frame ``(frames,)`` [dB], where known.
+    """
+
+    like: SonarFrames
+    time_s: Array
+    images: Callable[[Index], Pixels]
+    poses: Array | None = None
+    attitude_rad: Array | None = None
+    height_m: Array | None = None
+    gain_db: Array | None = None
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.time_s)
+
+    def read(self, index: ArrayLike) -> SonarFrames:
+        """Read frames of these numbers ``(n,)``.
+
+        Raises:
+            MitsonarError: frames that are not there, or that cannot be read.
+        """
+        chosen = np.asarray(index, dtype=np.intp)
+        beyond = chosen[(chosen < 0) | (chosen >= len(self))]
+        if beyond.size:
+            raise MitsonarError(f"there is no frame {beyond[0]}: the part holds {len(self):,}, numbered from 0")
+        per_frame = ("poses", "attitude_rad", "height_m")
+        known = {name: getattr(self, name)[chosen] for name in per_frame if getattr(self, name) is not None}
+        return replace(self.like, image=self.images(chosen), time_s=self.time_s[chosen], **known)
+
+    def chunks(self) -> Iterator[SonarFrames]:
+        """Read all frames, some at a time, so that memory does not grow with the file."""
+        cells = max(1, len(self.like.range_m) * len(self.like.bearing_rad))
+        count = max(1, CHUNK_BYTES // (4 * cells))
+        for start in range(0, len(self), count):
+            yield self.read(np.arange(start, min(start + count, len(self))))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A file of a real sonar, or a folder of one.
+
+    Attributes:
+        name: of the file.
+        format: in words: ``ARIS 5 (.aris)``.
+        parts: in the order of time; one where neither window nor beams change.
+        facts: what the headers tell, by name.
+        notes: sentences on what was left out, sorted or assumed.
+    """
+
+    name: str
+    format: str
+    parts: tuple[Part, ...]
+    facts: Facts = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not any(len(part) for part in self.parts):
+            raise MitsonarError(f"{self.name} holds no frame that can be read: the file is empty or damaged")
+
+    def __len__(self) -> int:
+        """Return the number of frames of all parts."""
+        return sum(len(part) for part in self.parts)
+
+    @property
+    def longest(self) -> int:
+        """Return the number of the longest part; of several, the first."""
+        return int(np.argmax([len(part) for part in self.parts]))
+
+    def part(self, number: int | None = None) -> Part:
+        """Return a part by its number; default: the longest.
+
+        Raises:
+            MitsonarError: no such part.
+        """
+        if number is not None and not 0 <= number < len(self.parts):
+            raise MitsonarError(f"{self.name} has no part {number}: it has {len(self.parts):,}, numbered from 0")
+        return self.parts[self.longest if number is None else number]
+
+
+def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[Index, list[str]]:
+    """Sort frames by time and drop repeated ones.
+
+    Args:
+        time_s: of the frames ``(frames,)`` [s].
+        number: that the sonar gave each frame ``(frames,)``, where known. It tells repeated from simultaneous frames.
+
+    Returns:
+        The places of the kept frames, times rising, and sentences on what was sorted, dropped or is missing.
+    """
+    time = np.asarray(time_s, dtype=float)
+    known = np.isfinite(time)
+    order = np.flatnonzero(known)[np.argsort(time[known], kind="stable")]
+    notes = [] if known.all() else [f"{(~known).sum():,} frames have no valid time and are left out"]
+    if (np.diff(order) < 0).any():
+        notes.append("frames are not in the order of time: they were sorted")
+    kept = order[np.diff(time[order], prepend=-np.inf) > 0]
+    if len(kept) < len(order):
+        notes.append(f"{len(order) - len(kept):,} frames repeat the time of the one before and are left out")
+    if number is not None and len(kept) > 1:
+        steps = np.diff(np.asarray(number, dtype=float)[kept])
+        missing = float((steps[steps > 1] - 1).sum())
+        if missing:
+            notes.append(f"{missing:,.0f} frames are missing, by the numbers that the sonar gave them")
+    return kept, notes
+
+
+def runs_of(keys: Sequence[Hashable]) -> list[tuple[Hashable, Index]]:
+    """Return each run of equal keys with the places of its members: frames of one geometry belong to one part."""
+    runs: list[tuple[Hashable, list[int]]] = []
+    for place, key in enumerate(keys):
+        if not runs or runs[-1][0] != key:
+            runs.append((key, []))
+        runs[-1][1].append(place)
+    return [(key, np.asarray(places, dtype=np.intp)) for key, places in runs]
