@@ -20,8 +20,10 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.hashed_points import MOST_CANDIDATES
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
 from mitsonar.simulation.mirror_tracing import MirrorTracer
+from mitsonar.simulation.rendered_pings import CutRays
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -76,12 +78,13 @@ class CoherentImager:
             image = image * self._stripes
         return np.asarray(image, dtype=np.complex64), counts
 
-    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts]:
-        """Return the levels of one ping after the gain ``(bins, beams)`` float32, and the counts of its rays."""
+    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts, CutRays]:
+        """Return the levels of one ping after the gain ``(bins, beams)`` float32, the counts of its rays, and cut ones."""
         image, found = self.image(pose, ping)
         power = image.real * image.real + image.imag * image.imag
         rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
-        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays)
+        cut = CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
+        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), cut
 
     @cached_property
     def gain(self) -> NDArray[np.float32]:

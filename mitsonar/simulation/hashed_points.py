@@ -16,13 +16,16 @@ import mitsuba as mi
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.device_arrays import DeviceArray
 
-__all__ = ["HashedPoints", "Point", "lattice_key", "nearest_axis", "pick", "place_in_cell", "weight_of"]
+__all__ = ["MOST_CANDIDATES", "HashedPoints", "Point", "lattice_key", "nearest_axis", "pick", "place_in_cell", "weight_of"]
 
 LEAST_COSINE = 4e-3
 """Grazing cosine below which a ray's cell is no longer stretched along the surface."""
 
 MOST_CANDIDATES = 4096
 """Lattice cells that one ray may look through."""
+
+LARGEST_COUNT = 2.0**30
+"""Largest number of lattice cells that is told."""
 
 
 @dataclass
@@ -65,7 +68,8 @@ class HashedPoints:
     Attributes:
         axis: the axis of the world nearest to each normal, 0 to 2.
         count: lattice cells that may hold a point of the ray.
-        cut: rays with more cells than are looked through.
+        wanted: lattice cells around each ray's cell, 2^30 at most.
+        cut: rays with more than :data:`MOST_CANDIDATES` of them.
         strength: root of reflectivity times the area of a lattice cell [m].
     """
 
@@ -93,6 +97,7 @@ class HashedPoints:
         self.low = low
         self.wide = high[0] - low[0] + 1
         wanted = mi.Float(self.wide) * mi.Float(high[1] - low[1] + 1)
+        self.wanted: DeviceArray = dr.select(wanted < LARGEST_COUNT, wanted, LARGEST_COUNT)
         self.cut = hit.valid & (wanted > MOST_CANDIDATES)
         self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, wanted)), 0)
         side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))

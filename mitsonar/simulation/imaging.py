@@ -117,13 +117,13 @@ class Simulator:
     def _coherent_ping(self, pose: NDArray[np.float64], number: int, labels: bool) -> RenderedPings:
         """Render one coherent ping. Labels are those of the expected levels, from the same surfaces."""
         assert self.coherent is not None
-        levels, counts = self.coherent.levels(pose, number)
+        levels, counts, cut = self.coherent.levels(pose, number)
         if labels:
             pings = self._launch(pose[None], number, True)[0]
-            pings.levels, pings.expected = levels[None], pings.levels
+            pings.levels, pings.expected, pings.cut = levels[None], pings.levels, cut
             return pings
         height_m = self.tracer.height_m(self.tracer.scene, self.tracer.inputs(pose[None], number)[0])
-        return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float))
+        return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
 
     def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[RenderedPings]:
         from mitsonar.simulation import binning

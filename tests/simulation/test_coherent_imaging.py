@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -145,6 +146,19 @@ def test_far_from_the_origin_is_warned_of(flat: mi.Scene) -> None:
     far = POSE + np.array([5000.0, 0, 0, 0, 0, 0])
     with pytest.warns(MitsonarWarning, match=r"within \d+ m of the origin"):
         Simulator(scene(floor=floor(diffuse(0.5), half=1e4)), SONAR).render([Pose(*far)])
+
+
+def test_rays_that_miss_points_are_told_with_the_pitch_that_would_do(flat: mi.Scene) -> None:
+    """5 cm above the floor cells of rays reach far: what they cannot look through is told once; the pitch told is enough."""
+    low = Pose(0, 0, 0.05, math.radians(0.5), 0, math.radians(45))
+    sonar = SONAR.replace(beams=8, azimuth_fov_deg=2.4, elevation_fov_deg=2.0, range_max=12.0, scatterer_spacing_m=0.004)
+    with pytest.warns(MitsonarWarning, match="scatterer_spacing_m of") as caught:
+        Simulator(flat, sonar).render([low, low], labels=True)
+    (told,) = [str(one.message) for one in caught if "scatterer_spacing_m of" in str(one.message)]
+    rays, enough = re.match(r"([\d,]+) rays .* scatterer_spacing_m of ([\d.]+) m would do", told).groups()  # type: ignore[union-attr]
+    assert int(rays.replace(",", "")) == 2 * imager(flat, sonar).image(np.array(low), 0)[1].cut > 0
+    found = imager(flat, sonar.replace(scatterer_spacing_m=float(enough))).image(np.array(low), 0)[1]
+    assert found.cut == found.widest == 0
 
 
 def test_neighbours_correlate_as_pattern_and_pulse_say(flat: mi.Scene) -> None:
