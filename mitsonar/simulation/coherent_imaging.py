@@ -33,6 +33,9 @@ __all__ = ["CoherentImager", "coherent_imager"]
 FEWEST_A_CELL = 4.0
 """Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
 
+MOST_CUT = 1e-3
+"""Part of the rays that may miss points: those that graze the sides of bodies do, and carry little."""
+
 STRIPES, NOISE, VOLUME = 0x57121, 0x6E6F6973, 0x766F6C75
 """Keep the draws of stripes, noise and volume apart."""
 
@@ -83,8 +86,13 @@ class CoherentImager:
         image, found = self.image(pose, ping)
         power = image.real * image.real + image.imag * image.imag
         rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
-        cut = CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
-        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), cut
+        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(found)
+
+    def _cut_rays(self, found: FieldCounts) -> CutRays:
+        """Return the rays that missed points, where they are so many that a picture may show it."""
+        if found.cut <= MOST_CUT * found.inside:
+            return CutRays()
+        return CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
 
     @cached_property
     def gain(self) -> NDArray[np.float32]:

@@ -34,6 +34,9 @@ class CutRays(NamedTuple):
     enough_m: float = 0.0
 
 
+NONE_CUT = CutRays()
+
+
 @dataclass
 class RenderedPings:
     """A batch of consecutive pings.
@@ -55,7 +58,7 @@ class RenderedPings:
     height_m: NDArray[np.float64]
     labels: dict[str, Any] = field(default_factory=dict)
     expected: NDArray[np.float32] | None = None
-    cut: CutRays = CutRays()
+    cut: CutRays = NONE_CUT
 
     def __len__(self) -> int:
         return len(self.levels)

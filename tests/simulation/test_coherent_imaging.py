@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pytest
-from helpers import Array, diffuse, floor, plate, scene, sphere
+from coherent_scenes import BOXES, HEIGHT, PITCH, POSE, SONAR, imager
+from helpers import Array, diffuse, floor, scene, sphere
 from scipy import stats
 
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -33,27 +34,10 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ig
 
 Shape: TypeAlias = Callable[[Array], Array]
 
-HEIGHT, PITCH = 2.5, math.radians(35)
-SONAR = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=48, azimuth_fov_deg=14.5, beam_width_deg=0.3, range_min=4.0,
-                     range_max=4.9, range_bins=192, bearing="cone", elevation_pattern="box", quality="standard",
-                     absorption_db_per_m=0.0)  # fmt: skip
-"""Half the field of view of a DIDSON, its window within the lit floor."""
-
-BOXES = SONAR.replace(model="physical", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
-"""Hard boxes as wide as the beams."""
-
-POSE = np.array([0, 0, HEIGHT, PITCH, 0, 0])
-
 
 @pytest.fixture(scope="module")
 def flat(variant: str) -> mi.Scene:
     return scene(floor=floor(diffuse(0.5)))
-
-
-def imager(loaded: mi.Scene, sonar: Sonar = SONAR) -> CoherentImager:
-    from mitsonar.simulation.coherent_imaging import CoherentImager
-
-    return CoherentImager(loaded, sonar)
 
 
 def images(source: CoherentImager, count: int, apart: float = 0.7) -> Array:
@@ -284,71 +268,6 @@ def test_threads_do_not_change_bits(flat: mi.Scene) -> None:
         dr.set_thread_count(before)
     np.testing.assert_array_equal(fields[0], fields[1])
     np.testing.assert_array_equal(fields[0], fields[2])
-
-
-# ---------------------------------------------------------------- one point
-
-
-def one_point(sonar: Sonar) -> tuple[CoherentImager, Array]:
-    """A small plate across the axis that carries one lattice point, and the sonar's pose.
-
-    Seeds are tried until exactly one point lies on the plate.
-    """
-    at = np.array([0, 4.4, 0])
-    loaded = scene(target=plate(at, (0, -1, 0), half=0.01, bsdf=diffuse(0.5)))
-    for seed in range(200):
-        source = imager(loaded, sonar.replace(scatterer_spacing_m=0.03, seed=seed))
-        if source.tracer.field(np.zeros(6))[1].points == 1:
-            return source, np.zeros(6)
-    raise AssertionError("no seed puts one point on the plate")
-
-
-@pytest.mark.parametrize(("shading", "pattern"), [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")])
-def test_point_spread(shading: str, pattern: str) -> None:
-    """Across beams and over range: 0.5 dB down to -35 dB, and the tops of the first two side lobes."""
-    narrow = {"beams": 256, "azimuth_fov_deg": 10.0, "beam_width_deg": 0.4, "range_min": 4.2, "range_max": 4.6}
-    sonar = SONAR.replace(shading=shading, pattern=pattern, range_bins=256, pulse_m=0.02, elevation_pattern="box", **narrow)
-    source, pose = one_point(sonar)
-    made = np.abs(source.image(pose, 0)[0]).astype(float)
-    range_m = sonar.range_m
-    bin_, beam = np.unravel_index(made.argmax(), made.shape)
-    for line, axis, shape in (
-        (made[bin_], np.sin(sonar.bearing_rad), sonar.aperture.pattern),
-        (made[:, beam], range_m, source.former.pulse.shape),
-    ):
-        truth = best_fit(line, axis, shape)
-        level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / truth.max()) for v in (line, truth))
-        main = wanted > -35 if shading != "uniform" else wanted > -25
-        inner = main & (np.abs(np.arange(len(line)) - line.argmax()) < first_null(wanted))
-        assert np.abs(level - wanted)[inner].max() < 0.5
-        tops = side_lobes(wanted)[:2]
-        assert len(tops) == (2 if pattern == "receive" or axis is range_m else 1)
-        for part in (slice(max(0, top - 2), top + 3) for top in tops):
-            assert level[part].max() == pytest.approx(wanted[part].max(), abs=1.0)
-
-
-def best_fit(line: Array, axis: Array, shape: Shape) -> Array:
-    """The shape at the place between samples where it fits best."""
-    step = axis[1] - axis[0]
-    places = axis[line.argmax()] + np.linspace(-1, 1, 401) * abs(step)
-    fits = [np.abs(shape(axis - place)) for place in places]
-    scale = [float(line @ fit / (fit @ fit)) for fit in fits]
-    errors = [float(((line - a * fit) ** 2).sum()) for a, fit in zip(scale, fits, strict=True)]
-    best = int(np.argmin(errors))
-    return np.asarray(scale[best] * fits[best])
-
-
-def first_null(level: Array) -> int:
-    """Samples from the top to the first minimum on its right."""
-    top = int(level.argmax())
-    return int(np.flatnonzero(np.diff(level[top:]) > 0)[0])
-
-
-def side_lobes(level: Array) -> list[int]:
-    """Indices of the maxima right of the main lobe."""
-    begin = int(level.argmax()) + first_null(level)
-    part = level[begin:]
-    return [begin + i for i in range(1, len(part) - 1) if part[i - 1] < part[i] >= part[i + 1] and part[i] > -75]
 
 
 # ---------------------------------------------------------------- levels
