@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
+from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
@@ -80,7 +81,7 @@ class Simulator:
         self.former = expected_former(sonar, views)
         traced = sonar if self.former is None else self.former.traced
         self.tracer = Tracer(scene, traced)
-        self.notes = self.tracer.notes if self.coherent is None else self.coherent.notes
+        self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
