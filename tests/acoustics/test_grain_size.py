@@ -38,7 +38,7 @@ def test_named_materials_lie_on_them(name: str) -> None:
 
 
 def test_joints_of_the_regressions_are_small() -> None:
-    """Steps where one polynomial ends and the next begins: 10 % at 1 phi (density) and at 5 phi (roughness), 2 % elsewhere."""
+    """Steps where one polynomial ends and the next begins: 10 % at 1 phi (density) and 5 phi (roughness), 2 % elsewhere."""
     for joint, allowed in ((0.0, 0.002), (1.0, 0.11), (2.6, 0.01), (4.5, 0.01), (5.0, 0.1), (5.3, 0.02), (6.0, 0.02)):
         below, above = sediment_of(joint - 1e-9), sediment_of(joint + 1e-9)
         for key in ("density_ratio", "sound_speed_ratio", "loss", "spectral_strength"):
