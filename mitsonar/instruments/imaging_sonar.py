@@ -27,7 +27,7 @@ RAYS = ("rays_per_beam", "rays_across")
 """Fields that follow from ``quality`` where they are not given."""
 
 LEAST_APERTURE = 0.5
-"""Shortest aperture of the model coherent [wavelengths]."""
+"""Shortest aperture of a pattern of beams [wavelengths]."""
 
 MOST_COHERENT_DEG = 170
 """Largest field of view of the model coherent: its fan is even in the sine and the tangent of angles [deg]."""
@@ -228,6 +228,8 @@ class Sonar(Instrument):
             raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
         if self.model == "coherent":
             self._check_coherent()
+        if self.beam_pattern != "box":
+            self._check_aperture()
         rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
         if rays > 2**28:
             raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower quality, beams or numbers of rays")
@@ -252,11 +254,14 @@ class Sonar(Instrument):
                 f"carrier: got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger "
                 "pulse_m"
             )
-        if self.aperture.length < LEAST_APERTURE:
+
+    def _check_aperture(self) -> None:
+        length = self.aperture.length
+        if length < LEAST_APERTURE:
+            widest = math.degrees(length * self.beam_width_rad / LEAST_APERTURE)
             raise ValueError(
                 f"an aperture is at least half a wavelength: a beam of {math.degrees(self.beam_width_rad):.3g} deg takes "
-                f"{self.aperture.length:.2g}; give beam_width_deg below "
-                f"{math.degrees(self.aperture.length * self.beam_width_rad / LEAST_APERTURE):.3g}"
+                f"{length:.2g}; give beam_width_deg below {math.floor(widest * 10) / 10:g}"
             )
 
     def replace(self, **fields: FieldValue) -> Self:

@@ -20,8 +20,10 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.hashed_points import MOST_CANDIDATES
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
 from mitsonar.simulation.mirror_tracing import MirrorTracer
+from mitsonar.simulation.rendered_pings import CutRays
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -30,6 +32,9 @@ __all__ = ["CoherentImager", "coherent_imager"]
 
 FEWEST_A_CELL = 4.0
 """Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
+
+MOST_CUT = 1e-3
+"""Part of the rays that may miss points: those that graze the sides of bodies do, and carry little."""
 
 STRIPES, NOISE, VOLUME = 0x57121, 0x6E6F6973, 0x766F6C75
 """Keep the draws of stripes, noise and volume apart."""
@@ -76,12 +81,18 @@ class CoherentImager:
             image = image * self._stripes
         return np.asarray(image, dtype=np.complex64), counts
 
-    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts]:
-        """Return the levels of one ping after the gain ``(bins, beams)`` float32, and the counts of its rays."""
+    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts, CutRays]:
+        """Return the levels of one ping after the gain ``(bins, beams)`` float32, the counts of its rays, and cut ones."""
         image, found = self.image(pose, ping)
         power = image.real * image.real + image.imag * image.imag
         rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
-        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays)
+        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(found)
+
+    def _cut_rays(self, found: FieldCounts) -> CutRays:
+        """Return the rays that missed points, where they are so many that a picture may show it."""
+        if found.cut <= MOST_CUT * found.inside:
+            return CutRays()
+        return CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
 
     @cached_property
     def gain(self) -> NDArray[np.float32]:

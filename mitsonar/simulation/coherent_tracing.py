@@ -42,12 +42,19 @@ MOST_IN_A_CELL = 2.0**16
 LARGEST_WEIGHT = 4.2
 """Largest amplitude of a weight: the root of -log 2^-25."""
 
-COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points")
+COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points", "widest")
 
 
 @dataclass(frozen=True)
 class FieldCounts:
-    """Numbers of rays inside the window, nearer, farther, missed, cut short, and of points summed."""
+    """Numbers of rays of a ping, and of points.
+
+    Attributes:
+        inside, nearer, farther, missed: rays whose hit lies inside the window, nearer, farther; rays that hit nothing.
+        cut: rays whose cell of the surface holds more points than are looked through.
+        points: that were summed.
+        widest: lattice cells around the largest cell of a ray.
+    """
 
     inside: int
     nearer: int
@@ -55,6 +62,7 @@ class FieldCounts:
     missed: int
     cut: int
     points: int
+    widest: int
 
 
 class CoherentTracer:
@@ -143,6 +151,8 @@ class CoherentTracer:
         for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
             kept = found & rays.inside
             dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), kept, mode=ADD)
+        widest = mi.UInt32(COUNTED.index("widest"))
+        dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.wanted), widest, points.cut & rays.inside, mode=ADD)
 
     def _deposit(
         self,
