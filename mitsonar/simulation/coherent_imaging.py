@@ -16,6 +16,7 @@ from mitsonar.acoustics.sonar_losses import gain_of, loss_notes, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.aperture import series, shaded_sinc
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.quality import Quality
 from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
@@ -49,6 +50,7 @@ class CoherentImager:
 
     def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
+        self._given = scene, mirrors
         self._kept_waves: dict[int, NDArray[np.float32]] = {}
         parts = mirror_of(scene, mirrors)
         self.tracer = CoherentTracer(scene, sonar, self.former, parts)
@@ -84,6 +86,10 @@ class CoherentImager:
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
         return np.asarray(image, dtype=np.complex64), counts
+
+    def of_quality(self, quality: Quality) -> CoherentImager:
+        """Return what renders the same scatterers with more or fewer rays."""
+        return CoherentImager(self._given[0], self.sonar.replace(quality=quality), self._given[1])
 
     def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts]:
         """Return the levels of one ping after the gain ``(bins, beams)`` float32, and the counts of its rays."""
@@ -128,15 +134,16 @@ class CoherentImager:
         noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude)
         return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
 
-    def noise_correlation(self, ways: int) -> tuple[csr_array[Any, Any], NDArray[np.float64]]:
-        """Return the correlation over bins ``(bins, bins)`` and over beams ``(beams, beams)`` of noise; their product is
-        that of two cells.
+    def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the correlation of the beams ``(beams, beams)`` of noise, of volume, and of speckle on even ground."""
+        noise, volume = (self._plane_waves(ways).astype(float) for ways in (1, 2))
+        lines = self.former.over_sine.T.astype(float)
+        return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
 
-        Args:
-            ways: 1 for the receiver's noise, 2 for the volume's.
-        """
-        waves, rows = self._plane_waves(ways).astype(float), self._noise_ranges.astype(float)
-        return csr_array(rows @ rows.T), np.asarray(waves.T @ waves)
+    def bin_correlation(self) -> csr_array[Any, Any]:
+        """Return the correlation of the bins ``(bins, bins)``, by the pulse, of noise, volume and speckle alike."""
+        rows = self._noise_ranges.astype(float)
+        return csr_array(rows @ rows.T)
 
     @cached_property
     def _noise_amplitude(self) -> NDArray[np.float64]:
@@ -191,6 +198,12 @@ class CoherentImager:
         rows = self.former.over_range
         power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
         return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
+
+
+def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the correlation that belongs to a covariance ``(n, n)``."""
+    std = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
 
 
 def point_notes(sonar: Sonar) -> list[str]:

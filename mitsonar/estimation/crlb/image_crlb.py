@@ -10,8 +10,7 @@ optimistic, since a real estimator has to find the relief and the reflectivity o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums
 from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.estimation.crlb.fisher_bound import Bound, fisher, together
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment
@@ -53,61 +53,6 @@ VARIABLES = {
 
 MOVING = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
 """Those that move the floor out of the window."""
-
-SURE = 3.0
-"""A direction is observable in which the information exceeds so many of its standard errors."""
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Fisher information of the motion in one frame.
-
-    Attributes:
-        information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
-        reason: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
-    """
-
-    information: NDArray[np.float64]
-    reason: NDArray[np.float64]
-
-    def __add__(self, other: Bound) -> Bound:
-        """Of two independent images."""
-        return Bound(self.information + other.information, self.reason + other.reason)
-
-    def covariance(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
-
-        The pseudo-inverse where not all can be observed: the variance of an axis with a part in what cannot be is inf.
-        """
-        if frames not in (1, 2):
-            raise MitsonarError(f"a bound is that of 1 or 2 noisy frames: got {frames}")
-        diagonal = np.diag(self.information)
-        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-        size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
-        known = size > np.maximum(SURE * self._error(axes * scale[:, None]), 1e-9)
-        inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
-        lost = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
-        inverse[lost, :] = inverse[:, lost] = 0
-        inverse[lost, lost] = np.inf
-        return np.asarray(frames * inverse)
-
-    def std(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
-        return np.asarray(np.sqrt(np.diag(self.covariance(frames))))
-
-    @property
-    def relative_error(self) -> NDArray[np.float64]:
-        """Standard error of :meth:`std` as a part of it ``(3,)``; nan where an axis cannot be observed."""
-        covariance = self.covariance()
-        variance = np.diag(covariance)
-        finite = np.where(np.isfinite(covariance), covariance, 0)
-        return np.asarray(np.where(np.isfinite(variance), self._error(finite) / (2 * variance), np.nan))
-
-    def _error(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the standard error of v' F v for each column v ``(3, n)``."""
-        v = directions
-        variance: NDArray[np.float64] = np.einsum("ijkl,in,jn,kn,ln->n", self.reason, v, v, v, v)
-        return np.sqrt(np.maximum(variance, 0))
 
 
 class InformationTerms(NamedTuple):
@@ -189,24 +134,6 @@ def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
     return InformationTerms(told, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
 
 
-def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
-    """Compute F = J1' W J2, made symmetric, and the covariance of its elements.
-
-    Args:
-        jacobian: two independent estimates of how k numbers of n independent values change with the motion ``(2, n, k, 3)``.
-        weight: information of each value about its numbers ``(n, k, k)``.
-
-    With M the mean and D half the difference of both it is M' W M - D' W D, and the noise of M is as large as D.
-    """
-    mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
-    weighted = weight @ half
-    own = mean.transpose(0, 2, 1) @ weight @ mean
-    noise = half.transpose(0, 2, 1) @ weighted
-    mixed = mean.transpose(0, 2, 1) @ weighted
-    parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, 9)
-    return Bound((own - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
-
-
 def bounds_of_views(
     names: Sequence[str], views: Sequence[Derivative], noise: NoiseModel, *, apart: bool = True
 ) -> dict[tuple[str, str, str], Bound | None]:
@@ -227,12 +154,6 @@ def bounds_of_views(
                 found[ALL, kind, law] = together(parts)
             found |= {(name, kind, law): part for name, part in zip(names, parts, strict=True)}
     return found
-
-
-def together(parts: Sequence[Bound | None]) -> Bound | None:
-    """Add the information of several views, whose noise is independent; None where one view alone has no bound."""
-    known = [part for part in parts if part is not None]
-    return sum(known[1:], known[0]) if len(known) == len(parts) else None
 
 
 def bounds_at(
@@ -314,11 +235,6 @@ def cramer_rao_bound(
             raise MitsonarError(f"portions that overlap have no bound together: got view {view!r}; name one of {names}")
         found.append(one[portion, kind, law])
     return np.array([np.zeros(3) if one is None else one.std(frames) for one in found]).reshape(-1, 3)
-
-
-def overall(stds: Iterable[ArrayLike]) -> NDArray[np.float64]:
-    """One number an axis for many poses ``(3,)``: the root of the mean variance, which an RMSE is to be compared with."""
-    return np.asarray(np.sqrt(np.mean(np.square(np.array(list(stds), dtype=float)), axis=0)))
 
 
 # ---------------------------------------------------------------- what if
