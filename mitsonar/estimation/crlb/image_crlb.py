@@ -16,9 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums
+from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums, refuse_noise
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.estimation.crlb.fisher_bound import Bound, fisher, together
+from mitsonar.estimation.crlb.speckle_crlb import SPECKLE_LAWS, SpeckleBounds
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment
@@ -27,8 +28,8 @@ from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, diffe
 from mitsonar.simulation.imaging import Simulator
 
 __all__ = [
-    *("ALL", "KINDS", "LAWS", "VARIABLES", "Bound", "bound", "cramer_rao_bound", "bounds_at", "bounds_of_views"),
-    *("fisher", "floor_ranges", "overall", "refuse_speckle", "together", "varied"),
+    *("ALL", "KINDS", "LAWS", "VARIABLES", "bound", "bounds_at", "bounds_of_views", "cramer_rao_bound", "floor_ranges"),
+    *("laws_of", "varied"),
 ]
 
 KINDS: dict[str, str] = {"image": "all pixels", "vector": "sums over the beams"}
@@ -102,8 +103,13 @@ def bound(
     return _terms(derivative, noise, kind, greys).bound(law)
 
 
-def _check(kind: str, law: str) -> None:
-    for what, word, known in (("kind", kind, KINDS), ("law", law, LAWS)):
+def laws_of(sonar: Sonar) -> dict[str, str]:
+    """Return the laws that a sonar's pixels may have, by name, with what they mean; the last counts in comparisons."""
+    return SPECKLE_LAWS if sonar.model == "coherent" else LAWS
+
+
+def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Sequence[str] = tuple(LAWS)) -> None:
+    for what, word, known in (("kind", kind, kinds), ("law", law, laws)):
         if word not in known:
             raise MitsonarError(f"unknown {what} {word!r}: {nearest_names(word, known)}")
 
@@ -169,6 +175,11 @@ def bounds_at(
         pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
             an axis can be observed.
     """
+    if simulator.coherent is not None:
+        refuse_noise(noise, simulator.sonar)
+        for laws in SpeckleBounds(simulator, gain).at(poses, pings=pings):
+            yield {(simulator.views[0].name, "image", law): found for law, found in laws.items()}
+        return
     source, names = jittered(simulator), [view.name for view in simulator.views]
     portions = [view.member for view in simulator.views if isinstance(view, Segment)]
     apart = not portions or bool(np.sum(portions, axis=0).max() <= 1)
@@ -183,19 +194,6 @@ def bounds_at(
         yield found
 
 
-def refuse_speckle(sonar: Sonar) -> None:
-    """Refuse a sonar whose images are speckle: the bound is that of expected levels and noise of pixels.
-
-    Raises:
-        MitsonarError: the model ``coherent``.
-    """
-    if sonar.model == "coherent":
-        raise MitsonarError(
-            "the Cramer-Rao bound knows noise of pixels, not speckle: got the model coherent; give --model physical for the "
-            "bound of the expected levels"
-        )
-
-
 def cramer_rao_bound(
     simulator: Simulator,
     poses: ArrayLike,
@@ -204,7 +202,7 @@ def cramer_rao_bound(
     *,
     view: str | None = None,
     kind: str = "image",
-    law: str = "pixel",
+    law: str | None = None,
     frames: int = 2,
     pings: int | None = None,
 ) -> NDArray[np.float64]:
@@ -214,19 +212,20 @@ def cramer_rao_bound(
     Args:
         simulator: as for :func:`bounds_at`, with its poses and gain.
         poses: of the sonar ``(n, 6)``.
-        noise: of the pixels; without noise ask for the law ``rays``.
+        noise: of the pixels; without noise ask for the law ``rays``. The model ``coherent`` has its own: none.
         gain: that of the frames.
         view: which one; default: the only one, or all together where no two hear the same rays.
-        kind: of :data:`KINDS`.
-        law: of :data:`LAWS`.
+        kind: of :data:`KINDS`; the model ``coherent`` has images only.
+        law: of :func:`laws_of` the sonar; default: ``pixel``, of the model ``coherent`` ``ground``.
         frames: noisy ones, 1 or 2.
         pings: as for :func:`bounds_at`.
 
     Raises:
-        MitsonarError: unknown words; several portions that overlap, and none named; the model ``coherent``.
+        MitsonarError: unknown words; several portions that overlap, and none named; noise of pixels with speckle.
     """
-    _check(kind, law)
-    refuse_speckle(simulator.sonar)
+    speckle = simulator.coherent is not None
+    law = law or ("ground" if speckle else "pixel")
+    _check(kind, law, ["image"] if speckle else list(KINDS), list(laws_of(simulator.sonar)))
     portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
     found = []
     for one in bounds_at(simulator, poses, noise, gain, pings=pings):

@@ -71,9 +71,11 @@ class ScoreCovariance:
 
     def __matmul__(self, values: Floats) -> Floats:
         """Apply to maps ``(k, bins, beams)``."""
-        return self.own * values + np.stack(
-            [sum(((np.conj(w) * (r @ (w * one))).real for w, r in self.parts), np.zeros_like(one)) for one in values]
-        )
+        found = self.own * values
+        for weight, correlation in self.parts:
+            for total, one in zip(found, values, strict=True):
+                total += (np.conj(weight) * (correlation @ (weight * one))).real
+        return found
 
     def solve(self, values: Floats) -> Floats:
         """Return C^-1 of maps ``(k, bins, beams)``, by conjugate gradients.

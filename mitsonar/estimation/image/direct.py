@@ -57,7 +57,7 @@ BLOCK_CAUCHY = 4.0
 
 MODEL = 4.5
 """Squared errors over the covariance of the residuals, measured on rocky fields: the ground is neither level nor finely
-sampled. With it they are 1.2 times the covariance without noise and with speckle, and 0.3 times with a high noise of pixels."""
+sampled. With it they are 1.2 times the covariance without noise and with speckle, 0.3 times with a high noise of pixels."""
 
 REMEMBERED = 4
 LEVER_M = 4.0
