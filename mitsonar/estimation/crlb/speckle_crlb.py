@@ -15,7 +15,7 @@ yet `ground` counts pixels as exponential: with patches it is too optimistic.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +35,7 @@ from mitsonar.simulation.imaging import Simulator
 if TYPE_CHECKING:
     from mitsonar.simulation.coherent_imaging import CoherentImager
 
-__all__ = ["SPECKLE_LAWS", "SpeckleBounds", "grain_information"]
+__all__ = ["SPECKLE_LAWS", "CellScores", "SpeckleBounds", "expected_sonar", "grain_law"]
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -95,51 +95,91 @@ class SpeckleBounds:
             pings: of each half of the derivatives; default: 1 for the grain, 4 for the ground.
         """
         for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
-            yield {
-                "grain": self._grain(pose, pings or GRAIN_PINGS),
-                "ground": self._ground(pose, pings or GROUND_PINGS, FIRST_PING + 32 * PINGS * number),
-            }
+            first = FIRST_PING + 32 * PINGS * number
+            yield {"grain": self.grain(pose, pings).bound(), "ground": self.ground(pose, pings, first).bound()}
 
-    def _grain(self, pose: Floats, pings: int) -> Bound:
-        """Return the bound of known scatterers: differences of echoes' powers, of two sets of rays."""
+    def grain(self, pose: Floats, pings: int | None = None) -> CellScores:
+        """Return what cells tell of the motion where the scatterers are known.
+
+        Differences are those of the power of echoes, by two sets of rays.
+
+        Args:
+            pose: of the sonar ``(6,)``.
+            pings: see :meth:`at`.
+        """
         step = np.array(step_for(self.sonar, GRAIN_STEP))
-        jacobian = np.stack([_power_slopes(imager, pose, step, pings) for imager in self.halves])
+        jacobian = np.stack([_power_slopes(imager, pose, step, pings or GRAIN_PINGS) for imager in self.halves])
         echo, other = (imager.echoes(pose)[0].astype(np.complex128) for imager in self.halves)
         level = np.abs(echo) ** 2 + self.noise
         scale = self.gain * self.imager.gain.astype(float)[:, None]
         slope = coding_slope(level * scale, self.sonar) * scale
         use = (slope > 0) & (np.abs(echo - other) < AGREEING * np.abs(echo + other) / 2)
         rounding = np.divide(1 / (12 * GREYS**2), slope**2, out=np.full_like(slope, np.inf), where=use)
-        return grain_information(jacobian, echo, self.noise, self.of_noise, rounding)
+        return CellScores(jacobian, *grain_law(echo, self.noise, self.of_noise, rounding))
 
-    def _ground(self, pose: Floats, pings: int, first: int) -> Bound:
-        """Return the bound of a known expected level: its differences, over level and noise."""
+    def ground(self, pose: Floats, pings: int | None = None, first: int = FIRST_PING) -> CellScores:
+        """Return what cells tell of the motion where the expected level is known.
+
+        Differences are those of the expected level, over level and noise.
+
+        Args:
+            pose: of the sonar ``(6,)``.
+            pings: see :meth:`at`.
+            first: number of the first ping, of which the rays' jitter is a function.
+        """
         gain = 0.01 / float(next(self.expected.pings(pose[None], first=first)).levels.max())
-        (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings, first=first))
-        noise = self.noise * self.imager.gain[:, None] * gain
-        level = derivative.level + noise
+        (derivative,) = next(differentiate(self.expected, pose, gain, pings=pings or GROUND_PINGS, first=first))
+        level = derivative.level + self.noise * self.imager.gain[:, None] * gain
         known = (level > 0) & (derivative.variance < (AGREEING * level) ** 2)
-        jacobian = derivative.jacobian[..., 0, :] / np.where(known, level, 1)[..., None]
-        echo = np.divide(derivative.level, level, out=np.zeros_like(level), where=known)
+        safe = np.where(known, level, 1)
+        echo = np.where(known, derivative.level, 0) / safe
+        other = np.where(known, 1 - echo, 0.0)
         parts = [
             (echo, self.of_speckle * self.of_speckle),
-            (np.sqrt(2 * echo * np.maximum(1 - echo, 0)), self.of_speckle * self.of_noise),
-            (np.where(known, 1 - echo, 0.0), self.of_noise * self.of_noise),
+            (np.sqrt(2 * echo * other), self.of_speckle * self.of_noise),
+            (other, self.of_noise * self.of_noise),
         ]
-        return _bound(jacobian, known.astype(float), ScoreCovariance.of(parts, level.shape))
+        jacobian = derivative.jacobian[..., 0, :] / safe[..., None]
+        return CellScores(jacobian, known.astype(float), ScoreCovariance.of(parts, level.shape))
 
 
-def grain_information(
-    jacobian: Floats, echo: Complex, noise: Floats, shared: CellCorrelation, rounding: ArrayLike = 0.0
-) -> Bound:
-    """Compute the bound from amplitudes whose noiseless field is known.
+class CellScores(NamedTuple):
+    """What the cells of a frame tell of the motion.
+
+    Attributes:
+        jacobian: two independent estimates of how the cells' numbers change with the motion ``(2, bins, beams, 3)``.
+        weight: Fisher information of each cell about its number ``(bins, beams)``.
+        covariance: of the standardised scores.
+    """
+
+    jacobian: Floats
+    weight: Floats
+    covariance: ScoreCovariance
+
+    def bound(self) -> Bound:
+        """Compute the bound J1' W^1/2 C^-1 W^1/2 J2."""
+        return fisher_by(np.asarray(self.jacobian, dtype=float).reshape(2, -1, 1, 3), self._weigh)
+
+    def _weigh(self, values: Floats) -> Floats:
+        """Return W^1/2 C^-1 W^1/2 of values ``(cells, 1, 3)``."""
+        root = np.sqrt(self.weight)
+        maps = np.moveaxis(values.reshape(*root.shape, 3), 2, 0)
+        return np.moveaxis(root * self.covariance.solve(root * maps), 0, 2).reshape(-1, 1, 3)
+
+
+def grain_law(
+    echo: Complex, noise: Floats, shared: CellCorrelation, rounding: ArrayLike = 0.0
+) -> tuple[Floats, ScoreCovariance]:
+    """Compute what amplitudes tell about the power of an echo whose noiseless field is known.
 
     Args:
-        jacobian: two independent estimates of how the power of the echo changes with the motion ``(2, bins, beams, 3)``.
         echo: the noiseless field ``(bins, beams)``.
         noise: mean power of the noise ``(bins, beams)``; all 0: only rounding is left.
         shared: correlation of the noise of two cells.
-        rounding: variance of the power by rounding ``(bins, beams)``; inf where a pixel is saturated.
+        rounding: variance of the power by rounding ``(bins, beams)``; inf where a pixel is not to be used.
+
+    Returns:
+        The information of each cell ``(bins, beams)`` and the covariance of their scores.
 
     Raises:
         MitsonarError: neither noise nor rounding.
@@ -149,7 +189,7 @@ def grain_information(
     if not (noise > 0).all():
         if not (rounding > 0).all():
             raise MitsonarError("without noise amplitudes tell the motion without limit: give the sonar noise_level_db")
-        return _bound(jacobian, 1 / rounding, ScoreCovariance([], np.ones(power.shape)))
+        return 1 / rounding, ScoreCovariance([], np.ones(power.shape))
     variance = 1 / rician_information(power, noise)
     total = variance + rounding
     kept = np.sqrt(variance / total)  # part of the score's standard deviation that is not rounding
@@ -160,7 +200,7 @@ def grain_information(
         (kept * shares.power, shared * shared),
         (kept * shares.double * turn**2, shared * shared),
     ]
-    return _bound(jacobian, 1 / total, ScoreCovariance.of(parts, power.shape))
+    return 1 / total, ScoreCovariance.of(parts, power.shape)
 
 
 def expected_sonar(sonar: Sonar) -> Sonar:
@@ -181,14 +221,3 @@ def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int
                 echo = imager.echoes(np.array(compose(Pose(*pose), Motion(*moved))))[0]
                 slopes[..., axis] += side * (echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2)
     return slopes / (2 * step * pings)
-
-
-def _bound(jacobian: Floats, weight: Floats, covariance: ScoreCovariance) -> Bound:
-    """Return the bound J1' W^1/2 C^-1 W^1/2 J2 of cells ``(2, bins, beams, 3)``, and its noise."""
-    shape, root = weight.shape, np.sqrt(weight)
-
-    def weigh(values: Floats) -> Floats:
-        maps = np.moveaxis(values.reshape(*shape, 3), 2, 0)
-        return np.moveaxis(root * covariance.solve(root * maps), 0, 2).reshape(-1, 1, 3)
-
-    return fisher_by(np.asarray(jacobian, dtype=float).reshape(2, -1, 1, 3), weigh)
