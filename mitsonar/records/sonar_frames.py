@@ -132,10 +132,14 @@ class SonarFrames:
         Linear images are as they are. Of images in the codings ``dB`` and ``gamma`` the root of the amplitude is returned:
         of level, amplitude, root of the amplitude and dB it made the smallest errors on speckle, with all estimators.
         """
+        return self.linear_values() if self.level == "linear" else self.linear_values() ** np.float32(0.25)
+
+    def linear_values(self) -> NDArray[np.float32]:
+        """Return the levels of the images as float32, as parts of full scale, like ``image``."""
         values = np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
         if self.level == "linear":
             return values
-        return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level) ** 0.25, dtype=np.float32)
+        return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level), dtype=np.float32)
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
         """Return some of the frames."""

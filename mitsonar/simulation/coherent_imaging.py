@@ -16,6 +16,7 @@ from mitsonar.acoustics.sonar_losses import gain_of, loss_notes, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.aperture import series, shaded_sinc
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.quality import Quality
 from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
@@ -54,6 +55,7 @@ class CoherentImager:
 
     def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None) -> None:
         self.sonar, self.former = sonar, BeamFormer(sonar)
+        self._given = scene, mirrors
         self._kept_waves: dict[int, NDArray[np.float32]] = {}
         parts = mirror_of(scene, mirrors)
         self.tracer = CoherentTracer(scene, sonar, self.former, parts)
@@ -67,12 +69,7 @@ class CoherentImager:
             pose: of the sonar ``(6,)`` [m, rad].
             ping: its number, of which the noise is a function.
         """
-        field, counts = self.tracer.field(pose)
-        if self.glints is not None:
-            self.glints.add(pose, field)
-        image = self.former.beams(field) * self._loss[:, None]
-        if self.sonar.crosstalk_db is not None:
-            image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
+        image, counts = self.echoes(pose)
         if self.sonar.volume_db is not None:
             image = image + self.volume(ping)
         if self.sonar.noise_level_db is not None:
@@ -80,6 +77,24 @@ class CoherentImager:
         if self.sonar.stripes_db > 0:
             image = image * self._stripes
         return np.asarray(image, dtype=np.complex64), counts
+
+    def echoes(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.complex64], FieldCounts]:
+        """Return the complex image of the scene alone ``(bins, beams)``, without noise, volume and stripes, and the counts.
+
+        Args:
+            pose: of the sonar ``(6,)`` [m, rad].
+        """
+        field, counts = self.tracer.field(pose)
+        if self.glints is not None:
+            self.glints.add(pose, field)
+        image = self.former.beams(field) * self._loss[:, None]
+        if self.sonar.crosstalk_db is not None:
+            image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
+        return np.asarray(image, dtype=np.complex64), counts
+
+    def of_quality(self, quality: Quality) -> CoherentImager:
+        """Return what renders the same scatterers with more or fewer rays."""
+        return CoherentImager(self._given[0], self.sonar.replace(quality=quality), self._given[1])
 
     def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts, CutRays]:
         """Return the levels of one ping after the gain ``(bins, beams)`` float32, the counts of its rays, and cut ones."""
@@ -118,25 +133,55 @@ class CoherentImager:
         White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
         matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell).
         """
-        sonar = self.sonar
-        assert sonar.noise_level_db is not None
-        glow = sonar.near_glow_db * np.maximum(0, 1 - sonar.range_m / sonar.near_glow_m)
-        amplitude = 10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 20)
-        return self._white(ping, NOISE, 1) * np.asarray(amplitude, np.float32)[:, None]
+        return self._white(ping, NOISE, 1) * np.asarray(self._noise_amplitude, np.float32)[:, None]
 
     def volume(self, ping: int) -> NDArray[np.complex64]:
         """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4."""
+        return self._white(ping, VOLUME, 2) * np.asarray(self._volume_amplitude, np.float32)[:, None]
+
+    def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the mean power of noise and of volume in each bin, two arrays ``(bins,)``; 0 where there is none."""
+        sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
+        noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude)
+        return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
+
+    def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the correlation of the beams ``(beams, beams)`` of noise, of volume, and of speckle on even ground."""
+        noise, volume = (self._plane_waves(ways).astype(float) for ways in (1, 2))
+        lines = self.former.over_sine.T.astype(float)
+        return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
+
+    def bin_correlation(self) -> csr_array[Any, Any]:
+        """Return the correlation of the bins ``(bins, bins)``, by the pulse, of noise, volume and speckle alike."""
+        rows = self._noise_ranges.astype(float)
+        return csr_array(rows @ rows.T)
+
+    @cached_property
+    def _noise_amplitude(self) -> NDArray[np.float64]:
+        """Return the amplitude of the receiver's noise ``(bins,)``."""
+        sonar = self.sonar
+        assert sonar.noise_level_db is not None
+        glow = sonar.near_glow_db * np.maximum(0, 1 - sonar.range_m / sonar.near_glow_m)
+        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 20), dtype=np.float64)
+
+    @cached_property
+    def _volume_amplitude(self) -> NDArray[np.float64]:
+        """Return the amplitude of the volume's echo ``(bins,)``."""
         sonar = self.sonar
         assert sonar.volume_db is not None
         volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
         power = 10 ** (sonar.volume_db / 10) * volume / sonar.range_m**4 * loss_of(sonar)
-        return self._white(ping, VOLUME, 2) * np.asarray(np.sqrt(power), np.float32)[:, None]
+        return np.asarray(np.sqrt(power), dtype=np.float64)
+
+    def _plane_waves(self, ways: int) -> NDArray[np.float32]:
+        """Return :meth:`_waves`, computed once."""
+        if ways not in self._kept_waves:
+            self._kept_waves[ways] = self._waves(ways)
+        return self._kept_waves[ways]
 
     def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
         """Return complex Gaussian noise of unit power ``(bins, beams)`` that has passed array and matched filter."""
-        if ways not in self._kept_waves:
-            self._kept_waves[ways] = self._waves(ways)
-        waves = self._kept_waves[ways]
+        waves = self._plane_waves(ways)
         shape = 1, self.former.ranges, len(waves)
         first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
         radius = np.sqrt(-np.log(first[0]))
@@ -164,6 +209,12 @@ class CoherentImager:
         rows = self.former.over_range
         power = np.asarray(rows.multiply(rows).sum(axis=1)).ravel()
         return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
+
+
+def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the correlation that belongs to a covariance ``(n, n)``."""
+    std = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
 
 
 def point_notes(sonar: Sonar) -> list[str]:
