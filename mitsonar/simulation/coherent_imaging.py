@@ -31,8 +31,11 @@ __all__ = ["CoherentImager", "coherent_imager"]
 FEWEST_A_CELL = 4.0
 """Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
 
-STRIPES, NOISE, VOLUME = 0x57121, 0x6E6F6973, 0x766F6C75
-"""Keep the draws of stripes, noise and volume apart."""
+STRIPES, NOISE, VOLUME, GLOW = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77
+"""Keep the draws of stripes, noise, volume and glow apart."""
+
+MEDIAN_SQUARE = 0.25
+"""Median over even beams of the square of the bearing, relative to the outermost."""
 
 
 class CoherentImager:
@@ -105,13 +108,28 @@ class CoherentImager:
         """Return the receiver's noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
 
         White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
-        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell).
+        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell), those of the part of the
+        glow that stays of (seed, cell).
         """
         sonar = self.sonar
         assert sonar.noise_level_db is not None
-        glow = sonar.near_glow_db * np.maximum(0, 1 - sonar.range_m / sonar.near_glow_m)
-        amplitude = 10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 20)
-        return self._white(ping, NOISE, 1) * np.asarray(amplitude, np.float32)[:, None]
+        power = 10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 10)
+        if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
+            return self._white(ping, NOISE, 1) * np.asarray(np.sqrt(power), np.float32)
+        still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
+        new = self._white(ping, NOISE, 1) * np.asarray(np.sqrt(power - still), np.float32)
+        return np.asarray(new + self._white(0, GLOW, 1) * np.asarray(np.sqrt(still), np.float32), dtype=np.complex64)
+
+    @cached_property
+    def _glow(self) -> NDArray[np.float64]:
+        """Return what the noise near the sonar exceeds that behind by ``(bins, 1)`` or ``(bins, beams)`` [dB]."""
+        sonar = self.sonar
+        fall = (sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))[:, None]
+        if sonar.near_glow_db == 0 or (sonar.near_glow_edge_db == 0 and sonar.near_glow_spread_db == 0):
+            return np.asarray(np.maximum(0, fall), dtype=np.float64)
+        bearing = np.sin(sonar.bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max())
+        drawn = np.random.default_rng([abs(sonar.seed), GLOW]).normal(0, sonar.near_glow_spread_db, sonar.beams)
+        return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (bearing**2 - MEDIAN_SQUARE) + drawn))
 
     def volume(self, ping: int) -> NDArray[np.complex64]:
         """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4."""
