@@ -182,6 +182,19 @@ class Sonar(Instrument):
     )
     near_glow_db: float = Field(0.0, ge=0, le=120, description="noise near the sonar above noise_level_db [dB] (coherent)")
     near_glow_m: float = Field(0.5, gt=0, le=100, description="range over which near_glow_db falls to 0, evenly in dB [m]")
+    near_glow_edge_db: float = Field(
+        0.0,
+        ge=-60,
+        le=60,
+        description="what the outermost beams glow less than the middle one, as the square of the bearing [dB]",
+    )
+    near_glow_spread_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' near glow, by the seed [dB]")
+    near_glow_still: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="part of the near glow's power that is the same in every ping, as the housing's ringing is",
+    )
     absorption_db_per_m: float | None = Field(
         None, ge=0, le=1e3, description="one way [dB/m]; default: coherent by frequency and water, else 0"
     )

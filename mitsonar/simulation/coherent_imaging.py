@@ -37,8 +37,11 @@ FEWEST_A_CELL = 4.0
 MOST_CUT = 1e-3
 """Part of the rays that may miss points: those that graze the sides of bodies do, and carry little."""
 
-STRIPES, NOISE, VOLUME = 0x57121, 0x6E6F6973, 0x766F6C75
-"""Keep the draws of stripes, noise and volume apart."""
+STRIPES, NOISE, VOLUME, GLOW = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77
+"""Keep the draws of stripes, noise, volume and glow apart."""
+
+MEDIAN_SQUARE = 0.25
+"""Median over even beams of the square of the bearing, relative to the outermost."""
 
 
 class CoherentImager:
@@ -131,18 +134,38 @@ class CoherentImager:
         """Return the receiver's noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
 
         White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
-        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell).
+        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell), those of the part of the
+        glow that stays of (seed, cell).
         """
-        return self._white(ping, NOISE, 1) * np.asarray(self._noise_amplitude, np.float32)[:, None]
+        sonar, power = self.sonar, self._noise_power
+        if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
+            return self._white(ping, NOISE, 1) * np.asarray(np.sqrt(power), np.float32)
+        still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
+        new = self._white(ping, NOISE, 1) * np.asarray(np.sqrt(power - still), np.float32)
+        return np.asarray(new + self._white(0, GLOW, 1) * np.asarray(np.sqrt(still), np.float32), dtype=np.complex64)
+
+    @cached_property
+    def _glow(self) -> NDArray[np.float64]:
+        """Return what the noise near the sonar exceeds that behind by ``(bins, 1)`` or ``(bins, beams)`` [dB]."""
+        sonar = self.sonar
+        fall = (sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))[:, None]
+        if sonar.near_glow_db == 0 or (sonar.near_glow_edge_db == 0 and sonar.near_glow_spread_db == 0):
+            return np.asarray(np.maximum(0, fall), dtype=np.float64)
+        bearing = np.sin(sonar.bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max())
+        drawn = np.random.default_rng([abs(sonar.seed), GLOW]).normal(0, sonar.near_glow_spread_db, sonar.beams)
+        return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (bearing**2 - MEDIAN_SQUARE) + drawn))
 
     def volume(self, ping: int) -> NDArray[np.complex64]:
         """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4."""
         return self._white(ping, VOLUME, 2) * np.asarray(self._volume_amplitude, np.float32)[:, None]
 
     def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the mean power of noise and of volume in each bin, two arrays ``(bins,)``; 0 where there is none."""
+        """Return the mean power of noise and of volume in each bin, two arrays ``(bins,)``; 0 where there is none.
+
+        Glow that differs from beam to beam counts by its mean.
+        """
         sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
-        noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude)
+        noise = none if sonar.noise_level_db is None else self._noise_power.mean(axis=1)
         return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
 
     def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -157,12 +180,11 @@ class CoherentImager:
         return csr_array(rows @ rows.T)
 
     @cached_property
-    def _noise_amplitude(self) -> NDArray[np.float64]:
-        """Return the amplitude of the receiver's noise ``(bins,)``."""
+    def _noise_power(self) -> NDArray[np.float64]:
+        """Return the power of the receiver's noise with its glow ``(bins, 1)`` or ``(bins, beams)``."""
         sonar = self.sonar
         assert sonar.noise_level_db is not None
-        glow = sonar.near_glow_db * np.maximum(0, 1 - sonar.range_m / sonar.near_glow_m)
-        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 20), dtype=np.float64)
+        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 10), dtype=np.float64)
 
     @cached_property
     def _volume_amplitude(self) -> NDArray[np.float64]:

@@ -352,6 +352,45 @@ def test_near_glow_falls_evenly_in_decibels(flat: mi.Scene) -> None:
     assert np.abs((made - truth).reshape(-1, 16).mean(axis=1)).max() < 0.3
 
 
+GLOWING: dict[str, float] = {
+    "range_min": 0.2,
+    "range_max": 1.1,
+    "noise_level_db": -120.0,
+    "near_glow_db": 60.0,
+    "near_glow_m": 0.8,
+}
+
+
+def test_near_glow_falls_from_the_middle_beam_outwards(flat: mi.Scene) -> None:
+    """As the square of the sine of the bearing; the median beam keeps the level; each beam has its own by the seed."""
+    sonar = SONAR.replace(**GLOWING, near_glow_edge_db=20.0)
+    seen = np.stack([imager(flat, sonar).noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    made = 10 * np.log10((np.abs(seen) ** 2).mean(axis=0))
+    line = -120 + 60 * (1 - sonar.range_m[sonar.range_m < 0.4] / 0.8)
+    square = (np.sin(sonar.bearing_rad) / np.sin(sonar.bearing_rad[-1])) ** 2
+    np.testing.assert_allclose((made - line[:, None]).mean(axis=0), -20 * (square - 0.25), atol=0.4)
+    spread = sonar.replace(near_glow_spread_db=5.0)
+    other = np.stack([imager(flat, spread).noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    own = (10 * np.log10((np.abs(other) ** 2).mean(axis=0)) - made).mean(axis=0)
+    assert own.std() == pytest.approx(5, abs=1.2)
+    redrawn = imager(flat, spread.replace(seed=7)).noise(0)[sonar.range_m < 0.4]
+    assert np.corrcoef(np.log(np.abs(redrawn)).mean(axis=0), np.log(np.abs(other[0])).mean(axis=0))[0, 1] < 0.9
+
+
+def test_a_part_of_the_near_glow_stays_and_its_power_is_kept(flat: mi.Scene) -> None:
+    """The field of two pings has that coherence where the glow is far above the noise, and none behind it."""
+    sonar = SONAR.replace(**GLOWING)
+    power = [np.zeros(0)] * 2
+    for k, still in enumerate((0.0, 0.7)):
+        draws = np.stack([imager(flat, sonar.replace(near_glow_still=still)).noise(ping) for ping in range(24)])
+        power[k] = 10 * np.log10((np.abs(draws) ** 2).mean(axis=(0, 2)))
+        for part, wanted in ((sonar.range_m < 0.4, still), (sonar.range_m > 0.8, 0.0)):
+            grain = draws[:, part] / np.sqrt((np.abs(draws[:, part]) ** 2).mean(axis=(0, 2)))[None, :, None]
+            shared = (grain[1:] * grain[:-1].conj()).mean()
+            assert abs(shared) == pytest.approx(wanted, abs=0.05)
+    assert np.abs((power[1] - power[0]).reshape(-1, 16).mean(axis=1)).max() < 0.8
+
+
 def test_bright_speckle_stays_and_noise_changes(flat: mi.Scene) -> None:
     """A still sonar: pixels far above the noise keep their grain, pixels at its level do not."""
     level = 10 * math.log10(float(expected(SONAR).mean()))
