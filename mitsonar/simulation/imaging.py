@@ -109,8 +109,10 @@ class Simulator:
         if table.ndim != 2 or table.shape[1] != 6 or not len(table) or not np.isfinite(table).all():
             raise MitsonarError(f"poses must be finite numbers (frames, 6): got {table.shape}; give m and rad")
         if self.coherent is not None:
+            if labels and self.coherent.sides != (0,):
+                raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
             for place, pose in enumerate(table):
-                yield [self._coherent_ping(pose, first + place, labels)]
+                yield self.coherent.in_views(self._coherent_ping(pose, first + place, labels))
             return
         for start in range(0, len(table), self.pings_per_launch):
             yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)

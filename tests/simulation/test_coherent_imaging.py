@@ -450,12 +450,8 @@ def test_labels_come_with_speckle(flat: mi.Scene) -> None:
 
 
 def test_what_it_cannot_do_is_refused(flat: mi.Scene) -> None:
-    from mitsonar.instruments.views import Segment
-
     with pytest.raises(MitsonarError, match="give the sonar noise_level_db"):
         Simulator(flat, SONAR).render([Pose(*POSE)], noise=NOISE_MODELS["low"])
-    with pytest.raises(MitsonarError, match="no portions"):
-        Simulator(flat, SONAR, views=[Segment(SONAR, "starboard")])
 
 
 def test_too_few_points_are_told_with_the_spacing_that_would_do(flat: mi.Scene) -> None:
