@@ -17,14 +17,30 @@ FIRST_BYTES = 16
 
 
 class Format(NamedTuple):
-    """A format: in words, whether a path with these first bytes (empty for a folder) has it, and what reads it."""
+    """A format: in words, whether a path with these first bytes (empty for a folder) has it, and what reads it.
+
+    What reads it is given the path, and a geometry file or None.
+    """
 
     words: str
     fits: Callable[[Path, bytes], bool]
-    read: Callable[[Path], Recording]
+    read: Callable[[Path, Path | None], Recording]
 
 
-FORMATS: tuple[Format, ...] = (Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), read_aris),)
+def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None], Recording]:
+    """Return a reader of a format whose files tell their geometry, which refuses another one."""
+
+    def checked(path: Path, geometry: Path | None) -> Recording:
+        if geometry is not None:
+            raise MitsonarError(f"{path} tells its geometry itself: leave {geometry} out")
+        return read(path)
+
+    return checked
+
+
+FORMATS: tuple[Format, ...] = (
+    Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
+)
 """All formats, in the order in which they are tried."""
 
 
@@ -43,14 +59,15 @@ def format_of(path: str | Path) -> Format | None:
     return next((one for one in FORMATS if one.fits(path, first)), None)
 
 
-def open_recording(path: str | Path) -> Recording:
+def open_recording(path: str | Path, geometry: str | Path | None = None) -> Recording:
     """Open a recording of a real sonar; pixels are read on demand.
 
     Args:
         path: of a file or folder in one of :data:`FORMATS`; its content tells which.
+        geometry: a geometry file, for pictures. Other formats tell their geometry themselves.
 
     Raises:
-        MitsonarError: nothing there, no known format, or damaged.
+        MitsonarError: nothing there, no known format, damaged, or a geometry that is not needed.
     """
     found = format_of(path)
     if found is None:
@@ -58,4 +75,4 @@ def open_recording(path: str | Path) -> Recording:
             raise MitsonarError(f"no such file: {path}")
         known = ", ".join(one.words for one in FORMATS)
         raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known}")
-    return found.read(Path(path))
+    return found.read(Path(path), None if geometry is None else Path(geometry))
