@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
+from mitsonar.recordings.bag_file import is_ros_bag
 from mitsonar.recordings.recording import Recording
+from mitsonar.recordings.ros_bag import read_ros_bag
 
 __all__ = ["FORMATS", "Format", "format_of", "open_recording"]
 
@@ -19,18 +21,20 @@ FIRST_BYTES = 16
 class Format(NamedTuple):
     """A format: in words, whether a path with these first bytes (empty for a folder) has it, and what reads it.
 
-    What reads it is given the path, and a geometry file or None.
+    What reads it is given the path, a geometry file or None, and the topic of the sonar or None.
     """
 
     words: str
     fits: Callable[[Path, bytes], bool]
-    read: Callable[[Path, Path | None], Recording]
+    read: Callable[[Path, Path | None, str | None], Recording]
 
 
-def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None], Recording]:
-    """Return a reader of a format whose files tell their geometry, which refuses another one."""
+def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
+    """Return a reader of a format whose files hold one sonar and tell their geometry, which refuses another one."""
 
-    def checked(path: Path, geometry: Path | None) -> Recording:
+    def checked(path: Path, geometry: Path | None, topic: str | None) -> Recording:
+        if topic is not None:
+            raise MitsonarError(f"{path} is a recording of one sonar, and has no topics or views: leave {topic!r} out")
         if geometry is not None:
             raise MitsonarError(f"{path} tells its geometry itself: leave {geometry} out")
         return read(path)
@@ -40,6 +44,7 @@ def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path |
 
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
+    Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
 )
 """All formats, in the order in which they are tried."""
 
@@ -59,15 +64,16 @@ def format_of(path: str | Path) -> Format | None:
     return next((one for one in FORMATS if one.fits(path, first)), None)
 
 
-def open_recording(path: str | Path, geometry: str | Path | None = None) -> Recording:
+def open_recording(path: str | Path, geometry: str | Path | None = None, topic: str | None = None) -> Recording:
     """Open a recording of a real sonar; pixels are read on demand.
 
     Args:
         path: of a file or folder in one of :data:`FORMATS`; its content tells which.
         geometry: a geometry file, for pictures. Other formats tell their geometry themselves.
+        topic: of the sonar in a ROS bag; default: the only one.
 
     Raises:
-        MitsonarError: nothing there, no known format, damaged, or a geometry that is not needed.
+        MitsonarError: nothing there, no known format, damaged, no such topic, or a geometry that is not needed.
     """
     found = format_of(path)
     if found is None:
@@ -75,4 +81,4 @@ def open_recording(path: str | Path, geometry: str | Path | None = None) -> Reco
             raise MitsonarError(f"no such file: {path}")
         known = ", ".join(one.words for one in FORMATS)
         raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known}")
-    return found.read(Path(path), None if geometry is None else Path(geometry))
+    return found.read(Path(path), None if geometry is None else Path(geometry), topic)
