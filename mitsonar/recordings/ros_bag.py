@@ -74,8 +74,9 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
         parts.append(part if written is None else replace(part, like=written))
     if not all(one.elevation_rad for one in scan.layouts):
         notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")
+    facts = _facts(scan, kept) | ({"poses": found.origin} if found.origin else {})
     words = f"ROS {1 if bag.is_ros1 else 2} bag, {short(chosen.kind)}"
-    return Recording(str(path), words, tuple(parts), _facts(scan, kept), (*notes, *found.notes))
+    return Recording(str(path), words, tuple(parts), facts, (*notes, *found.notes))
 
 
 def sonar_topic(bag: BagFile, topic: str | None = None) -> Topic:

@@ -7,6 +7,7 @@ MD5 sums with the published ones. Sources:
   ``SonarImageData``. The older package ``acoustic_msgs`` has the same messages.
 - ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, as the pings of BlueROVs with an Oculus
   are recorded. Older versions hold a ``sensor_msgs/Image``; their bags bring the definition along.
+- ``tf2_msgs``: ros/geometry2 (BSD-3-Clause), ``TFMessage``, which ``rosbags`` lacks for ROS 1.
 """
 
 from __future__ import annotations
@@ -87,6 +88,10 @@ uint32 num_beams
 sensor_msgs/CompressedImage ping
 """
 
+TRANSFORMS = """
+geometry_msgs/TransformStamped[] transforms
+"""
+
 DEFINITIONS = {
     **{
         f"{package}/msg/{name}": text
@@ -99,6 +104,7 @@ DEFINITIONS = {
     },
     "sonar_oculus/msg/OculusFire": OCULUS_FIRE,
     "sonar_oculus/msg/OculusPing": OCULUS_PING,
+    "tf2_msgs/msg/TFMessage": TRANSFORMS,
 }
 """Text of each definition by its type."""
 

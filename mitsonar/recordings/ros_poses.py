@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,10 +34,17 @@ LARGEST_GAP_S = 2.0
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """Poses of the frames ``(frames, 6)`` [m, rad], None where the bag does not tell them; sentences on their origin."""
+    """Poses of the frames.
+
+    Attributes:
+        poses: ``(frames, 6)`` [m, rad]; None where the bag does not tell them.
+        notes: sentences on why not, or on what is assumed.
+        origin: topic or transforms, and the world, in words.
+    """
 
     poses: Array | None
     notes: tuple[str, ...] = ()
+    origin: str = ""
 
 
 @dataclass
@@ -102,10 +109,8 @@ def poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> Fou
     mount = _between(links, _plain(frame_id), child) if child else None
     if mount is None:
         notes = (*notes, f"poses of {link.topic} count as those of the sonar: no transform leads from them to {frame_id!r}")
-    found_poses = _along([*(mount or []), link], axes, times, link.topic)
-    return FoundPoses(
-        found_poses.poses, (*notes, *found_poses.notes) if found_poses.poses is not None else found_poses.notes
-    )
+    moved = _along([*(mount or []), link], axes, times, link.topic)
+    return replace(moved, notes=notes if moved.poses is not None else moved.notes)
 
 
 def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> FoundPoses:
@@ -120,7 +125,7 @@ def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Fou
     if world.lower().endswith("ned"):
         down = Rotation.from_matrix(CONVENTIONS["ned"].world)
         place, turn = down.apply(place), down * turn
-    return FoundPoses(poses_from(place, turn), (f"poses are those of {source}, in the frame {world!r}",))
+    return FoundPoses(poses_from(place, turn), origin=f"{source}, in the frame {world!r}")
 
 
 def _only(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | None, tuple[str, ...]]:
