@@ -10,7 +10,7 @@ from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.recordings.mcap_metadata import RECORD, WRITTEN, metadata_of
 from mitsonar.recordings.ros_encoding import TOPICS, Encoded, FrameEncoder
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.sonar_frames import PER_FRAME, SonarFrames
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -33,7 +33,8 @@ def write_mcap(
 
     Topics: ``/sonar/image`` (``marine_acoustic_msgs/ProjectedSonarImage``: samples uint8 or float32, bit for bit),
     ``/sonar/fan/compressed`` (``sensor_msgs/CompressedImage``). Of frames with elevations ``/sonar/points``
-    (``sensor_msgs/PointCloud2``), with poses ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``. Times in headers are
+    (``sensor_msgs/PointCloud2``), with poses ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``, with attitudes
+    ``/sonar/imu`` (``sensor_msgs/Imu``), with heights ``/sonar/altitude`` (``sensor_msgs/Range``). Times in headers are
     those of the frames. Sonar, exact ranges and bearings, and coding are in a metadata record, which
     :func:`~mitsonar.recordings.open_recording.open_recording` reads back.
 
@@ -106,9 +107,14 @@ def _all(first: SonarFrames, rest: Iterator[SonarFrames]) -> Iterator[SonarFrame
     """
     yield first
     for one in rest:
-        if one.image.shape[1:] != first.image.shape[1:] or (one.poses is None) != (first.poses is None):
-            raise MitsonarError("all frames of an MCAP file must have one geometry, and poses or none: write two files")
+        if one.image.shape[1:] != first.image.shape[1:] or _known(one) != _known(first):
+            raise MitsonarError("all frames of an MCAP file must have one geometry and the same arrays: write two files")
         yield one
+
+
+def _known(frames: SonarFrames) -> list[bool]:
+    """Return which arrays frames have."""
+    return [getattr(frames, name) is not None for name in PER_FRAME]
 
 
 def _channels(writer: Writer, encoder: FrameEncoder) -> dict[str, int]:

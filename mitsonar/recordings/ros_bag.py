@@ -17,7 +17,7 @@ from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
 from mitsonar.recordings.ros_messages import OCULUS, PROJECTED, short
 from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
-from mitsonar.recordings.ros_poses import poses_in
+from mitsonar.recordings.ros_poses import attitude_in, heights_in, poses_in
 from mitsonar.recordings.ros_scan import TopicScan
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -65,12 +65,15 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     coding = _coding(scan, kept, notes)
     numbers = np.array(scan.numbers)[kept]
     layout = scan.layouts[numbers[0]]
-    found = poses_in(bag, layout.frame_id, layout.axes, scan.frame_times()[kept])
+    times = scan.frame_times()[kept]
+    found = poses_in(bag, layout.frame_id, layout.axes, times)
+    attitude, heights = attitude_in(bag, layout.frame_id, layout.axes, times), heights_in(bag, times)
     written = _as_written(scan, layout, coding)
     parts = []
     for number, run in runs_of(numbers.tolist()):
         part = _part(scan, kept[run], scan.layouts[int(str(number))], coding)
-        part = part if found.poses is None else replace(part, poses=found.poses[run])
+        told = {"poses": found.poses, "attitude_rad": attitude, "height_m": heights}
+        part = replace(part, **{name: values[run] for name, values in told.items() if values is not None})
         parts.append(part if written is None else replace(part, like=written))
     if not all(one.elevation_rad for one in scan.layouts):
         notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")

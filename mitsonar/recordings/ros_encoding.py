@@ -44,6 +44,8 @@ TOPICS = {
     "/sonar/fan/compressed": "sensor_msgs/msg/CompressedImage",
     "/sonar/points": "sensor_msgs/msg/PointCloud2",
     "/sonar/odometry": "nav_msgs/msg/Odometry",
+    "/sonar/imu": "sensor_msgs/msg/Imu",
+    "/sonar/altitude": "sensor_msgs/msg/Range",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
 }
@@ -89,8 +91,14 @@ class FrameEncoder:
     @property
     def topics(self) -> list[str]:
         """Return the topics that these frames become."""
-        absent = set() if self.like.elevation_rad is not None else {"/sonar/points"}
-        absent |= {"/sonar/odometry", "/tf"} if self.like.poses is None else set()
+        needs = {
+            "/sonar/points": self.like.elevation_rad,
+            "/sonar/odometry": self.like.poses,
+            "/tf": self.like.poses,
+            "/sonar/imu": self.like.attitude_rad,
+            "/sonar/altitude": self.like.height_m,
+        }
+        absent = [name for name, values in needs.items() if values is None]
         return [name for name in TOPICS if name not in absent]
 
     def definition(self, topic: str) -> str:
@@ -103,9 +111,13 @@ class FrameEncoder:
         for index, time in enumerate(nanoseconds(time_s)):
             yield self._encoded(WRITTEN, time, self._image(frames, index, time))
             yield self._encoded("/sonar/fan/compressed", time, self._fan(frames, index, time))
-            if self.like.elevation_rad is not None:
+            if frames.elevation_rad is not None:
                 yield self._encoded("/sonar/points", time, self._points(frames, index, time))
-            if self.like.poses is not None and frames.poses is not None:
+            if frames.attitude_rad is not None:
+                yield self._encoded("/sonar/imu", time, self._imu(frames.attitude_rad[index], time))
+            if frames.height_m is not None:
+                yield self._encoded("/sonar/altitude", time, self._altitude(float(frames.height_m[index]), time))
+            if frames.poses is not None:
                 place, turn = _ros_pose(frames.poses[index])
                 yield self._encoded("/tf", time, self._transform(WORLD, BODY, time, place, turn))
                 yield self._encoded("/sonar/odometry", time, self._odometry(time, place, turn))
@@ -255,6 +267,35 @@ class FrameEncoder:
             child_frame_id=BODY,
             pose=self._make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
             twist=self._make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
+        )
+
+    def _imu(self, attitude: Array, time: int) -> RosObject:
+        """Return pitch, roll, heading ``(3,)`` as the orientation of an IMU; rates are not known, which -1 says."""
+        known = bool(np.isfinite(attitude).all())
+        _, turn = _ros_pose(np.concatenate([np.zeros(3), np.where(np.isfinite(attitude), attitude, 0)]))
+        unknown = np.zeros(9)
+        unknown[0] = -1
+        return self._make(
+            "sensor_msgs/Imu",
+            header=self._header(time, BODY),
+            orientation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
+            orientation_covariance=np.zeros(9) if known else unknown,
+            angular_velocity=self._vector(np.zeros(3)),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=self._vector(np.zeros(3)),
+            linear_acceleration_covariance=unknown,
+        )
+
+    def _altitude(self, height_m: float, time: int) -> RosObject:
+        """Return the height over the ground as an altimeter measures it; infinite where nothing is below (REP 117)."""
+        return self._make(
+            "sensor_msgs/Range",
+            header=self._header(time, BODY),
+            radiation_type=0,
+            field_of_view=0.0,
+            min_range=0.0,
+            max_range=1e5,
+            range=height_m if math.isfinite(height_m) else math.inf,
         )
 
 

@@ -1,4 +1,4 @@
-"""Poses of a sonar from the odometry, poses and transforms of its ROS bag, in mitsonar's convention."""
+"""Poses, attitudes and heights of a sonar by other topics of its ROS bag, in mitsonar's convention."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.bag_file import BagFile, Message, Topic
 
-__all__ = ["FoundPoses", "poses_in"]
+__all__ = ["FoundPoses", "attitude_in", "heights_in", "poses_in"]
 
 Array = NDArray[np.float64]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 OLD_TRANSFORMS = "tf/msg/tfMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
+RANGE = "sensor_msgs/msg/Range"
 POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
 MOST_LINKS = 32
@@ -111,6 +113,57 @@ def poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> Fou
         notes = (*notes, f"poses of {link.topic} count as those of the sonar: no transform leads from them to {frame_id!r}")
     moved = _along([*(mount or []), link], axes, times, link.topic)
     return replace(moved, notes=notes if moved.poses is not None else moved.notes)
+
+
+def attitude_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> Array | None:
+    """Return pitch, roll and heading of a sonar ``(frames, 3)`` [rad] by the only IMU of its bag; None without one.
+
+    Fixed transforms must lead from the sonar's frame to that of the IMU. Its orientation is relative to east, north, up
+    (REP 145).
+
+    Args:
+        bag: with the topics.
+        frame_id: frame of the sonar's messages.
+        axes: starboard, forward and up of the sonar in that frame ``(3, 3)``.
+        time_s: of the frames ``(frames,)``.
+    """
+    topics = [one for one in bag.topics() if one.messages]
+    these = [one for one in topics if one.kind == IMU]
+    if len(these) != 1:
+        return None
+    child, link = "", Link("", these[0].name)
+    for _, raw in bag.messages(these[0].name):
+        message = bag.decode(raw, IMU)
+        child = _plain(message.header.frame_id)
+        if float(message.orientation_covariance[0]) != -1:
+            link.numbers.append((_seconds(message), 0.0, 0.0, 0.0, *_numbers(message.orientation)))
+    mount = _between(_transforms(bag, topics), _plain(frame_id), child)
+    if mount is None:
+        return None
+    found = _along([*mount, link], axes, np.asarray(time_s, dtype=float), link.topic).poses
+    return None if found is None else found[:, 3:]
+
+
+def heights_in(bag: BagFile, time_s: ArrayLike) -> Array | None:
+    """Return heights over the ground ``(frames,)`` [m] by the only topic of an altimeter; nan where unknown, None without.
+
+    A topic is one of an altimeter where it holds ``sensor_msgs/Range`` and its name holds ``alti``.
+    """
+    these = [one for one in bag.topics() if one.messages and one.kind == RANGE and "alti" in one.name.lower()]
+    if len(these) != 1:
+        return None
+    numbers = []
+    for _, raw in bag.messages(these[0].name):
+        message = bag.decode(raw, RANGE)
+        numbers.append((_seconds(message), float(message.range)))
+    table = np.array(sorted(numbers), dtype=float)
+    times = np.asarray(time_s, dtype=float)
+    after = np.clip(np.searchsorted(table[:, 0], times), 1, max(1, len(table) - 1))
+    ends = np.stack([table[after - 1], table[np.minimum(after, len(table) - 1)]])
+    near = np.abs(ends[:, :, 0] - times).min(axis=0) <= LARGEST_GAP_S / 2
+    table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0), 1] = np.nan
+    height = np.where(near, np.interp(times, table[:, 0], table[:, 1]), np.nan)
+    return height if np.isfinite(height).any() else None
 
 
 def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> FoundPoses:

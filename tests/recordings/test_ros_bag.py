@@ -221,8 +221,10 @@ def test_poses_are_those_of_transforms_or_odometry_with_the_mount(tmp_path: Path
     place, quaternion = in_ros(poses)
     sent = [("/tf_static", TIME[0], maker.transform(0.0, "base_link", "sonar", [0, 0, 0], to_message_axes(MOUNT)))]
     for time, where, turn in zip(times, place, quaternion, strict=True):
-        one = maker.transform(time, "odom", "base_link", where, turn)
-        sent.append(("/tf", time, one) if source == "tf" else ("/odom", time, maker.odometry(time, where, turn, "base_link")))
+        if source == "tf":
+            sent.append(("/tf", time, maker.transform(time, "odom", "base_link", where, turn)))
+        else:
+            sent.append(("/odom", time, maker.odometry(time, where, turn, "base_link")))
     recording = open_recording(write_bag(tmp_path / name, maker, [*pings(maker, smooth()), *sent]))
     assert recording.part().poses == pytest.approx(expected("mount"), abs=1e-4)
     assert recording.facts["poses"].endswith("in the frame 'odom'")
