@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
+from mitsonar.recordings.picture_folder import holds_pictures, read_picture_folder
+from mitsonar.recordings.picture_stack import is_picture_stack, read_picture_stack
+from mitsonar.recordings.picture_video import is_video, read_picture_video
 from mitsonar.recordings.recording import Recording
 
 __all__ = ["FORMATS", "Format", "format_of", "open_recording"]
@@ -40,6 +43,9 @@ def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path |
 
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
+    Format("stacks of pictures (.npz)", is_picture_stack, read_picture_stack),
+    Format("videos (.avi, .mp4)", is_video, read_picture_video),
+    Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, read_picture_folder),
 )
 """All formats, in the order in which they are tried."""
 
