@@ -9,6 +9,9 @@ from typing import NamedTuple
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
 from mitsonar.recordings.bag_file import is_ros_bag
+from mitsonar.recordings.picture_folder import holds_pictures, read_picture_folder
+from mitsonar.recordings.picture_stack import is_picture_stack, read_picture_stack
+from mitsonar.recordings.picture_video import is_video, read_picture_video
 from mitsonar.recordings.recording import Recording
 from mitsonar.recordings.ros_bag import read_ros_bag
 
@@ -29,22 +32,34 @@ class Format(NamedTuple):
     read: Callable[[Path, Path | None, str | None], Recording]
 
 
-def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
-    """Return a reader of a format whose files hold one sonar and tell their geometry, which refuses another one."""
+def _of_pictures(read: Callable[[Path, Path | None], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
+    """Return a reader of a format whose files hold one sonar, which refuses a topic."""
 
     def checked(path: Path, geometry: Path | None, topic: str | None) -> Recording:
         if topic is not None:
             raise MitsonarError(f"{path} is a recording of one sonar, and has no topics or views: leave {topic!r} out")
+        return read(path, geometry)
+
+    return checked
+
+
+def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path | None, str | None], Recording]:
+    """Return a reader of a format whose files hold one sonar and tell their geometry, which refuses another one."""
+
+    def checked(path: Path, geometry: Path | None) -> Recording:
         if geometry is not None:
             raise MitsonarError(f"{path} tells its geometry itself: leave {geometry} out")
         return read(path)
 
-    return checked
+    return _of_pictures(checked)
 
 
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
+    Format("stacks of pictures (.npz)", is_picture_stack, _of_pictures(read_picture_stack)),
+    Format("videos (.avi, .mp4)", is_video, _of_pictures(read_picture_video)),
+    Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, _of_pictures(read_picture_folder)),
 )
 """All formats, in the order in which they are tried."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +16,8 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.bag_file import BagFile, Topic
 from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
-from mitsonar.recordings.ros_messages import OCULUS, PROJECTED, short
+from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, short
+from mitsonar.recordings.ros_pictures import read_ros_pictures
 from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
 from mitsonar.recordings.ros_poses import attitude_in, heights_in, poses_in
 from mitsonar.recordings.ros_scan import TopicScan
@@ -46,14 +48,16 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
 
     Args:
         path: of a ``.bag``, ``.mcap`` or ``.db3``, or of the folder of a ROS 2 bag.
-        geometry: a geometry file; images of sonars tell their geometry themselves.
-        topic: of the sonar; default: the only one.
+        geometry: a geometry file, for topics of pictures; images of sonars tell their geometry themselves.
+        topic: of the sonar, or of pictures; default: the only one of a sonar, or with a geometry the only one of pictures.
 
     Raises:
         MitsonarError: damaged, no topic of a sonar, or several and none chosen.
     """
     bag = BagFile(path)
-    chosen = sonar_topic(bag, topic)
+    chosen = sonar_topic(bag, topic, FANS if geometry is not None else (*PROJECTED, *OCULUS))
+    if chosen.kind in FANS:
+        return read_ros_pictures(bag, chosen, None if geometry is None else Path(geometry))
     if geometry is not None:
         raise MitsonarError(f"{path}: {chosen.name} tells its geometry itself: leave {geometry} out")
     scan = TopicScan(bag, chosen)
@@ -82,33 +86,44 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     return Recording(str(path), words, tuple(parts), facts, (*notes, *found.notes))
 
 
-def sonar_topic(bag: BagFile, topic: str | None = None) -> Topic:
-    """Return the topic of the sonar: the one that is named, or the only one.
+def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (*PROJECTED, *OCULUS)) -> Topic:
+    """Return the topic of the sonar: the one that is named, or the only one of some types.
+
+    Args:
+        bag: with the topics.
+        topic: its name.
+        kinds: types among which the only one is found.
 
     Raises:
-        MitsonarError: no such topic, of another type, or several.
+        MitsonarError: no such topic, of a type that cannot be read, or several.
     """
     there = bag.topics()
-    sonars = [one for one in there if one.kind in (*PROJECTED, *OCULUS) and one.messages]
-    named = [one for one in there if one.name == topic]
-    if topic is not None and not named:
-        raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in there])}")
-    if topic is not None and named[0] not in sonars:
+    readable = [one for one in there if one.kind in (*PROJECTED, *OCULUS, *FANS) and one.messages]
+    if topic is not None:
+        named = next((one for one in there if one.name == topic), None)
+        if named is None:
+            raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in there])}")
+        if named not in readable:
+            raise MitsonarError(
+                f"{bag.path}: {topic} holds {named.messages:,} messages {short(named.kind)}; a sonar's are {_words(*kinds)}"
+            )
+        return named
+    found = [one for one in readable if one.kind in kinds]
+    if len(found) > 1:
         raise MitsonarError(
-            f"{bag.path}: {topic} holds {named[0].messages:,} messages {short(named[0].kind)}; a sonar's are "
-            f"{' or '.join(short(one) for one in (PROJECTED[0], OCULUS[0]))}"
-        )
-    if topic is None and len(sonars) > 1:
-        raise MitsonarError(
-            f"{bag.path} holds several sonars: choose one of the topics {', '.join(one.name for one in sonars)} "
+            f"{bag.path} holds several sonars: choose one of the topics {', '.join(one.name for one in found)} "
             "(topic= in Python, --topic or --view on the command line)"
         )
-    if not sonars:
+    if not found:
         others = ", ".join(f"{one.name} ({short(one.kind)})" for one in there[:8]) or "none"
-        raise MitsonarError(
-            f"{bag.path} holds no images of a sonar ({short(PROJECTED[0])}, {short(OCULUS[0])}): its topics are {others}"
-        )
-    return named[0] if topic is not None else sonars[0]
+        more = "; pictures need a geometry file (--geometry)" if readable and not set(FANS) & set(kinds) else ""
+        raise MitsonarError(f"{bag.path} holds no messages {_words(*kinds)}: its topics are {others}{more}")
+    return found[0]
+
+
+def _words(*kinds: str) -> str:
+    """Return the names of types for a sentence."""
+    return " or ".join(short(one) for one in kinds if not one.startswith("acoustic_msgs"))
 
 
 class Coding(NamedTuple):

@@ -13,11 +13,25 @@ from numpy.typing import NDArray
 from mitsonar.recordings.bag_file import Message
 from mitsonar.recordings.ros_messages import DTYPES, PROJECTED
 
-__all__ = ["PingLayout", "is_beam_major", "layout_of", "samples_of"]
+__all__ = ["FORWARD_LEFT_UP", "PingLayout", "is_beam_major", "layout_of", "picture_of", "samples_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Samples = NDArray[np.generic]
+
+RED, GREEN, BLUE = 0.299, 0.587, 0.114
+"""Weights of colours in the luminance (ITU-R BT.601)."""
+
+CHANNELS = {
+    "mono8": (1.0,),
+    "8UC1": (1.0,),
+    "rgb8": (RED, GREEN, BLUE),
+    "bgr8": (BLUE, GREEN, RED),
+    "8UC3": (BLUE, GREEN, RED),
+    "rgba8": (RED, GREEN, BLUE, 0.0),
+    "bgra8": (BLUE, GREEN, RED, 0.0),
+}
+"""Encodings of ``sensor_msgs/Image`` that are read: the weight of each channel."""
 
 SAME_RANGE = 0.002
 """Relative change of ranges up to which a window counts as the same: the sound speed drifts."""
@@ -27,6 +41,9 @@ SAME_BEARING = 1e-4
 
 CENTIDEGREE = math.pi / 18_000
 """Unit of the bearings of an Oculus [rad]."""
+
+FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+"""Starboard, forward and up in axes forward, left, up (REP 103), as columns."""
 
 CLEARLY = 0.05
 """By how much a correlation must exceed the other one to decide on the order of samples."""
@@ -113,7 +130,7 @@ def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: b
             raise ValueError("the samples are not as many as ranges and beams say")
         image = flat.reshape(shape[::-1]).T if beam_major else flat.reshape(shape)
     else:
-        image = _picture(message.ping)
+        image = picture_of(message.ping)
         if image.shape != shape:
             raise ValueError(f"the picture is {image.shape[0]} x {image.shape[1]}, not {shape[0]} x {shape[1]}")
     return image[:, layout.order]
@@ -201,7 +218,7 @@ def _oculus(message: Message) -> PingLayout:
         bearing_rad=bearing[order],
         order=order,
         dtype="|u1",
-        axes=np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+        axes=FORWARD_LEFT_UP,
         frame_id=str(message.header.frame_id),
         frequency_hz=_amount(getattr(message, "frequency", 0.0)),
         sound_speed=_amount(getattr(message, "speed_of_sound", 0.0)) or _amount(fire.speed_of_sound),
@@ -209,8 +226,12 @@ def _oculus(message: Message) -> PingLayout:
     )
 
 
-def _picture(picture: Message) -> NDArray[np.uint8]:
-    """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``."""
+def picture_of(picture: Message) -> NDArray[np.uint8]:
+    """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``.
+
+    Raises:
+        ValueError: it cannot be decoded, or its samples are not as many as it says.
+    """
     data = np.asarray(picture.data, np.uint8)
     if hasattr(picture, "format"):
         from PIL import Image
@@ -221,12 +242,15 @@ def _picture(picture: Message) -> NDArray[np.uint8]:
         except Exception as error:  # damaged pictures raise errors of many kinds
             raise ValueError(f"a picture cannot be decoded: {error}") from None
     rows, columns = int(picture.height), int(picture.width)
-    if picture.encoding not in ("mono8", "8UC1"):
-        raise ValueError(f"a picture is {picture.encoding}, not mono8")
-    stride = int(picture.step) if int(picture.step) * rows == len(data) else columns
-    if stride < columns or stride * rows != len(data):
+    if picture.encoding not in CHANNELS:
+        raise ValueError(f"a picture is {picture.encoding}: mitsonar reads {', '.join(CHANNELS)}")
+    channels = len(CHANNELS[picture.encoding])
+    width = columns * channels
+    stride = int(picture.step) if int(picture.step) * rows == len(data) else width
+    if stride < width or stride * rows != len(data):
         raise ValueError("a picture's samples are not as many as its height and width say")
-    return data.reshape(rows, stride)[:, :columns]
+    values = data.reshape(rows, stride)[:, :width].reshape(rows, columns, channels)
+    return np.asarray(np.rint(values @ np.array(CHANNELS[picture.encoding])), dtype=np.uint8)
 
 
 def _amount(value: object) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.bag_file import BagFile, Message, Topic
-from mitsonar.recordings.ros_messages import PROJECTED
+from mitsonar.recordings.ros_messages import FANS, PROJECTED
 from mitsonar.recordings.ros_pings import PingLayout, layout_of
 
 __all__ = ["TopicScan"]
@@ -79,7 +79,9 @@ class TopicScan:
             self.numbers.append(number)
 
     def _number(self, raw: bytes, known: dict[bytes, int], heads: dict[int, int]) -> int:
-        """Return the number of a message's layout."""
+        """Return the number of a message's layout; pictures have none."""
+        if self.topic.kind in FANS:
+            return 0
         head = heads.get(len(raw))
         if head is not None:
             number = known.get(_digest(raw[STAMP:head]))

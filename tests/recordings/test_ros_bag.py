@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from bags import Maker, Sent, write_bag
 from mutations import changed_bytes, outcome
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -175,7 +177,10 @@ def test_of_several_sonars_one_is_chosen(tmp_path: Path) -> None:
 def test_bags_without_a_sonar_say_what_they_hold(tmp_path: Path) -> None:
     maker = Maker(True)
     path = write_bag(tmp_path / "a.bag", maker, [("/odom", 1.0, maker.odometry(1.0, [0, 0, 0], [0, 0, 0, 1], "base"))])
-    with pytest.raises(MitsonarError, match=r"holds no images of a sonar .*: its topics are /odom \(nav_msgs/Odometry\)"):
+    with pytest.raises(
+        MitsonarError,
+        match=r"holds no messages marine_acoustic_msgs/ProjectedSonarImage or .*: its topics are /odom \(nav_msgs/Odometry\)",
+    ):
         open_recording(path)
     with pytest.raises(MitsonarError, match=r"/odom holds 1 messages nav_msgs/Odometry; a sonar's are"):
         open_recording(path, topic="/odom")
@@ -310,6 +315,68 @@ def test_a_wrong_name_is_said(tmp_path: Path) -> None:
         open_recording(tmp_path / "a.orig")
 
 
-def test_a_geometry_is_refused(tmp_path: Path) -> None:
+# ---------------------------------------------------------------- pictures
+
+POLAR = """
+layout: polar
+range_min: 1
+range_max: 3
+azimuth_fov_deg: 58
+level: dB
+"""
+
+
+def pictures(maker: Maker, images: NDArray[np.uint8], compressed: bool, encoding: str = "mono8") -> list[Sent]:
+    sent: list[Sent] = []
+    for time, image in zip(TIME, images, strict=True):
+        header, rows, columns = maker.header(time), *image.shape
+        if compressed:
+            buffer = io.BytesIO()
+            Image.fromarray(image).save(buffer, format="PNG")
+            data = np.frombuffer(buffer.getvalue(), np.uint8)
+            fields: dict[str, Any] = {"header": header, "format": "png", "data": data}
+            sent.append(("/fan", time, maker.make("sensor_msgs/CompressedImage", **fields)))
+        else:
+            values = image if encoding == "mono8" else np.repeat(image[:, :, None], 3, axis=2)
+            step = columns * values.size // image.size
+            fields = {
+                "header": header,
+                "height": rows,
+                "width": columns,
+                "encoding": encoding,
+                "is_bigendian": 0,
+                "step": step,
+            }
+            sent.append(("/fan", time, maker.make("sensor_msgs/Image", **fields, data=values.ravel())))
+    return sent
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(("compressed", "encoding"), [(True, ""), (False, "mono8"), (False, "bgr8")])
+def test_pictures_with_a_geometry_are_a_recording(tmp_path: Path, name: str, compressed: bool, encoding: str) -> None:
+    maker, images = Maker(name.endswith(".bag")), smooth()
+    (tmp_path / "polar.yaml").write_text(POLAR)
+    path = write_bag(tmp_path / name, maker, [*pictures(maker, images, compressed, encoding), *pings(maker, images)])
+    recording = open_recording(path, tmp_path / "polar.yaml")
+    assert recording.facts["topic"] == "/fan"
+    frames = recording.part().read([0, 4, 2])
+    assert (frames.image == images[[0, 4, 2]]).all()
+    assert frames.time_s == pytest.approx(TIME[[0, 4, 2]], abs=1e-6)
+    assert frames.level == "dB"
+    assert (frames.sonar.range_min, frames.sonar.range_max) == (1, 3)
+    assert open_recording(path).facts["topic"] == "/sonar"
+    assert open_recording(path, tmp_path / "polar.yaml", "/fan").facts["topic"] == "/fan"
+
+
+def test_pictures_without_a_geometry_ask_for_one(tmp_path: Path) -> None:
+    maker = Maker(False)
+    path = write_bag(tmp_path / "two", maker, pictures(maker, smooth(), True))
+    with pytest.raises(MitsonarError, match=r"its topics are /fan .*; pictures need a geometry file"):
+        open_recording(path)
+    with pytest.raises(MitsonarError, match="give a geometry file"):
+        open_recording(path, topic="/fan")
+
+
+def test_a_geometry_is_refused_for_a_sonar(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="tells its geometry itself"):
-        open_recording(bag(tmp_path / "two"), "geometry.yaml")
+        open_recording(bag(tmp_path / "two"), "geometry.yaml", "/sonar")
