@@ -19,7 +19,7 @@ from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_tim
 from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, short
 from mitsonar.recordings.ros_pictures import read_ros_pictures
 from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
-from mitsonar.recordings.ros_poses import attitude_in, heights_in, poses_in
+from mitsonar.recordings.ros_poses import motion_in, with_motion
 from mitsonar.recordings.ros_scan import TopicScan
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -70,20 +70,18 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     numbers = np.array(scan.numbers)[kept]
     layout = scan.layouts[numbers[0]]
     times = scan.frame_times()[kept]
-    found = poses_in(bag, layout.frame_id, layout.axes, times)
-    attitude, heights = attitude_in(bag, layout.frame_id, layout.axes, times), heights_in(bag, times)
+    motion = motion_in(bag, layout.frame_id, layout.axes, times)
     written = _as_written(scan, layout, coding)
     parts = []
     for number, run in runs_of(numbers.tolist()):
         part = _part(scan, kept[run], scan.layouts[int(str(number))], coding)
-        told = {"poses": found.poses, "attitude_rad": attitude, "height_m": heights}
-        part = replace(part, **{name: values[run] for name, values in told.items() if values is not None})
+        part = with_motion(part, motion, run)
         parts.append(part if written is None else replace(part, like=written))
     if not all(one.elevation_rad for one in scan.layouts):
         notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")
-    facts = _facts(scan, kept) | ({"poses": found.origin} if found.origin else {})
+    facts = _facts(scan, kept) | ({"poses": motion.origin} if motion.origin else {})
     words = f"ROS {1 if bag.is_ros1 else 2} bag, {short(chosen.kind)}"
-    return Recording(str(path), words, tuple(parts), facts, (*notes, *found.notes))
+    return Recording(str(path), words, tuple(parts), facts, (*notes, *motion.notes))
 
 
 def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (*PROJECTED, *OCULUS)) -> Topic:

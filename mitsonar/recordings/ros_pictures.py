@@ -14,7 +14,7 @@ from mitsonar.recordings.picture_recording import Pictures, geometry_for, record
 from mitsonar.recordings.recording import Recording
 from mitsonar.recordings.ros_messages import short
 from mitsonar.recordings.ros_pings import FORWARD_LEFT_UP, picture_of
-from mitsonar.recordings.ros_poses import attitude_in, heights_in, poses_in
+from mitsonar.recordings.ros_poses import motion_in, with_motion
 from mitsonar.recordings.ros_scan import TopicScan
 
 __all__ = ["read_ros_pictures"]
@@ -75,12 +75,7 @@ def read_ros_pictures(bag: BagFile, topic: Topic, geometry: Path | None) -> Reco
 def _with_poses(recording: Recording, bag: BagFile, frame_id: str) -> Recording:
     """Return the recording with what other topics of the bag tell of the sonar."""
     part = recording.parts[0]
-    found = poses_in(bag, frame_id, FORWARD_LEFT_UP, part.time_s)
-    told = {
-        "poses": found.poses,
-        "attitude_rad": attitude_in(bag, frame_id, FORWARD_LEFT_UP, part.time_s),
-        "height_m": heights_in(bag, part.time_s),
-    }
-    part = replace(part, **{name: values for name, values in told.items() if values is not None})
-    facts = recording.facts | ({"poses": found.origin} if found.origin else {})
-    return replace(recording, parts=(part,), facts=facts, notes=(*recording.notes, *found.notes))
+    motion = motion_in(bag, frame_id, FORWARD_LEFT_UP, part.time_s)
+    part = with_motion(part, motion, np.arange(len(part)))
+    facts = recording.facts | ({"poses": motion.origin} if motion.origin else {})
+    return replace(recording, parts=(part,), facts=facts, notes=(*recording.notes, *motion.notes))

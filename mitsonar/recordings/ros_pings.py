@@ -170,11 +170,11 @@ def _projected(message: Message) -> PingLayout:
     bearing, axes = _bearings(vectors)
     order = np.argsort(bearing, kind="stable")
     info, image = message.ping_info, message.image
-    range_m: Array = np.asarray(message.ranges, dtype=np.float64)
+    ranges: Array = np.asarray(message.ranges).astype(np.float64)
     if int(image.dtype) not in DTYPES:
         raise ValueError(f"unknown type {image.dtype} of samples")
     return PingLayout(
-        range_m=range_m,
+        range_m=ranges,
         bearing_rad=bearing[order],
         order=order,
         dtype=(">" if image.is_bigendian else "<") + DTYPES[int(image.dtype)],
@@ -214,7 +214,7 @@ def _oculus(message: Message) -> PingLayout:
     fire = message.fire_msg
     gamma = float(fire.gamma)
     return PingLayout(
-        range_m=(np.arange(bins) + 0.5) * step,
+        range_m=np.asarray((np.arange(bins) + 0.5) * step, dtype=np.float64),
         bearing_rad=bearing[order],
         order=order,
         dtype="|u1",

@@ -6,16 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.bag_file import BagFile, Message, Topic
+from mitsonar.recordings.recording import Part
 
-__all__ = ["FoundPoses", "attitude_in", "heights_in", "poses_in"]
+__all__ = ["Motion", "motion_in", "with_motion"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 OLD_TRANSFORMS = "tf/msg/tfMessage"
@@ -35,16 +37,20 @@ LARGEST_GAP_S = 2.0
 
 
 @dataclass(frozen=True)
-class FoundPoses:
-    """Poses of the frames.
+class Motion:
+    """What other topics tell of a sonar at the times of its frames; None where they do not.
 
     Attributes:
-        poses: ``(frames, 6)`` [m, rad]; None where the bag does not tell them.
-        notes: sentences on why not, or on what is assumed.
-        origin: topic or transforms, and the world, in words.
+        poses: ``(frames, 6)`` [m, rad].
+        attitude_rad: pitch, roll, heading by an IMU ``(frames, 3)``.
+        height_m: by an altimeter ``(frames,)``; nan where unknown.
+        notes: sentences on what is assumed of the poses, or why there are none.
+        origin: topic or transforms of the poses, and the world, in words.
     """
 
-    poses: Array | None
+    poses: Array | None = None
+    attitude_rad: Array | None = None
+    height_m: Array | None = None
     notes: tuple[str, ...] = ()
     origin: str = ""
 
@@ -85,12 +91,8 @@ class Link:
         return place, Slerp(known, Rotation.from_quat(table[:, 4:]))(held)
 
 
-def poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> FoundPoses:
-    """Return the poses of a sonar by the transforms, or else the odometry or the poses, of its bag.
-
-    Transforms (TF) that lead from the sonar's frame to a world come first. Next is the only odometry: its child frame must
-    lead to the sonar's by fixed transforms, or it counts as the sonar's, which a note says. The only topic of poses counts
-    as the sonar's. Several of a kind are ambiguous: then there are no poses, and a note names them.
+def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
+    """Return poses, attitudes and heights of a sonar by the other topics of its bag.
 
     Args:
         bag: with the topics.
@@ -98,34 +100,49 @@ def poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> Fou
         axes: starboard, forward and up of the sonar in that frame ``(3, 3)``.
         time_s: of the frames ``(frames,)``.
     """
-    times = np.asarray(time_s, dtype=float)
+    poses = _poses_in(bag, frame_id, axes, time_s)
+    attitude = _attitude_in(bag, frame_id, axes, time_s)
+    return replace(poses, attitude_rad=attitude, height_m=_heights_in(bag, time_s))
+
+
+def with_motion(part: Part, motion: Motion, places: Index) -> Part:
+    """Return a part with what is known of the motion of its frames, which are at these places ``(n,)``."""
+    return replace(
+        part,
+        poses=part.poses if motion.poses is None else motion.poses[places],
+        attitude_rad=part.attitude_rad if motion.attitude_rad is None else motion.attitude_rad[places],
+        height_m=part.height_m if motion.height_m is None else motion.height_m[places],
+    )
+
+
+def _poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
+    """Return the poses of a sonar by the transforms, or else the odometry or the poses, of its bag.
+
+    Transforms (TF) that lead from the sonar's frame to a world come first. Next is the only odometry: its child frame must
+    lead to the sonar's by fixed transforms, or it counts as the sonar's, which a note says. The only topic of poses counts
+    as the sonar's. Several of a kind are ambiguous: then there are no poses, and a note names them.
+    """
     topics = [one for one in bag.topics() if one.messages]
     links = _transforms(bag, topics)
     chain = _chain(links, _plain(frame_id))
     if chain and any(not one.fixed for one in chain):
-        return _along(chain, axes, times, "the transforms")
+        return _along(chain, axes, time_s, "the transforms")
     found, notes = _only(bag, topics)
     if found is None:
-        return FoundPoses(None, notes)
+        return Motion(notes=notes)
     child, link = found
     mount = _between(links, _plain(frame_id), child) if child else None
     if mount is None:
         notes = (*notes, f"poses of {link.topic} count as those of the sonar: no transform leads from them to {frame_id!r}")
-    moved = _along([*(mount or []), link], axes, times, link.topic)
+    moved = _along([*(mount or []), link], axes, time_s, link.topic)
     return replace(moved, notes=notes if moved.poses is not None else moved.notes)
 
 
-def attitude_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> Array | None:
+def _attitude_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Array | None:
     """Return pitch, roll and heading of a sonar ``(frames, 3)`` [rad] by the only IMU of its bag; None without one.
 
     Fixed transforms must lead from the sonar's frame to that of the IMU. Its orientation is relative to east, north, up
     (REP 145).
-
-    Args:
-        bag: with the topics.
-        frame_id: frame of the sonar's messages.
-        axes: starboard, forward and up of the sonar in that frame ``(3, 3)``.
-        time_s: of the frames ``(frames,)``.
     """
     topics = [one for one in bag.topics() if one.messages]
     these = [one for one in topics if one.kind == IMU]
@@ -140,11 +157,11 @@ def attitude_in(bag: BagFile, frame_id: str, axes: Array, time_s: ArrayLike) -> 
     mount = _between(_transforms(bag, topics), _plain(frame_id), child)
     if mount is None:
         return None
-    found = _along([*mount, link], axes, np.asarray(time_s, dtype=float), link.topic).poses
+    found = _along([*mount, link], axes, time_s, link.topic).poses
     return None if found is None else found[:, 3:]
 
 
-def heights_in(bag: BagFile, time_s: ArrayLike) -> Array | None:
+def _heights_in(bag: BagFile, time_s: Array) -> Array | None:
     """Return heights over the ground ``(frames,)`` [m] by the only topic of an altimeter; nan where unknown, None without.
 
     A topic is one of an altimeter where it holds ``sensor_msgs/Range`` and its name holds ``alti``.
@@ -157,28 +174,27 @@ def heights_in(bag: BagFile, time_s: ArrayLike) -> Array | None:
         message = bag.decode(raw, RANGE)
         numbers.append((_seconds(message), float(message.range)))
     table = np.array(sorted(numbers), dtype=float)
-    times = np.asarray(time_s, dtype=float)
-    after = np.clip(np.searchsorted(table[:, 0], times), 1, max(1, len(table) - 1))
+    after = np.clip(np.searchsorted(table[:, 0], time_s), 1, max(1, len(table) - 1))
     ends = np.stack([table[after - 1], table[np.minimum(after, len(table) - 1)]])
-    near = np.abs(ends[:, :, 0] - times).min(axis=0) <= LARGEST_GAP_S / 2
+    near = np.abs(ends[:, :, 0] - time_s).min(axis=0) <= LARGEST_GAP_S / 2
     table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0), 1] = np.nan
-    height = np.where(near, np.interp(times, table[:, 0], table[:, 1]), np.nan)
+    height = np.where(near, np.interp(time_s, table[:, 0], table[:, 1]), np.nan)
     return height if np.isfinite(height).any() else None
 
 
-def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> FoundPoses:
+def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Motion:
     """Return the poses along links from the sonar to the world."""
     place, turn = np.zeros((len(times), 3)), Rotation.from_matrix(np.repeat(axes[None], len(times), axis=0))
     for link in chain:
         here = link.at(times)
         if here is None:
-            return FoundPoses(None, (f"poses are not used: {link.topic} does not cover the times of all frames",))
+            return Motion(notes=(f"poses are not used: {link.topic} does not cover the times of all frames",))
         place, turn = here[0] + here[1].apply(place), here[1] * turn
     world = chain[-1].parent
     if world.lower().endswith("ned"):
         down = Rotation.from_matrix(CONVENTIONS["ned"].world)
         place, turn = down.apply(place), down * turn
-    return FoundPoses(poses_from(place, turn), origin=f"{source}, in the frame {world!r}")
+    return Motion(poses_from(place, turn), origin=f"{source}, in the frame {world!r}")
 
 
 def _only(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | None, tuple[str, ...]]:

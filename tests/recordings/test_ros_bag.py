@@ -25,7 +25,7 @@ from mitsonar.recordings.ros_messages import OCULUS, PROJECTED, ros1_types
 pytest.importorskip("rosbags")
 
 BEARING = np.radians(np.linspace(-30, 28, 24)) + 0.01 * np.sin(np.arange(24))
-RANGE = 1.0 + 0.05 * np.arange(40)
+RANGE: NDArray[np.float64] = 1.0 + 0.05 * np.arange(40, dtype=np.float64)
 TIME = 1_700_000_000 + np.array([0.1, 0.35, 0.5, 0.7, 1.0, 1.1])
 KINDS = ["one.bag", "two", "three_mcap"]
 """A bag of ROS 1, one of ROS 2 in SQLite, one of ROS 2 in MCAP."""
@@ -36,7 +36,8 @@ def smooth(count: int = len(TIME), kind: type[np.generic] = np.uint8) -> NDArray
     noise = np.random.default_rng(5).normal(size=(count, len(RANGE), len(BEARING)))
     drawn = ndimage.gaussian_filter(noise, (0, 1.5, 1.5))
     level = (drawn - drawn.min()) / np.ptp(drawn)
-    return level.astype(kind) if np.dtype(kind).kind == "f" else (level * np.iinfo(kind).max).astype(kind)  # type: ignore[type-var]
+    letters = np.dtype(kind)
+    return np.asarray(level if letters.kind == "f" else level * np.iinfo(letters.name).max, dtype=letters)
 
 
 def pings(maker: Maker, images: NDArray[Any], topic: str = "/sonar", **options: Any) -> list[Sent]:
@@ -122,7 +123,8 @@ def test_pings_of_an_oculus(tmp_path: Path, name: str) -> None:
     assert (frames.image == images).all()
     assert np.degrees(frames.bearing_rad) == pytest.approx(centidegrees / 100)
     assert frames.range_m[:2] == pytest.approx([0.01, 0.03])
-    assert (frames.sonar.sound_speed, frames.sonar.coding_gamma) == (1490, pytest.approx(127 / 255))
+    assert frames.sonar.sound_speed == 1490
+    assert frames.sonar.coding_gamma == pytest.approx(127 / 255)
     assert "opening over elevation" in " ".join(recording.notes)
 
 
@@ -329,7 +331,7 @@ level: dB
 def pictures(maker: Maker, images: NDArray[np.uint8], compressed: bool, encoding: str = "mono8") -> list[Sent]:
     sent: list[Sent] = []
     for time, image in zip(TIME, images, strict=True):
-        header, rows, columns = maker.header(time), *image.shape
+        header, (rows, columns) = maker.header(time), image.shape
         if compressed:
             buffer = io.BytesIO()
             Image.fromarray(image).save(buffer, format="PNG")
