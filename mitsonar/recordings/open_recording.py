@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
+from mitsonar.recordings.oculus import read_oculus
+from mitsonar.recordings.oculus_messages import is_oculus
 from mitsonar.recordings.recording import Recording
 
 __all__ = ["FORMATS", "Format", "format_of", "open_recording"]
@@ -24,7 +26,10 @@ class Format(NamedTuple):
     read: Callable[[Path], Recording]
 
 
-FORMATS: tuple[Format, ...] = (Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), read_aris),)
+FORMATS: tuple[Format, ...] = (
+    Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), read_aris),
+    Format("Oculus (.raw, .oculus)", lambda path, first: is_oculus(first), read_oculus),
+)
 """All formats, in the order in which they are tried."""
 
 
