@@ -72,6 +72,9 @@ MOST_CELLS = 2**28
 LONGEST_M = 1e4
 """What is believed of an image: cells, and its far end [m]."""
 
+LONGEST_S = 1e4
+"""What is believed of the time between two pings [s]."""
+
 BANDS = {
     "oculus-m750d-750khz": (6e5, 9e5),
     "oculus-m1200d-1200khz": (1e6, 1.5e6),
@@ -208,15 +211,10 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     if np.isfinite(logged_s).any():
         return logged_s, []
     head = pings.head
-    steps: Array = np.diff(head["start"].astype(np.float64))
-    if (
-        (head["version"] >= 2).all()
-        and len(steps)
-        and np.isfinite(steps).all()
-        and float(steps.min()) > 0
-        and float(steps.max()) < 1e4
-    ):
-        return np.asarray(head["start"], dtype=float), []
+    start: Array = head["start"].astype(np.float64)
+    steps = np.diff(start)
+    if (head["version"] >= 2).all() and len(steps) and bool(((steps > 0) & (steps < LONGEST_S)).all()):
+        return start, []
     number = np.diff(head["number"].astype(np.int64))
     number = np.where((number > 0) & (number < 1e6), number, 1)
     codes = np.unique(head["ping_rate"])

@@ -41,6 +41,7 @@ class OculusImages:
 
     @property
     def eight_bit(self) -> bool:
+        """Return whether images are the bytes of the file."""
         return self.width == 1 and not self.gained
 
     def __call__(self, index: Index) -> Pixels:
