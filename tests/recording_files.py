@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from mitsonar.recordings.aris import FRAME
+from mitsonar.recordings.didson import FILE, FRAME_HEADER
 from mitsonar.recordings.oculus import LATER, OLDER
 
 Values = np.ndarray[Any, Any]
@@ -65,3 +67,44 @@ def some_pings(count: int = 3, version: int = 0, **fields: Any) -> list[bytes]:
         oculus_ping(rng.integers(0, 256, (12, 8)), version=version, number=40 + one, **({"start": one / 4} | fields))
         for one in range(count)
     ]
+
+
+def aris_file(frames: int = 4, samples: int = 20, **changed: Any) -> bytes:
+    """An ARIS 3000 with 64 beams; fields of the headers may be changed ``(frames,)``."""
+    head = np.zeros(frames, FRAME)
+    head["index"], head["signature"] = np.arange(frames), b"DDF\x05"
+    head["time_us"] = 1_000_000 + 100_000 * np.arange(frames)
+    head["ping_mode"], head["samples"], head["system"], head["reordered"] = 6, samples, 1, 1
+    head["sample_period_us"], head["start_delay_us"], head["sound_speed"] = 10, 2000, 1500.0
+    for name, values in changed.items():
+        head[name] = values
+    body = np.random.default_rng(3).integers(0, 256, (frames, samples * 64), dtype=np.uint8)
+    pairs = zip(head, body, strict=True)
+    return b"DDF\x05".ljust(1024, b"\0") + b"".join(one.tobytes() + pixels.tobytes() for one, pixels in pairs)
+
+
+def didson_file(
+    images: Values, *, version: int = 3, header: int | None = None, file: dict[str, Any] | None = None, **changed: Any
+) -> bytes:
+    """A DIDSON file: images ``(frames, samples, beams)``; fields of the file's header, and of the frames' ``(frames,)``."""
+    frames, samples, beams = images.shape
+    mark = b"DDF" + bytes([version])
+    first = np.zeros(1, FILE)
+    told = {
+        "signature": mark, "frames": frames, "frame_rate_hz": 8, "high_frequency": int(beams == 96), "beams": beams,
+        "sample_rate_hz": samples * 1500 / (2 * 10.0), "samples": samples, "length_code": 3 if beams == 96 else 1,
+        "serial": 200,
+    }  # fmt: skip
+    for name, value in (told | (file or {})).items():
+        first[name] = value
+    head = np.zeros(frames, FRAME_HEADER[version])
+    told = {
+        "index": np.arange(frames), "signature": mark, "year": 2010, "month": 6, "day": 3, "hour": 23, "minute": 59,
+        "second": 58 + np.arange(frames) // 8, "hundredth": np.arange(frames) % 8 * 12, "start_code": 4,
+        "length_code": first["length_code"][0],
+    }  # fmt: skip
+    for name, value in (told | changed).items():
+        head[name] = value
+    size = header or {3: 512, 4: 1024}[version]
+    pairs = zip(head, images.astype(np.uint8), strict=True)
+    return first.tobytes().ljust(size, b"\0")[:size] + b"".join(one.tobytes() + image.tobytes() for one, image in pairs)

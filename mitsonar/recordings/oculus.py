@@ -212,16 +212,21 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
         return logged_s, []
     head = pings.head
     start: Array = head["start"].astype(np.float64)
-    steps = np.diff(start)
-    if (head["version"] >= 2).all() and len(steps) and bool(((steps > 0) & (steps < LONGEST_S)).all()):
+    if (head["version"] >= 2).all() and len(head) > 1 and _rise(start):
         return start, []
     number = np.diff(head["number"].astype(np.int64))
-    number = np.where((number > 0) & (number < 1e6), number, 1)
+    number = np.where((number > 0) & (number < 1_000_000), number, 1)
     codes = np.unique(head["ping_rate"])
     rate = RATES.get(int(codes[0]), 10.0) if len(codes) == 1 else 10.0
     why = "the greatest ping rate" if len(codes) == 1 and int(codes[0]) in RATES else "assumed"
     note = f"the file tells no times in a known unit: pings follow each other at {rate:g} Hz ({why}), by their numbers"
     return np.concatenate([[0.0], np.cumsum(number)]) / rate, [note]
+
+
+def _rise(time_s: Array) -> bool:
+    """Return whether each time comes after the one before, and not long after."""
+    steps = time_s[1:] - time_s[:-1]
+    return bool(((steps > 0) & (steps < LONGEST_S)).all())
 
 
 def _windows(pings: _Pings) -> list[tuple[float, ...]]:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
+from mitsonar.recordings.didson import SIGNATURES, read_didson
 from mitsonar.recordings.oculus import read_oculus
 from mitsonar.recordings.oculus_messages import is_oculus
 from mitsonar.recordings.recording import Recording
@@ -28,6 +29,7 @@ class Format(NamedTuple):
 
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), read_aris),
+    Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, read_didson),
     Format("Oculus (.raw, .oculus)", lambda path, first: is_oculus(first), read_oculus),
 )
 """All formats, in the order in which they are tried."""
