@@ -119,7 +119,7 @@ def convert(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
 ) -> None:
-    """Convert frames: to the folder of a run (frames.npz, or frames.zarr of more than 1,000), to ROS (.mcap), or to .aris."""
+    """Convert frames to the folder of a run (frames.npz, or frames.zarr of more than 1,000), to ROS (.mcap) or to .aris."""
     from mitsonar.recordings.frame_folder import write_frames
     from mitsonar.recordings.mcap_writer import write_mcap
 

@@ -1,4 +1,4 @@
-"""Frames of any origin as a recording: files of real sonars, runs and data sets; with poses and labels where there are any."""
+"""Frames of any origin as a recording: files of real sonars, runs and data sets; with poses and labels."""
 
 from __future__ import annotations
 

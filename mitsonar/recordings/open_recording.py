@@ -9,6 +9,9 @@ from typing import NamedTuple
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
 from mitsonar.recordings.bag_file import is_ros_bag
+from mitsonar.recordings.didson import SIGNATURES, read_didson
+from mitsonar.recordings.oculus import read_oculus
+from mitsonar.recordings.oculus_messages import is_oculus
 from mitsonar.recordings.picture_folder import holds_pictures, read_picture_folder
 from mitsonar.recordings.picture_stack import is_picture_stack, read_picture_stack
 from mitsonar.recordings.picture_video import is_video, read_picture_video
@@ -56,6 +59,8 @@ def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path |
 
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
+    Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, _says_it_itself(read_didson)),
+    Format("Oculus (.raw, .oculus)", lambda path, first: is_oculus(first), _says_it_itself(read_oculus)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
     Format("stacks of pictures (.npz)", is_picture_stack, _of_pictures(read_picture_stack)),
     Format("videos (.avi, .mp4)", is_video, _of_pictures(read_picture_video)),
