@@ -13,13 +13,16 @@ from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
 from mitsonar.cli.render_command import NOISE, SIX, Frame
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Frames", "odometry"]
+__all__ = ["Frames", "Geometry", "odometry"]
 
 Frames = Annotated[
     str,
     typer.Argument(
         metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, a data set or a recording."
     ),
+]
+Geometry = Annotated[
+    Path | None, typer.Option(help="YAML file that tells how the pictures of a recording are laid out.", dir_okay=False)
 ]
 PAIRS_A_WORKER = 50
 """Smallest number of pairs that is worth a process."""
@@ -75,6 +78,7 @@ def odometry(
         int | None, typer.Option(help="Sequence of a data set, or part of a recording (default: the longest).")
     ] = None,
     view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
+    geometry: Geometry = None,
     noise: Annotated[
         str,
         typer.Option(help=f"{NOISE}; for impulse responses a ratio such as '20 dB'."),
@@ -103,7 +107,7 @@ def odometry(
     factors = scale if scale is None or scale == "fit" else numbers(scale, 3, "--scale (or fit)")
     first = numbers(start, 6, "--from")
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
-    reading = Reading(sequence, view, noise, seed, height, pitch, height_by, contrast)
+    reading = Reading(sequence, view, noise, seed, height, pitch, height_by, geometry, contrast)
     images, recorded = record_at(frames) is SonarFrames, is_recording(frames)
     estimator = estimator or ("ecc" if recorded else "direct" if images else "likelihood")
     try:

@@ -38,7 +38,7 @@ class ViewReader(Protocol):
     def kind(self) -> str: ...
 
 
-FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad", "contrast")
+FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad", "geometry", "contrast")
 """Options that impulse responses lack."""
 
 
@@ -63,6 +63,7 @@ class Reading:
         height_m: over the ground [m], for records that lack it.
         pitch_rad: of the sonar [rad], for frames that lack poses.
         height_by: measures the height in each frame: ``direct`` or a checkpoint.
+        geometry: file that tells how the pictures of a recording are laid out.
         contrast: what is matched: ``levels``; ``local`` contrast; ``moving``: the same, less the pattern that moves with the
             sonar. None: local for recordings of real sonars, levels for all others.
     """
@@ -74,6 +75,7 @@ class Reading:
     height_m: float | None = None
     pitch_rad: float | None = None
     height_by: str | None = None
+    geometry: Path | None = None
     contrast: str | None = None
 
 
@@ -110,7 +112,7 @@ def frames_for(where: str, reading: Reading) -> FrameSource:
         MitsonarError: none there, or options that do not fit them.
     """
     noise = load_noise(reading.noise)
-    source = open_frames(where, sequence=reading.sequence, view=reading.view)
+    source = open_frames(where, sequence=reading.sequence, view=reading.view, geometry=reading.geometry)
     if not len(source):
         raise MitsonarError(f"{source.name} holds no frames: give those of a finished run")
     return source.with_noise(noise, reading.seed).with_geometry(reading.height_m, reading.pitch_rad)
@@ -127,8 +129,10 @@ def views_for(where: str, views: tuple[str, ...], kind: str, reading: Reading) -
 
 def _views_of(where: str, estimator: ViewReader, reading: Reading) -> ViewSource:
     """Open the views that a network was trained on."""
-    if any(option is not None for option in (reading.view, reading.height_m, reading.pitch_rad)):
-        raise MitsonarError("--view, --height and --pitch-deg are not for a network that reads views of a data set")
+    if any(option is not None for option in (reading.view, reading.height_m, reading.pitch_rad, reading.geometry)):
+        raise MitsonarError(
+            "--view, --height, --pitch-deg and --geometry are not for a network that reads views of a data set"
+        )
     return views_for(where, estimator.views, estimator.kind, reading)
 
 
@@ -136,7 +140,7 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
     """Open impulse responses with noise and the assumed height."""
     if any(getattr(reading, name) is not None for name in FRAME_OPTIONS):
         raise MitsonarError(
-            "--sequence, --view, --height-by and --pitch-deg belong to frames; impulse responses have none of them"
+            "--sequence, --view, --height-by, --pitch-deg and --geometry belong to frames, not to impulse responses"
         )
     return open_responses(where).with_noise(reading.noise, reading.seed).with_height(reading.height_m)
 
