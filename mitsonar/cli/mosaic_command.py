@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.odometry_command import Frames
+from mitsonar.cli.odometry_command import Frames, Geometry
 from mitsonar.cli.render_command import NOISE, Frame
 from mitsonar.errors import MitsonarError, meant
 from mitsonar.io.run_directory import refuse_to_replace
@@ -54,6 +54,7 @@ def mosaic(
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
+    geometry: Geometry = None,
     noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
@@ -68,7 +69,7 @@ def mosaic(
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
     paths, path_height = _paths(trajectory, true, frame)
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
-    source = frames_for(frames, Reading(sequence, view, noise, seed, height, pitch))
+    source = frames_for(frames, Reading(sequence, view, noise, seed, height, pitch, geometry=geometry))
     if source.note:
         say(source.note)
     if source.height_m is None and path_height is not None:

@@ -143,6 +143,8 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
 
     It is measured on levels: codings such as ``dB`` and ``gamma`` lift the skirt of the light to a height like the ground's.
     """
+    if frames.level == "contrast":
+        return None  # its dark parts are no water without echoes
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
     smooth = cv2.GaussianBlur(image, (3, 13), sigmaX=0.5, sigmaY=2.0, borderType=cv2.BORDER_REPLICATE)
     start, bins = smooth[:15], len(smooth)

@@ -28,22 +28,28 @@ StoredArray = Any
 FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
 
 
-def open_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> FrameSource:
+def open_frames(
+    where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
+) -> FrameSource:
     """Open the frames at a path or URL.
 
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
         sequence: of a data set, or part of a recording; default: the longest; of several, the first.
-        view: of a data set; default: the first.
+        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
+        geometry: file that tells how the pictures of a recording are laid out.
 
     Raises:
-        MitsonarError: no frames there; a sequence or view that is not there.
+        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
     """
     path = Path(where)
-    if is_data_set(where):
+    data_set = is_data_set(where)
+    if not data_set and is_recording(where):
+        return _of_recording(path, sequence, view, geometry)
+    if geometry is not None:
+        raise MitsonarError(f"{where} is no recording of pictures: it tells its geometry itself; leave {geometry} out")
+    if data_set:
         return _of_data_set(str(where), sequence, view)
-    if is_recording(where):
-        return _of_recording(path, sequence, view)
     if sequence is not None or view is not None:
         raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
     if path.is_dir() and not (path / "zarr.json").is_file():
@@ -84,11 +90,9 @@ def is_recording(where: str | Path) -> bool:
     return "://" not in str(where) and format_of(where) is not None
 
 
-def _of_recording(path: Path, number: int | None, view: str | None) -> FrameSource:
+def _of_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
     """Open a part of a recording."""
-    if view is not None:
-        raise MitsonarError(f"{path} is a recording of one sonar: view chooses among those of a data set; leave it out")
-    recording = open_recording(path)
+    recording = open_recording(path, geometry, view)
     for note in recording.notes:
         warnings.warn(f"{path}: {note}", MitsonarWarning, stacklevel=3)
     part, which = recording.part(number), ""

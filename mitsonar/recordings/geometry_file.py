@@ -1,0 +1,202 @@
+"""Geometry files: YAML that tells how the pictures of a recording are laid out, and what else pictures do not tell."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mitsonar.errors import MitsonarError, complaint
+from mitsonar.instruments.imaging_sonar import Bearing, Coding
+from mitsonar.io.whole_files import read_yaml
+
+__all__ = ["PictureGeometry", "geometry_beside", "load_geometry"]
+
+ANY_RANGE_MAX = 10.0
+"""End of the window where metres are not known [m]: any value does."""
+
+ANY_ELEVATION_DEG, ANY_RATE_HZ = 14.0, 10.0
+"""Opening over elevation [deg] and frame rate [Hz] that are assumed where nothing tells them."""
+
+SAME_SCALE = 0.02
+"""Largest distance of ``near_px / far_px`` and ``range_min / range_max``, beyond which the apex is doubted."""
+
+FAN = ("apex_px", "near_px", "far_px", "half_angle_deg")
+"""Keys that a fan needs."""
+
+FAN_ONLY = (*FAN, "stretch", "forward", "pixels_per_m", "bins", "beams")
+POLAR_ONLY = ("azimuth_fov_deg", "bearings_deg", "beam_layout", "rows", "transposed")
+"""Keys that belong to one layout."""
+
+SEE = "; see docs/reference/files.md#geometry-files"
+
+Row = tuple[float, float]
+
+
+class PictureGeometry(BaseModel):
+    """How the pictures of a recording are laid out; each field is a key of the YAML file.
+
+    Pixels count from 0 at the centre of the picture's upper left pixel: columns to the right, rows down. A fan's pixel
+    (u, v) lies at x = (u - apex column) ``stretch`` to the right and y = apex row - v forward.
+
+    Raises:
+        MitsonarError: through :meth:`create`, for an unknown key or values that do not fit together.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    layout: Literal["fan", "polar"] = Field(description="fan: scan-converted pictures; polar: beams by bins")
+    name: str = Field("pictures", max_length=200, description="what the sonar is called")
+    apex_px: Row | None = Field(None, description="fan: column and row of the sonar; may lie outside the picture")
+    near_px: float | None = Field(None, ge=0, le=1e6, description="fan: distance of the near arc from the apex [px]")
+    far_px: float | None = Field(None, gt=0, le=1e6, description="fan: distance of the far arc from the apex [px]")
+    half_angle_deg: float | None = Field(None, gt=0, le=180, description="fan: angle from its axis to its edge [deg]")
+    stretch: float = Field(1.0, gt=0.01, lt=100, description="fan: factor on columns that makes its arcs circles")
+    forward: Literal["up", "down"] = Field("up", description="fan: whether ranges rise upwards or downwards")
+    pixels_per_m: float | None = Field(None, gt=0, le=1e6, description="fan: scale, in place of range_max [px/m]")
+    bins: int | None = Field(None, ge=2, le=65_536, description="fan: range bins to make; default: one a pixel")
+    beams: int | None = Field(None, ge=2, le=65_536, description="fan: beams to make; default: one a pixel at mid range")
+    azimuth_fov_deg: float | None = Field(None, gt=0, le=360, description="polar: field of view over all beams [deg]")
+    bearings_deg: tuple[float, ...] | None = Field(
+        None, min_length=2, max_length=65_536, description="polar: of each column, starboard positive [deg]"
+    )
+    beam_layout: Literal["even", "sine"] = Field("even", description="polar: steps of the angle, or of its sine")
+    rows: Literal["near-to-far", "far-to-near"] = Field("near-to-far", description="polar: order of the rows")
+    transposed: bool = Field(False, description="polar: each row is a beam, each column a bin")
+    mirror: bool = Field(False, description="left in the picture is starboard")
+    range_min: float | None = Field(None, ge=0, le=1e5, description="start of the window [m]; fan: default by near_px")
+    range_max: float | None = Field(None, gt=0, le=1e5, description="end of the window [m]")
+    scale_known: bool = Field(True, description="false: metres are not known, and range_max may be any value")
+    level: Coding | None = Field(None, description="how values stand for levels: linear, dB or gamma; default: linear")
+    coding_db: float = Field(80.0, gt=0, le=300, description="span of the level dB, from value 0 to 255 [dB]")
+    coding_gamma: float = Field(0.5, gt=0, le=4, description="of the level gamma: value = amplitude^gamma")
+    sound_speed: float = Field(1500.0, gt=0, le=1e4, description="sound speed [m/s]")
+    frame_rate_hz: float | None = Field(None, gt=0, le=1e6, description="pictures a second, where nothing tells times")
+    times: str | None = Field(None, description="file of times [s], a line each, `TIME` or `NAME, TIME`")
+    pitch_deg: float | None = Field(None, ge=-90, le=90, description="pitch of the sonar [deg], > 0 is down")
+    roll_deg: float = Field(0.0, ge=-180, le=180, description="roll of the sonar [deg], > 0 is starboard down")
+    height_m: float | None = Field(None, gt=0, le=1e5, description="height of the sonar over the ground [m]")
+    frequency_hz: float | None = Field(None, gt=0, le=1e8, description="carrier [Hz]")
+    elevation_fov_deg: float | None = Field(None, gt=0, le=180, description="field of view within a beam [deg]")
+    bearing: Bearing | None = Field(
+        None, description="what a beam's angle is: azimuth, or the cone of a line array; default: cone up to 180 deg"
+    )
+
+    @classmethod
+    def create(cls, **fields: Any) -> Self:  # values of a file, before pydantic checks them
+        """Create a geometry with these keys.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits, keys that do not fit together.
+        """
+        try:
+            return cls(**fields)
+        except ValidationError as error:
+            raise MitsonarError(complaint(error, cls, "geometry", SEE)) from None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        others = POLAR_ONLY if self.layout == "fan" else FAN_ONLY
+        wrong = [name for name in others if name in self.model_fields_set]
+        if wrong:
+            raise ValueError(f"{', '.join(wrong)} do not belong to the layout {self.layout}: leave them out{SEE}")
+        self._check_fan() if self.layout == "fan" else self._check_polar()
+        if self.range_min is not None and self.range_max is not None and not self.range_max > self.range_min:
+            raise ValueError(f"range_max must exceed range_min: got {self.range_max:g} m <= {self.range_min:g} m")
+        return self
+
+    def _check_fan(self) -> None:
+        lacking = [name for name in FAN if getattr(self, name) is None]
+        if lacking:
+            raise ValueError(f"the layout fan needs {', '.join(lacking)}{SEE}")
+        if not self.far >= self.near + 2:
+            raise ValueError(f"far_px must exceed near_px by 2: got {self.far:g} and {self.near:g}")
+        told = (self.pixels_per_m is not None) + (self.range_max is not None)
+        if told == 2 or (told == 0 and self.scale_known):
+            raise ValueError("a fan needs its scale: give pixels_per_m or range_max, one of them, or `scale_known: false`")
+
+    def _check_polar(self) -> None:
+        if self.range_min is None or self.range_max is None:
+            raise ValueError("the layout polar needs range_min and range_max; with `scale_known: false` their ratio counts")
+        if (self.azimuth_fov_deg is None) == (self.bearings_deg is None):
+            raise ValueError("the layout polar needs azimuth_fov_deg or bearings_deg, one of them")
+        if self.bearings_deg is not None:
+            steps = [after - before for before, after in zip(self.bearings_deg, self.bearings_deg[1:], strict=False)]
+            if not (all(step > 0 for step in steps) or all(step < 0 for step in steps)):
+                raise ValueError("bearings_deg must rise, or fall, from column to column")
+            if not all(abs(one) <= 180 for one in self.bearings_deg):
+                raise ValueError("bearings_deg must lie in -180..180 deg")
+            if {"mirror", "beam_layout"} & self.model_fields_set:
+                raise ValueError("bearings_deg tell the order of the columns: leave mirror and beam_layout out")
+
+    @property
+    def near(self) -> float:
+        """Return ``near_px`` of a fan."""
+        return float(self.near_px or 0.0)
+
+    @property
+    def far(self) -> float:
+        """Return ``far_px`` of a fan."""
+        return float(self.far_px or 0.0)
+
+    @property
+    def window_m(self) -> Row:
+        """Return start and end of the window [m]."""
+        if self.layout == "polar":
+            return float(self.range_min or 0.0), float(self.range_max or 0.0)
+        scale = self.pixels_per_m
+        end = float(self.range_max or ANY_RANGE_MAX) if scale is None else self.far / scale
+        start = self.near * end / self.far if self.range_min is None else float(self.range_min)
+        return start, end
+
+    def bearing_of(self, half_angle_deg: float) -> Bearing:
+        """Return what a beam's angle is: as told, or by the half angle of the fan [deg]."""
+        return self.bearing or ("cone" if half_angle_deg <= 90 else "azimuth")
+
+    def notes(self) -> list[str]:
+        """Return sentences on what is assumed."""
+        start, end = self.window_m
+        notes = []
+        if not self.scale_known:
+            notes.append(f"metres are not known: the window counts as {start:.4g}..{end:.4g} m, and lengths are up to scale")
+        if self.layout == "fan" and abs(self.near / self.far - start / end) > SAME_SCALE:
+            notes.append(
+                f"near_px and far_px are {self.near:g} and {self.far:g}, and range_min and range_max {start:g} and {end:g} "
+                "m: the ratios differ, check the apex"
+            )
+        if self.level is None:
+            notes.append("level is not told: values are taken as linear")
+        if self.elevation_fov_deg is None:
+            notes.append(f"elevation_fov_deg is not told: {ANY_ELEVATION_DEG:g} deg are assumed")
+        return notes
+
+
+def load_geometry(path: str | Path) -> PictureGeometry:
+    """Load a geometry file.
+
+    Raises:
+        MitsonarError: no such file, not YAML, an unknown key, or values that do not fit together.
+    """
+    fields = read_yaml(path, "geometry file")
+    if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
+        raise MitsonarError(f"{path} must hold `key: value` lines of a geometry{SEE}")
+    try:
+        found = PictureGeometry.create(**fields)
+    except MitsonarError as error:
+        raise MitsonarError(f"{path}: {error}") from None
+    numbers = [value for value in found.model_dump().values() if isinstance(value, float)]
+    if not all(map(math.isfinite, [*numbers, *(found.apex_px or ()), *(found.bearings_deg or ())])):
+        raise MitsonarError(f"{path} holds a number that is not finite{SEE}")
+    return found
+
+
+def geometry_beside(path: Path) -> Path | None:
+    """Return the geometry file beside a recording: ``geometry.yaml`` in a folder; ``FILE.yaml`` or it beside a file."""
+    path = path.absolute()
+    near = [path / "geometry.yaml"] if path.is_dir() else []
+    if not path.name:  # the root of the file system
+        return None
+    near += [path.with_name(f"{path.name}.yaml"), path.with_suffix(".yaml"), path.with_name("geometry.yaml")]
+    return next((one for one in near if one.is_file() and one != path), None)
