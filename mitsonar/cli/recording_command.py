@@ -100,9 +100,9 @@ def video(
     if rate is not None and not 0 < rate <= 1000:
         raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
     with progress_bar("drawing", len(chosen), "frames") as progress:
-        options = {"span_db": span_db, "overwrite": overwrite}
-        count = write_fan_video(chosen.chunks(), out, rate or min(1000.0, found), **options, progress=progress)
-    say(f"{count:,} frames at {rate or found:.4g} a second in {out}")
+        speed = rate or min(1000.0, found)
+        count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
+    say(f"{count:,} frames at {speed:.4g} a second in {out}")
 
 
 @answered
