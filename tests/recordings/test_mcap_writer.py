@@ -200,3 +200,20 @@ def test_frames_of_other_arrays_or_times_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="no frames"):
         write_mcap([], tmp_path / "a.mcap")
     assert not list(tmp_path.iterdir())
+
+
+REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="needs the recordings of ../shared/data/real")
+@pytest.mark.parametrize("name", ["aris1200-sdk-sample/sample.aris", "oculus-m1200d-three-pings/three_pings_8bit.raw"])
+def test_real_recordings_come_back_bit_for_bit(tmp_path: Path, name: str) -> None:
+    part = open_recording(REAL / name).part()
+    write_mcap(part.chunks(), tmp_path / "a.mcap")
+    back, frames = open_recording(tmp_path / "a.mcap").part(), part.read(np.arange(len(part)))
+    read = back.read(np.arange(len(back)))
+    for column in ("image", "range_m", "bearing_rad", "time_s"):
+        assert (getattr(read, column) == getattr(frames, column)).all(), column
+    assert (read.sonar, read.level) == (frames.sonar, frames.level)
+    if frames.attitude_rad is not None:
+        assert read.attitude_rad == pytest.approx(frames.attitude_rad, abs=1e-9)
