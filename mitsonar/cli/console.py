@@ -55,7 +55,6 @@ OPTIONS: dict[str, dict[str, str]] = {
     "compare": {"height_m": "NAME:height_m=METRES", "pitch_rad": "NAME:pitch_deg=DEGREES"},
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "reproduce": {"minutes": "--minutes"},
-    "convert": {"beams": "--beams"},
 }
 """By command: the option for an argument that a message names (:func:`mitsonar.errors.argument`)."""
 

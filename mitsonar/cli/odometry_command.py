@@ -16,7 +16,10 @@ from mitsonar.errors import MitsonarError
 __all__ = ["Frames", "Geometry", "odometry"]
 
 Frames = Annotated[
-    str, typer.Argument(metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, or a data set.")
+    str,
+    typer.Argument(
+        metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, a recording or a data set."
+    ),
 ]
 Geometry = Annotated[
     Path | None, typer.Option(help="YAML file that tells how the pictures of a recording are laid out.", dir_okay=False)
@@ -30,7 +33,7 @@ def odometry(
     frames: Annotated[
         str,
         typer.Argument(
-            metavar="RUN|FRAMES|DATA.zarr", help="A run of frames or impulse responses, or a data set of frames."
+            metavar="RUN|FRAMES|DATA.zarr", help="A run of frames or impulse responses, a recording, or a data set."
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to make: path, motions, table, figure.")],
@@ -54,7 +57,9 @@ def odometry(
     ] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
-    view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
+    view: Annotated[
+        str | None, typer.Option(help="View of a data set, or topic of a ROS bag (default: the first, or the only one).")
+    ] = None,
     geometry: Geometry = None,
     noise: Annotated[
         str,

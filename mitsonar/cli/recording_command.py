@@ -33,7 +33,7 @@ Span = Annotated[float, typer.Option("--span-db", help="Levels from full scale d
 def recordings() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Look at recordings of real sonars and at runs, and convert them.", no_args_is_help=True)
-    for command in (info, show, video, convert):
+    for command in (info, show, video, answered(convert, {"beams": "--beams"})):
         app.command()(command)
     return app
 
@@ -105,7 +105,6 @@ def video(
     say(f"{count:,} frames at {speed:.4g} a second in {out}")
 
 
-@answered
 def convert(
     file: File,
     out: Annotated[Path, typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make.")],
