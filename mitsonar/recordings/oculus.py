@@ -1,7 +1,8 @@
 """Oculus recordings of Blueprint Subsea: dumps of messages (``.raw``) and logs (``.oculus``), message versions 0, 1 and 2.
 
-Source of the layout: the public headers of Blueprint Subsea's SDK, as liboculus (BSD-3-Clause) quotes them. Version 0 and 8
-bits were checked on real pings. Version 2, other widths, gains of rows and logs were not: no such file was at hand.
+Source of the layout: liboculus (BSD-3-Clause). Version 0 and 8 bits were checked on real pings. Version 2, other widths,
+gains of rows and logs were not: no such file was at hand. The authors of hydroformats (Apache-2.0) report a real log of
+version 2 whose start times are seconds, and whose bearings are negative to port.
 """
 
 from __future__ import annotations
@@ -94,8 +95,9 @@ def read_oculus(path: str | Path) -> Recording:
     byte 127, 1 for 0 and 255. Where rows begin with a gain, counts are divided by its root, as two public readers do.
     Where a frame has 8 bits and no gains its image is uint8, else float32.
 
-    Times are those of a log, or the start times of version 2 [s]. The counter of older versions has no known unit: frames
-    of a dump then follow each other at the ping rate, or at 10 Hz where that has no known code, by their numbers.
+    Times are those of a log, or the start times of version 2 [s]. The counter of older versions has no known unit: it rises
+    by 62.5 million a ping in the real ones, and one public driver calls it microseconds. Frames of such a dump follow each
+    other by their numbers, at the ping rate, or at 10 Hz where that has no known code.
     Attitude is that of version 2 [deg], its pitch taken as upward positive.
 
     Raises:

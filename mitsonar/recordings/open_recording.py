@@ -30,7 +30,7 @@ class Format(NamedTuple):
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), read_aris),
     Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, read_didson),
-    Format("Oculus (.raw, .oculus)", lambda path, first: is_oculus(first), read_oculus),
+    Format("Oculus (.raw, .oculus)", is_oculus, read_oculus),
 )
 """All formats, in the order in which they are tried."""
 

@@ -192,6 +192,13 @@ def test_an_encrypted_log_is_refused(tmp_path: Path) -> None:
         open_recording(tmp_path / "a.oculus")
 
 
+def test_a_log_of_viewpoint_2_is_refused(tmp_path: Path) -> None:
+    for name, reason in (("a.oculus", "ViewPoint 2"), ("a.db3", "is no recording")):
+        (tmp_path / name).write_bytes(b"SQLite format 3\0".ljust(4096, b"\0"))
+        with pytest.raises(MitsonarError, match=reason):
+            open_recording(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
