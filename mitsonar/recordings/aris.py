@@ -127,9 +127,10 @@ def _frames_of(data: Bytes, name: str) -> tuple[EqualFrames, int]:
 
 def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which frames have a header that can be, and sentences on the others."""
-    first, speed = headers[0], headers["sound_speed"].astype(float)
+    first, told = headers[0], headers["sound_speed"].astype(float)
+    speed = np.where((told > LEAST_SPEED) & (told < MOST_SPEED), told, np.nan)
     whole = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
-    whole &= (headers["samples"] == first["samples"]) & (speed > LEAST_SPEED) & (speed < MOST_SPEED)
+    whole &= headers["samples"] == first["samples"]
     end_us = headers["start_delay_us"] + headers["sample_period_us"] * headers["samples"].astype(float)
     whole &= (
         (headers["sample_period_us"] > 0) & (end_us * 1e-6 * speed / 2 < LONGEST_M) & np.isin(headers["system"], list(KINDS))

@@ -73,8 +73,8 @@ MOST_CELLS = 2**28
 LONGEST_M = 1e4
 """What is believed of an image: cells, and its far end [m]."""
 
-LONGEST_S = 1e4
-"""What is believed of the time between two pings [s]."""
+LONGEST_S, LATEST_S = 1e4, 1e11
+"""What is believed of the time between two pings, and of a time [s]."""
 
 BANDS = {
     "oculus-m750d-750khz": (6e5, 9e5),
@@ -180,15 +180,14 @@ def _whole(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
     ranges, beams, image = (head[name].astype(np.int64) for name in ("ranges", "beams", "image"))
     rows = ranges * beams * (np.minimum(head["width"], 3) + 1)
     start = np.where(head["version"] >= 2, LATER.itemsize, OLDER.itemsize)
-    far = head["resolution"] * ranges
+    step = np.where((head["resolution"] > 1e-6) & (head["resolution"] < LONGEST_M), head["resolution"], np.nan)
     return np.asarray(
         (head["version"] <= 2)
         & (head["width"] <= 3)
         & (ranges > 0)
         & (beams > 1)
         & (ranges * beams <= MOST_CELLS)
-        & (head["resolution"] > 1e-6)
-        & (far < LONGEST_M)
+        & (step * ranges < LONGEST_M)
         & (image >= start + 2 * beams)
         & (head["image_size"] >= rows)
         & (image + head["image_size"] <= size)
@@ -227,6 +226,8 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
 
 def _rise(time_s: Array) -> bool:
     """Return whether each time comes after the one before, and not long after."""
+    if not (np.abs(time_s) < LATEST_S).all():
+        return False
     steps = time_s[1:] - time_s[:-1]
     return bool(((steps > 0) & (steps < LONGEST_S)).all())
 

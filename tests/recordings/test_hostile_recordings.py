@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -96,12 +97,14 @@ def changed_numbers(rng: Rng, content: bytes) -> bytes:
 
 
 def read(folder: Path) -> None:
-    """Read all frames of the recording in a folder, and check that they can be."""
+    """Read all frames of the recording in a folder, and check that they can be. Warnings of NumPy are failures."""
     path = next(iter(sorted(folder.iterdir())))
     size = sum(one.stat().st_size for one in [path, *path.rglob("*")] if one.is_file())
     tracemalloc.start()
     try:
-        _read(path)
+        with np.errstate(over="warn", divide="warn", invalid="warn"), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            _read(path)
     except MitsonarError as error:
         said = str(error)
         assert "\n" not in said, f"a refusal is not one line: {said[:300]}"
