@@ -266,7 +266,7 @@ def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) ->
     bins, beams = images.shape
     step = float(np.median(head["resolution"]))
     frequency = float(first["frequency"])
-    known = next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
+    known = _known(frequency)
     named = preset(known) if known else None
     layout_name, fan_deg = _layout(bearings)
     sonar = Sonar.create(
@@ -294,6 +294,11 @@ def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) ->
         sonar=sonar,
         level="gamma",
     )
+
+
+def _known(frequency: float) -> str | None:
+    """Return the preset of a carrier [Hz]; None where there is none."""
+    return next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
 
 
 def _layout(bearings: Array) -> tuple[str, float]:
@@ -359,4 +364,6 @@ def _notes(head: Header) -> list[str]:
         )
     if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
         notes.append("the sound speed of the messages cannot be: 1500 m/s is taken; ranges do not depend on it")
+    if not _known(float(head["frequency"][0])):
+        notes.append(f"no preset has this carrier: an opening over elevation of {ELEVATION_DEG:g} deg is taken")
     return notes

@@ -133,6 +133,23 @@ def test_levels_follow_the_gamma_byte(tmp_path: Path, code: int, gamma: float) -
     assert any("gamma byte" in note for note in recording.notes) == (code == 64)
 
 
+@pytest.mark.parametrize(
+    ("frequency", "name", "elevation"),
+    [(2.1e6, "oculus-m1200d-2100khz", 12), (1.2e6, "oculus-m1200d-1200khz", 20), (750e3, "oculus-m750d-750khz", 20)],
+)
+def test_the_carrier_names_the_preset(tmp_path: Path, frequency: float, name: str, elevation: float) -> None:
+    (tmp_path / "a.raw").write_bytes(oculus_ping(np.ones((4, 3)), frequency=frequency))
+    sonar = open_recording(tmp_path / "a.raw").part().like.sonar
+    assert (sonar.name, sonar.elevation_fov_deg, sonar.frequency_hz) == (name, elevation, frequency)
+
+
+def test_a_carrier_of_no_preset_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.raw").write_bytes(oculus_ping(np.ones((4, 3)), frequency=375e3))
+    recording = open_recording(tmp_path / "a.raw")
+    assert any("no preset has this carrier" in note for note in recording.notes)
+    assert recording.part().like.sonar.name == "oculus"
+
+
 def test_windows_and_beams_that_change_make_parts(tmp_path: Path) -> None:
     counts = np.ones((4, 3), int)
     steps = (0.003, 0.003 * 1.0005, 0.006, 0.006)
