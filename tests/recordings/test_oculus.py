@@ -9,6 +9,8 @@ import pytest
 from recording_files import oculus_log, oculus_ping, other_message, some_pings
 
 from mitsonar import MitsonarError, open_recording
+from mitsonar.estimation.image.direct import Direct
+from mitsonar.mapping.open_frames import open_frames
 
 SAMPLE = Path(__file__).resolve().parents[2].parent / "shared/data/real/oculus-m1200d-three-pings/three_pings_8bit.raw"
 
@@ -51,6 +53,16 @@ def test_the_layout_of_the_beams_follows_the_sample() -> None:
     frames = open_recording(SAMPLE).part().like
     assert frames.sonar.beam_layout == "sine"
     assert np.degrees(frames.sonar.bearing_rad - frames.bearing_rad) == pytest.approx(0, abs=0.02)
+
+
+@with_sample
+def test_the_sonar_of_the_sample_is_estimated_to_stand_still(tmp_path: Path) -> None:
+    source = open_frames(SAMPLE).with_geometry(height_m=0.6, pitch_rad=np.radians(25))
+    for pair in ([0, 1], [1, 2]):
+        found = Direct().estimate(source.read(pair))
+        assert found.valid
+        assert np.abs(found.motion[:2]).max() < 1e-3
+        assert abs(found.motion[2]) < np.radians(0.05)
 
 
 @pytest.mark.parametrize("packed", [False, True])
