@@ -76,6 +76,9 @@ LONGEST_M = 1e4
 LONGEST_S, LATEST_S = 1e4, 1e11
 """What is believed of the time between two pings, and of a time [s]."""
 
+SAME_CLOCK_S = 1.0
+"""Difference between the clocks of sonar and log, beyond their shift, up to which they count as one [s]."""
+
 BANDS = {
     "oculus-m750d-750khz": (6e5, 9e5),
     "oculus-m1200d-1200khz": (1e6, 1.5e6),
@@ -95,9 +98,10 @@ def read_oculus(path: str | Path) -> Recording:
     byte 127, 1 for 0 and 255. Where rows begin with a gain, counts are divided by its root, as two public readers do.
     Where a frame has 8 bits and no gains its image is uint8, else float32.
 
-    Times are those of a log, or the start times of version 2 [s]. The counter of older versions has no known unit: it rises
-    by 62.5 million a ping in the real ones, and one public driver calls it microseconds. Frames of such a dump follow each
-    other by their numbers, at the ping rate, or at 10 Hz where that has no known code.
+    Times are those of a log, or the start times of version 2 [s]. A log of version 2 has both: then times are those of the
+    sonar, which do not jitter, shifted to the log's clock. The counter of older versions has no known unit: it rises by 62.5
+    million a ping in the real ones, and one public driver calls it microseconds. Frames of such a dump follow each other by
+    their numbers, at the ping rate, or at 10 Hz where that has no known code.
     Attitude is that of version 2 [deg], its pitch taken as upward positive.
 
     Raises:
@@ -209,11 +213,12 @@ def _gained(head: Header) -> NDArray[np.bool_]:
 
 def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     """Return the times of the pings ``(n,)`` [s], and a sentence where they are assumed."""
-    if np.isfinite(logged_s).any():
-        return logged_s, []
     head = pings.head
     start: Array = head["start"].astype(np.float64)
-    if (head["version"] >= 2).all() and len(head) > 1 and _rise(start):
+    steady = (head["version"] >= 2).all() and len(head) > 1 and _rise(start)
+    if np.isfinite(logged_s).any():
+        return (_shifted(start, logged_s) if steady else logged_s), []
+    if steady:
         return start, []
     number = np.diff(head["number"].astype(np.int64))
     number = np.where((number > 0) & (number < 1_000_000), number, 1)
@@ -222,6 +227,13 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     why = "the greatest ping rate" if len(codes) == 1 and int(codes[0]) in RATES else "assumed"
     note = f"the file tells no times in a known unit: pings follow each other at {rate:g} Hz ({why}), by their numbers"
     return np.concatenate([[0.0], np.cumsum(number)]) / rate, [note]
+
+
+def _shifted(start_s: Array, logged_s: Array) -> Array:
+    """Return the sonar's times on the clock of the log ``(n,)`` [s]; those of the log where the clocks part."""
+    late = logged_s - start_s
+    shift = np.nanmedian(late)
+    return start_s + shift if bool((np.abs(late - shift) < SAME_CLOCK_S).all()) else logged_s
 
 
 def _rise(time_s: Array) -> bool:

@@ -49,6 +49,9 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "oculus log, packed": lambda folder: (folder / "a.oculus").write_bytes(
         oculus_log(some_pings(3), [1, 2, 3], packed=True)
     ),
+    "oculus log, version 2": lambda folder: (folder / "a.oculus").write_bytes(
+        oculus_log(some_pings(4, version=2), [5.0, 5.26, 5.5, 5.75], packed=False)
+    ),
     "didson 3": lambda folder: (folder / "a.ddf").write_bytes(didson_file(IMAGES)),
     "didson 4": lambda folder: (folder / "a.ddf").write_bytes(didson_file(IMAGES, version=4)),
 }

@@ -137,6 +137,18 @@ def test_attitude_and_times_of_version_2(tmp_path: Path) -> None:
     assert np.degrees(part.attitude_rad[0]) == pytest.approx([-10, -3, 90])
 
 
+@pytest.mark.parametrize(("stops_s", "steady"), [(0.0, True), (5.0, False)])
+def test_a_log_of_version_2_has_the_clock_of_the_sonar(tmp_path: Path, stops_s: float, steady: bool) -> None:
+    """The log's times jitter by 20 ms, and two of them are equal. Where the clocks part they are taken as they are."""
+    start = 50 + np.arange(6) / 10
+    late = 1.6e9 + np.array([0.0, 0.02, -0.08, 0.01, 0.0, stops_s])
+    pings = [oculus_ping(np.ones((4, 3)), version=2, number=one, start=start[one]) for one in range(6)]
+    (tmp_path / "a.oculus").write_bytes(oculus_log(pings, list(start + late), packed=False))
+    time_s = open_recording(tmp_path / "a.oculus").part().time_s
+    assert time_s == pytest.approx(start + 1.6e9 if steady else np.unique(start + late), abs=0.02 if steady else 1e-6)
+    assert (np.diff(time_s) == pytest.approx(0.1, abs=1e-5)) == steady
+
+
 @pytest.mark.parametrize(("code", "gamma"), [(0, 1.0), (255, 1.0), (127, 0.5), (64, 64 / 254)])
 def test_levels_follow_the_gamma_byte(tmp_path: Path, code: int, gamma: float) -> None:
     counts = np.array([[255, 128, 64]] * 2)
