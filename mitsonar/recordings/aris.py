@@ -20,7 +20,20 @@ from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, ma
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["BEAMS", "CHANNELS", "FRAME", "PINGS", "SIGNATURE", "in_beam_order", "read_aris"]
+__all__ = [
+    "BEAMS",
+    "CHANNELS",
+    "FRAME",
+    "KINDS",
+    "PINGS",
+    "SIGNATURE",
+    "facts_of",
+    "in_beam_order",
+    "like_of",
+    "notes_of",
+    "read_aris",
+    "windows_of",
+]
 
 SIGNATURE = b"DDF\x05"
 
@@ -108,8 +121,10 @@ def read_aris(path: str | Path) -> Recording:
     headers = frames.headers()
     whole, notes = _whole(headers, frames)
     kept, sorting = in_time_order(np.where(whole, headers["time_us"] * 1e-6, np.nan), headers["index"])
-    parts = tuple(_part(frames, headers, kept[run], beams) for _, run in runs_of(_windows(headers[kept])))
-    return Recording(name, "ARIS 5 (.aris)", parts, _facts(headers[kept], beams), (*notes, *sorting, *_notes(headers[kept])))
+    parts = tuple(_part(frames, headers, kept[run], beams) for _, run in runs_of(windows_of(headers[kept])))
+    return Recording(
+        name, "ARIS 5 (.aris)", parts, facts_of(headers[kept], beams), (*notes, *sorting, *notes_of(headers[kept]))
+    )
 
 
 def _frames_of(data: Bytes, name: str) -> tuple[EqualFrames, int]:
@@ -151,7 +166,7 @@ def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], lis
     return whole, notes
 
 
-def _windows(headers: Header) -> list[tuple[float, ...]]:
+def windows_of(headers: Header) -> list[tuple[float, ...]]:
     """Return what the geometry of each frame follows from; small drifts of the sound speed count as none."""
     names = ("start_delay_us", "sample_period_us", "large_lens", "system", "high_frequency")
     keys, speed = [], 0.0
@@ -170,7 +185,7 @@ def _part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], beams:
     attitude = np.where(np.abs(attitude) <= 2 * np.pi, attitude, np.nan)
     attitude = attitude if np.any(attitude) else None
     return Part(
-        like=_like(mine, samples, beams),
+        like=like_of(mine, samples, beams),
         time_s=mine["time_us"] * 1e-6,
         images=raw,
         poses=_poses(mine, attitude),
@@ -221,7 +236,7 @@ def in_beam_order(samples: Bytes, mode: int) -> Bytes:
     return ordered
 
 
-def _like(headers: Header, samples: int, beams: int) -> SonarFrames:
+def like_of(headers: Header, samples: int, beams: int) -> SonarFrames:
     """Return frames without images: the geometry of a part."""
     first = headers[0]
     kind = KINDS[int(first["system"])]
@@ -282,7 +297,7 @@ def _poses(headers: Header, attitude: NDArray[np.float64] | None) -> NDArray[np.
     return np.column_stack([east, north, -np.where(np.abs(depth) < 1.2e4, depth, 0.0), attitude])
 
 
-def _facts(headers: Header, beams: int) -> Facts:
+def facts_of(headers: Header, beams: int) -> Facts:
     """Return what the headers tell, by name."""
     if not len(headers):
         return {}
@@ -307,7 +322,7 @@ def _facts(headers: Header, beams: int) -> Facts:
     return facts
 
 
-def _notes(headers: Header) -> list[str]:
+def notes_of(headers: Header) -> list[str]:
     """Return sentences on what changes inside the file."""
     gains = np.unique(headers["gain_db"])
     return [f"the receiver's gain changes between {gains[0]} and {gains[-1]} dB"] if len(gains) > 1 else []

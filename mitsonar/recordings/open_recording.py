@@ -8,10 +8,12 @@ from typing import NamedTuple
 
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
+from mitsonar.recordings.canoe import is_canoe, read_canoe
 from mitsonar.recordings.picture_folder import holds_pictures, read_picture_folder
 from mitsonar.recordings.picture_stack import is_picture_stack, read_picture_stack
 from mitsonar.recordings.picture_video import is_video, read_picture_video
 from mitsonar.recordings.recording import Recording
+from mitsonar.recordings.uxo import is_uxo, read_uxo
 
 __all__ = ["FORMATS", "Format", "format_of", "open_recording"]
 
@@ -43,6 +45,8 @@ def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path |
 
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
+    Format("folders of UXO (DFKI)", is_uxo, _says_it_itself(read_uxo)),
+    Format("folders of CANOE", is_canoe, _says_it_itself(read_canoe)),
     Format("stacks of pictures (.npz)", is_picture_stack, read_picture_stack),
     Format("videos (.avi, .mp4)", is_video, read_picture_video),
     Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, read_picture_folder),
