@@ -85,15 +85,16 @@ def read_canoe(path: Path) -> Recording:
     stamps, files = np.array([time for time, _ in whole], dtype=np.int64), [one for _, one in whole]
     poses, told = _poses(path / POSES, stamps)
     if poses is not None and not np.isfinite(poses).all():
-        posed = np.isfinite(poses).all(axis=1)
-        notes.append(f"{(~posed).sum():,} pictures have no pose and are left out")
-        stamps, files, poses = stamps[posed], [one for one, kept in zip(files, posed, strict=True) if kept], poses[posed]
-    kept, sorting = in_time_order(stamps * 1e-6)
+        posed = np.flatnonzero(np.isfinite(poses).all(axis=1))
+        notes.append(f"{len(files) - len(posed):,} pictures have no pose and are left out")
+        stamps, files, poses = stamps[posed], [files[place] for place in posed], poses[posed]
+    times = np.asarray(stamps * 1e-6, dtype=float)
+    kept, sorting = in_time_order(times)
     sizes = [picture_size(files[place]) for place in kept]
     parts = []
     for size, run in runs_of(sizes):
         assert isinstance(size, tuple)  # as they were given
-        parts.append(_part([files[place] for place in kept[run]], size, stamps[kept[run]] * 1e-6, poses, kept[run]))
+        parts.append(_part([files[place] for place in kept[run]], size, times[kept[run]], poses, kept[run]))
     facts: Facts = {"pictures": len(files), "rows": sizes[0][0], "columns": sizes[0][1]}
     assumed = f"the window 0..{RANGE_MAX:g} m and the coding amplitude^0.5 are assumed: the files do not tell them"
     return Recording(str(path), "CANOE data set (Oculus as PNG)", tuple(parts), facts, (*notes, *sorting, *told, assumed))

@@ -119,7 +119,7 @@ def test_simulated_frames_of_a_real_sonar() -> None:
 @with_samples
 @pytest.mark.parametrize("name", ["forward_chain", "translate_tyre"])
 def test_real_fans_turn_as_their_registration_says(name: str) -> None:
-    """The reference is a registration of the fans themselves: it tests the signs here, and tells nothing of the sonar's side.
+    """The reference is a registration of the fans themselves: it tests the signs, and tells nothing of the sonar's side.
 
     A fixed point that turns anticlockwise in the fan (x to the right, y forward) is one that the sonar turned away from to
     starboard.

@@ -23,6 +23,10 @@ def polar(frames: int = 4, bins: int = 30, beams: int = 20) -> NDArray[np.uint8]
     return np.random.default_rng(5).integers(1, 256, (frames, bins, beams), dtype=np.uint8)
 
 
+def ramp(radius: NDArray[np.float64], bearing: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (radius - 60) / 300
+
+
 def folder_of(path: Path, images: NDArray[np.uint8], names: list[str], geometry: str = POLAR) -> Path:
     path.mkdir()
     for image, name in zip(images, names, strict=True):
@@ -125,9 +129,7 @@ def test_times_may_stand_in_a_file(tmp_path: Path) -> None:
 
 
 def test_fans_are_resampled_and_the_told_pitch_and_height_are_kept(tmp_path: Path) -> None:
-    pictures = np.stack([np.rint(drawn(lambda r, b, k=k: (r - 60) / 300 * (k + 1)) * 255) for k in range(2)]).astype(
-        np.uint8
-    )
+    pictures = np.stack([np.rint(drawn(ramp) * 255 * (k + 1)) for k in range(2)]).astype(np.uint8)
     text = (
         "layout: fan\napex_px: [119.5, 210.25]\nnear_px: 60\nfar_px: 200\nhalf_angle_deg: 28\nrange_max: 10\npitch_deg: 30\n"
         "height_m: 2.5\nlevel: gamma\nelevation_fov_deg: 20\nframe_rate_hz: 4\nbeams: 64\n"
