@@ -9,6 +9,7 @@ from typing import NamedTuple
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
 from mitsonar.recordings.canoe import is_canoe, read_canoe
+from mitsonar.recordings.neusis import is_neusis, read_neusis
 from mitsonar.recordings.picture_folder import holds_pictures, read_picture_folder
 from mitsonar.recordings.picture_stack import is_picture_stack, read_picture_stack
 from mitsonar.recordings.picture_video import is_video, read_picture_video
@@ -47,6 +48,7 @@ FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
     Format("folders of UXO (DFKI)", is_uxo, _says_it_itself(read_uxo)),
     Format("folders of CANOE", is_canoe, _says_it_itself(read_canoe)),
+    Format("folders of views (neusis)", is_neusis, _says_it_itself(read_neusis)),
     Format("stacks of pictures (.npz)", is_picture_stack, read_picture_stack),
     Format("videos (.avi, .mp4)", is_video, read_picture_video),
     Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, read_picture_folder),
