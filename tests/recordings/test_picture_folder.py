@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -152,13 +153,15 @@ def test_fans_are_resampled_and_the_told_pitch_and_height_are_kept(tmp_path: Pat
 
 def test_odd_pictures_are_left_out_and_told(tmp_path: Path) -> None:
     path = folder_of(tmp_path / "p", polar(4), [f"{k}.png" for k in range(4)])
+    os.mkfifo(path / "7.png")
+    (path / "8.png").mkdir()
     (path / "3.png").write_bytes((path / "3.png").read_bytes()[:-30])
     (path / "4.png").write_bytes(b"")
     (path / "5.png").write_bytes(b"no picture")
     Image.fromarray(polar(1, 31)[0]).save(path / "6.png")
     recording = open_recording(path)
     assert len(recording) == 3
-    assert any("3 pictures are cut off or damaged" in note for note in recording.notes)
+    assert any("5 pictures are cut off or damaged" in note for note in recording.notes)
     assert any("1 pictures have another size than 20 x 30" in note for note in recording.notes)
 
 
