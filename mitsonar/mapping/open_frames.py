@@ -60,13 +60,15 @@ def open_frames(
     return _of_zarr(path, str(where)) if path.is_dir() else FrameSource.of(SonarFrames.load(path), str(where))
 
 
-def load_frames(where: str | Path, *, sequence: int | None = None, view: str | None = None) -> SonarFrames:
+def load_frames(
+    where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
+) -> SonarFrames:
     """Load all frames at a path or URL into memory; see :func:`open_frames`.
 
     Raises:
         MitsonarError: no frames there; a sequence or view that is not there.
     """
-    source = open_frames(where, sequence=sequence, view=view)
+    source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
     return source.read(np.arange(len(source)))
 
 

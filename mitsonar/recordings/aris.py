@@ -21,7 +21,20 @@ from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, ma
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["BEAMS", "CHANNELS", "FRAME", "PINGS", "SIGNATURE", "in_beam_order", "read_aris"]
+__all__ = [
+    "BEAMS",
+    "CHANNELS",
+    "FRAME",
+    "KINDS",
+    "PINGS",
+    "SIGNATURE",
+    "facts_of",
+    "in_beam_order",
+    "like_of",
+    "notes_of",
+    "read_aris",
+    "windows_of",
+]
 
 SIGNATURE = b"DDF\x05"
 
@@ -106,8 +119,10 @@ def read_aris(path: str | Path) -> Recording:
     headers = frames.table()
     whole, notes = _whole(headers, frames)
     kept, sorting = in_time_order(np.where(whole, headers["time_us"] * 1e-6, np.nan), headers["index"])
-    parts = tuple(_part(frames, headers, kept[run], beams) for _, run in runs_of(_windows(headers[kept])))
-    return Recording(name, "ARIS 5 (.aris)", parts, _facts(headers[kept], beams), (*notes, *sorting, *_notes(headers[kept])))
+    parts = tuple(_part(frames, headers, kept[run], beams) for _, run in runs_of(windows_of(headers[kept])))
+    return Recording(
+        name, "ARIS 5 (.aris)", parts, facts_of(headers[kept], beams), (*notes, *sorting, *notes_of(headers[kept]))
+    )
 
 
 def _frames_of(data: Bytes, name: str) -> tuple[EqualFrames, int]:
@@ -154,7 +169,7 @@ def _tabled(headers: Header) -> NDArray[np.bool_]:
     return np.asarray(known, dtype=bool)
 
 
-def _windows(headers: Header) -> list[tuple[float, ...]]:
+def windows_of(headers: Header) -> list[tuple[float, ...]]:
     """Return what the geometry of each frame follows from; small drifts of the sound speed count as none."""
     names = ("start_delay_us", "sample_period_us", "large_lens", "system", "high_frequency")
     keys, speed = [], 0.0
@@ -171,7 +186,7 @@ def _part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], beams:
     raw = _Samples(frames, places, samples, beams, int(mine["ping_mode"][0]), bool(mine["reordered"].all()))
     attitude = attitude_of(mine)
     return Part(
-        like=_like(mine, samples, beams),
+        like=like_of(mine, samples, beams),
         time_s=mine["time_us"] * 1e-6,
         images=raw,
         poses=poses_of(mine, attitude),
@@ -222,7 +237,7 @@ def in_beam_order(samples: Bytes, mode: int) -> Bytes:
     return ordered
 
 
-def _like(headers: Header, samples: int, beams: int) -> SonarFrames:
+def like_of(headers: Header, samples: int, beams: int) -> SonarFrames:
     """Return frames without images: the geometry of a part."""
     first = headers[0]
     kind = KINDS[int(first["system"])]
@@ -265,7 +280,7 @@ def _rate(headers: Header) -> float:
     return (len(headers) - 1) / seconds if seconds > 0 else 10.0
 
 
-def _facts(headers: Header, beams: int) -> Facts:
+def facts_of(headers: Header, beams: int) -> Facts:
     """Return what the headers tell, by name."""
     if not len(headers):
         return {}
@@ -290,7 +305,7 @@ def _facts(headers: Header, beams: int) -> Facts:
     return facts
 
 
-def _notes(headers: Header) -> list[str]:
+def notes_of(headers: Header) -> list[str]:
     """Return sentences on what changes inside the file."""
     gains = np.unique(headers["gain_db"])
     return [f"the receiver's gain changes between {gains[0]} and {gains[-1]} dB"] if len(gains) > 1 else []

@@ -9,7 +9,9 @@ from typing import NamedTuple
 from mitsonar.errors import MitsonarError
 from mitsonar.recordings.aris import SIGNATURE, read_aris
 from mitsonar.recordings.bag_file import is_ros_bag
+from mitsonar.recordings.canoe import is_canoe, read_canoe
 from mitsonar.recordings.didson import SIGNATURES, read_didson
+from mitsonar.recordings.neusis import is_neusis, read_neusis
 from mitsonar.recordings.oculus import read_oculus
 from mitsonar.recordings.oculus_messages import is_oculus
 from mitsonar.recordings.picture_folder import holds_pictures, read_picture_folder
@@ -17,6 +19,7 @@ from mitsonar.recordings.picture_stack import is_picture_stack, read_picture_sta
 from mitsonar.recordings.picture_video import is_video, read_picture_video
 from mitsonar.recordings.recording import Recording
 from mitsonar.recordings.ros_bag import read_ros_bag
+from mitsonar.recordings.uxo import is_uxo, read_uxo
 
 __all__ = ["FORMATS", "Format", "format_of", "open_recording"]
 
@@ -62,6 +65,9 @@ FORMATS: tuple[Format, ...] = (
     Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, _says_it_itself(read_didson)),
     Format("Oculus (.raw, .oculus)", is_oculus, _says_it_itself(read_oculus)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
+    Format("folders of UXO (DFKI)", is_uxo, _says_it_itself(read_uxo)),
+    Format("folders of CANOE", is_canoe, _says_it_itself(read_canoe)),
+    Format("folders of views (neusis)", is_neusis, _says_it_itself(read_neusis)),
     Format("stacks of pictures (.npz)", is_picture_stack, _of_pictures(read_picture_stack)),
     Format("videos (.avi, .mp4)", is_video, _of_pictures(read_picture_video)),
     Format("folders of pictures (PNG, JPEG, PGM)", holds_pictures, _of_pictures(read_picture_folder)),

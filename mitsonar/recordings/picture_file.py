@@ -55,7 +55,9 @@ def refuse_size(rows: int, columns: int, source: str) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Return whether a file is not visibly cut off: a PNG file ends as one, any other has bytes."""
+    """Return whether a path is a file that is not visibly cut off: a PNG file ends as one, any other has bytes."""
+    if not path.is_file():  # a pipe would never end
+        return False
     try:
         with path.open("rb") as file:
             if file.read(len(PNG)) != PNG:

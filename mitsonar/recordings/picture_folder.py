@@ -41,7 +41,10 @@ def holds_pictures(path: Path, first: bytes) -> bool:
     """Return whether a path is a folder of pictures, and no folder of a run."""
     if first or not path.is_dir() or any((path / name).exists() for name in ("run.json", "zarr.json", "frames.npz")):
         return False
-    return any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+    try:
+        return any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+    except OSError:
+        return False
 
 
 def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from fans import FAN, drawn
@@ -30,8 +32,8 @@ def smooth(radius: Array, bearing: Array) -> Array:
     "changed",
     [{}, {"stretch": 1.3}, {"stretch": 0.8}, {"mirror": True}, {"forward": "down"}, {"mirror": True, "forward": "down"}],
 )
-def test_each_cell_holds_the_value_of_its_place(changed: dict[str, float]) -> None:
-    picture = drawn(smooth, **changed)  # type: ignore[arg-type]
+def test_each_cell_holds_the_value_of_its_place(changed: dict[str, Any]) -> None:
+    picture = drawn(smooth, **changed)
     keys = dict(changed)
     apex = (119.5, 210.25 if changed.get("forward") != "down" else 199 - 210.25)
     geometry = PictureGeometry.create(**{**FAN, "apex_px": apex}, range_max=10, **keys)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from pathlib import Path
@@ -21,6 +22,10 @@ POLAR = "layout: polar\nrange_min: 1\nrange_max: 9\nazimuth_fov_deg: 60\nlevel: 
 
 def polar(frames: int = 4, bins: int = 30, beams: int = 20) -> NDArray[np.uint8]:
     return np.random.default_rng(5).integers(1, 256, (frames, bins, beams), dtype=np.uint8)
+
+
+def ramp(radius: NDArray[np.float64], bearing: NDArray[np.float64]) -> NDArray[np.float64]:
+    return (radius - 60) / 300
 
 
 def folder_of(path: Path, images: NDArray[np.uint8], names: list[str], geometry: str = POLAR) -> Path:
@@ -125,9 +130,7 @@ def test_times_may_stand_in_a_file(tmp_path: Path) -> None:
 
 
 def test_fans_are_resampled_and_the_told_pitch_and_height_are_kept(tmp_path: Path) -> None:
-    pictures = np.stack([np.rint(drawn(lambda r, b, k=k: (r - 60) / 300 * (k + 1)) * 255) for k in range(2)]).astype(
-        np.uint8
-    )
+    pictures = np.stack([np.rint(drawn(ramp) * 255 * (k + 1)) for k in range(2)]).astype(np.uint8)
     text = (
         "layout: fan\napex_px: [119.5, 210.25]\nnear_px: 60\nfar_px: 200\nhalf_angle_deg: 28\nrange_max: 10\npitch_deg: 30\n"
         "height_m: 2.5\nlevel: gamma\nelevation_fov_deg: 20\nframe_rate_hz: 4\nbeams: 64\n"
@@ -150,13 +153,15 @@ def test_fans_are_resampled_and_the_told_pitch_and_height_are_kept(tmp_path: Pat
 
 def test_odd_pictures_are_left_out_and_told(tmp_path: Path) -> None:
     path = folder_of(tmp_path / "p", polar(4), [f"{k}.png" for k in range(4)])
+    os.mkfifo(path / "7.png")
+    (path / "8.png").mkdir()
     (path / "3.png").write_bytes((path / "3.png").read_bytes()[:-30])
     (path / "4.png").write_bytes(b"")
     (path / "5.png").write_bytes(b"no picture")
     Image.fromarray(polar(1, 31)[0]).save(path / "6.png")
     recording = open_recording(path)
     assert len(recording) == 3
-    assert any("3 pictures are cut off or damaged" in note for note in recording.notes)
+    assert any("5 pictures are cut off or damaged" in note for note in recording.notes)
     assert any("1 pictures have another size than 20 x 30" in note for note in recording.notes)
 
 

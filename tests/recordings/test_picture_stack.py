@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from fans import drawn
 
-from mitsonar import MitsonarError, SonarFrames, open_recording
+from mitsonar import MitsonarError, MitsonarWarning, SonarFrames, create_estimator, open_recording
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping.open_frames import open_frames
 from mitsonar.recordings.open_recording import format_of
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
@@ -53,6 +55,22 @@ def test_the_static_videos_of_fish_open_with_their_ready_geometries(name: str, r
     assert not [note for note in recording.notes if "stretch" in note]
     with pytest.raises(MitsonarError, match="do not tell their geometry"):
         open_recording(REAL / f"didson-static-video/{name}_first30.npz")
+
+
+@with_samples
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", ["lamprey2", "lamprey4"])
+def test_a_fish_before_a_sonar_at_rest_is_no_motion(name: str) -> None:
+    """Height and pitch are guessed: a motion of nothing is nothing over any ground."""
+    path, geometry = REAL / f"didson-static-video/{name}_first30.npz", GEOMETRIES / f"{name}.yaml"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MitsonarWarning)  # of metres that are not known
+        source = open_frames(path, geometry=geometry).with_geometry(2.0, np.radians(15))
+    estimator = create_estimator("direct")
+    found = [estimator.estimate(source.read([k, k + 1])) for k in range(0, 29, 4)]
+    assert all(one.valid for one in found)
+    motions = np.array([one.motion for one in found])
+    assert (np.sqrt((motions**2).mean(axis=0)) < [0.01, 0.002, np.radians(0.08)]).all()
 
 
 def stack(path: Path, **arrays: Any) -> Path:
