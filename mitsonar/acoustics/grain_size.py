@@ -1,7 +1,7 @@
 """The sediment of a mean grain size, -1 phi (sandy gravel) to 9 phi (clay), as numbers of a rough fluid.
 
 The regressions are those of APL-UW TR 9407 (1994), section IV, which could not be read: they are quoted from memory of the
-literature. At -1, 0.5, 1.5, 2.5 and 6 phi they give the numbers of a program of D. R. Jackson as the project hyo2_openbst
+literature. At 0.5, 1.5, 2.5 and 6 phi they give the numbers of a program of D. R. Jackson as the project hyo2_openbst
 has them, which is a second route (``tests/acoustics/test_grain_size.py``). They hold for 10 to 100 kHz.
 """
 

@@ -18,6 +18,7 @@ from PIL import Image
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.imaging import Simulator
@@ -291,7 +292,33 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     assert "rays traced and binned" in doctor.stdout
 
 
-@pytest.mark.parametrize("name", sorted(shipped_scenes()))
+LONG_TO_COMPILE = ("observatory", "pattern", "sunken_ship")
+"""Scenes of many materials or textures; the commands of the README render `pattern` along its trajectory."""
+
+
+@pytest.mark.parametrize("name", LONG_TO_COMPILE)
+def test_scenes_that_take_long_are_hit_along_their_trajectory(name: str) -> None:
+    """Single rays along the axis of the sonar, from each pose in the middle of the path: each meets the scene."""
+    import mitsuba as mi
+
+    scene, path = load_scene(name), Trajectory.load_tum(shipped_trajectory(name))
+    found = sonar_in(scene)
+    assert found is not None
+    poses = np.vstack([found[1], path.poses])
+    ahead = to_world_matrices(poses)[:, :3, 2]
+    rays = mi.Ray3f(mi.Point3f(*poses[:, :3].T.astype(np.float32)), mi.Vector3f(*ahead.T.astype(np.float32)))
+    hits = scene.ray_intersect_preliminary(rays)
+    away = np.where(np.array(hits.is_valid()), np.array(hits.t), np.inf)
+    assert ((away > found[0].range_min) & (away < found[0].range_max)).mean() > 0.9, away
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.thorough) if name in LONG_TO_COMPILE else name
+        for name in sorted(shipped_scenes())
+    ],
+)
 def test_shipped_scenes_render_and_have_a_trajectory_to_fly(name: str) -> None:
     path = Trajectory.load_tum(shipped_trajectory(name))
     scene = load_scene(name)

@@ -149,8 +149,17 @@ INSTRUMENTS = {
 }
 
 
-@pytest.mark.parametrize("focus_m", [2.0, 3.0, 4.4, 12.0])
-@pytest.mark.parametrize("name", INSTRUMENTS)
+QUICK = (("DIDSON", 2.0), ("DIDSON", 12.0), ("ARIS", 3.0), ("ARIS", 4.4))
+
+
+@pytest.mark.parametrize(
+    ("name", "focus_m"),
+    [
+        (name, at) if (name, at) in QUICK else pytest.param(name, at, marks=pytest.mark.thorough)
+        for name in INSTRUMENTS
+        for at in (2.0, 3.0, 4.4, 12.0)
+    ],
+)
 def test_focus_against_exact_ways_to_the_elements(name: str, focus_m: float) -> None:
     """Near field of a lens: the level in each beam relative to the top in focus, 0.5 dB down to -30 dB, blurred or not."""
     loaded, fields, place = one_point()
