@@ -45,8 +45,8 @@ SPECKLE_LAWS: dict[str, str] = {
     "ground": "the expected level is known, the grain is new in each frame: intensities of speckle and noise",
 }
 
-GRAIN_PINGS, GROUND_PINGS = 1, 4
-"""Places at which each half of the derivatives is taken: bounds vary by 2 %."""
+GRAIN_PINGS, GROUND_PINGS = 2, 4
+"""Places at which each half of the derivatives is taken: bounds vary by 1 to 3 %."""
 
 GRAIN_STEP = 1 / 8
 """Step of the grain's derivatives, as a part of a bin (forward) and of a beam (sideways, yaw): a tenth of the grain."""
@@ -92,7 +92,7 @@ class SpeckleBounds:
 
         Args:
             poses: of the sonar ``(n, 6)``.
-            pings: of each half of the derivatives; default: 1 for the grain, 4 for the ground.
+            pings: of each half of the derivatives; default: 2 for the grain, 4 for the ground.
         """
         for number, pose in enumerate(np.atleast_2d(np.asarray(poses, dtype=float))):
             first = FIRST_PING + 32 * PINGS * number
