@@ -41,8 +41,8 @@ EVEN = 0.005
 """Largest distance of the quartiles of the height under the steepest rays on even ground, as part of the height."""
 
 EVEN_SKIRT = 0.02
-"""The same where the light has a skirt in place of an edge: speckle spreads first echoes. They come from the skirt, and tell a
-height that is 5 to 12 % too small; among rocks the rocks answer first, and the error is 1 %."""
+"""The same where the light has a skirt in place of an edge: speckle spreads first echoes. They come from the skirt, and tell
+a height that is 5 to 12 % too small. Among rocks the rocks answer first, and the error is 1 %."""
 
 FEWEST_BEAMS = 8
 
