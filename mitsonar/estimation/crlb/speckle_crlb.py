@@ -8,8 +8,9 @@ which turns once in a quarter of a millimetre, tells nothing. Neighbouring cells
 frame has grain of its own, as after a motion of more than the grain's size. An intensity is exponential; its score is the
 intensity over its mean, and scores of two cells covary as the squared coherence of their fields.
 
-Both are what the best weighted sum of the scores of single pixels can use. Patches of ``speckle_nu`` belong to the grain,
-yet `ground` counts pixels as exponential: with patches it is too optimistic.
+Both are what the best weighted sum of the scores of single pixels can use. `ground` is optimistic in two ways: speckle
+correlates as on even ground, though a dark cell beside a bright one shows that one's grain; and patches of ``speckle_nu``,
+which belong to the grain, are not in it.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from helpers import Array, diffuse, floor, scene
-from scipy import special, stats
+from scipy import ndimage, special, stats
 from scipy.sparse import csr_array
 
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -97,10 +97,15 @@ def test_rounding_is_a_variance_and_without_noise_it_is_all() -> None:
 
 
 def source(noise_db: float, even: bool = False) -> Simulator:
-    """Even ground, or blotches of 8 cm; a noise of -90 dB lies 16 dB below the median echo."""
+    """Even ground, or soft blotches of 10 cm; a noise of -90 dB lies 16 dB below the median echo."""
+    import mitsuba as mi
+
     from mitsonar.simulation.imaging import Simulator
 
-    made = scene(floor=floor(diffuse(0.5 if even else {"type": "cell_noise", "cells": 500}), 20.0))
+    grain = ndimage.gaussian_filter(np.random.default_rng(5).random((400, 400)), 1.5, mode="wrap")
+    picture = mi.Bitmap(np.clip(0.5 + (grain - 0.5) * 3, 0.02, 1).astype(np.float32)[..., None])
+    blotches = {"type": "bitmap", "bitmap": picture, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+    made = scene(floor=floor(diffuse(0.5 if even else blotches), 10.0))
     return Simulator(made, SONAR.replace(noise_level_db=noise_db))
 
 
@@ -118,7 +123,7 @@ def reaches(value: float, draws: int) -> bool:
 def pulled(told: CellScores, scores: Array) -> Array:
     """Return J' W^1/2 C^-1 of standardised scores ``(n, bins, beams)``, as ``(n, 3)``."""
     jacobian = told.jacobian.mean(axis=0, dtype=float) * np.sqrt(told.weight)[..., None]
-    return np.einsum("nij,ijk->nk", told.covariance.solve(scores), jacobian)
+    return np.asarray(np.einsum("nij,ijk->nk", told.covariance.solve(scores), jacobian))
 
 
 def rician_scores(amplitude: Array, echo: Array, noise: Array, weight: Array) -> Array:
