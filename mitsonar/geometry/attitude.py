@@ -40,6 +40,10 @@ STD_MEASURED, STD_GIVEN = 0.02, 0.05
 EVEN = 0.005
 """Largest distance of the quartiles of the height under the steepest rays on even ground, as part of the height."""
 
+EVEN_SKIRT = 0.02
+"""The same where the light has a skirt in place of an edge: speckle spreads first echoes. They come from the skirt, and tell
+a height that is 5 to 12 % too small. Among rocks the rocks answer first, and the error is 1 %."""
+
 FEWEST_BEAMS = 8
 
 FAINTEST = 1e-9
@@ -162,4 +166,6 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
     drop = (frames.range_m[first] * down)[received]
     height = float(drop.mean() - TOPS * (np.percentile(drop, 90) - drop.mean()))
     low, high = np.percentile(drop, [25, 75])
+    if frames.sonar.vertical_pattern != "box" and high - low < EVEN_SKIRT * height:
+        return None
     return _FirstEchoes(height, bool(high - low < EVEN * height)) if height > 0 else None

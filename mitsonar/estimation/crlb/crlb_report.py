@@ -136,4 +136,11 @@ def report_lines(report: PlainTable) -> list[str]:
 def _text(std: list[float | None] | None) -> str:
     if std is None:
         return "-"
-    return " / ".join("inf" if v is None else f"{v:.{d}f}" for v, d in zip(std, (3, 3, 4), strict=True))
+    return " / ".join(_number(v, d) for v, d in zip(std, (3, 3, 4), strict=True))
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Return a standard deviation with some decimals, or with two digits where these show fewer; inf for None."""
+    if value is None:
+        return "inf"
+    return f"{value:.2g}" if 0 < value < 10 ** (1 - digits) else f"{value:.{digits}f}"
