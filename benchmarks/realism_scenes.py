@@ -157,7 +157,8 @@ def rough(body: trimesh.Trimesh, rms: float, longest: float, edge: float, seed: 
         edge: largest edge of the faces afterwards [m].
         seed: of the waves.
     """
-    vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, edge, max_iter=12)
+    subdivide: Callable[..., Any] = trimesh.remesh.subdivide_to_size
+    vertices, faces = subdivide(body.vertices, body.faces, edge, max_iter=12)
     body = trimesh.Trimesh(vertices, faces)
     body.merge_vertices()
     rng = np.random.default_rng(seed)
@@ -276,7 +277,7 @@ def tank_with_tyre(folder: Path) -> mi.Scene:
         "lid": (rough(lid, 2e-3, 0.08, 0.006, 43), 0.008),
         "wall": (rough(wall, 3e-3, 0.15, 0.01, 44), 0.02),
     }
-    return loaded(parts, folder / "tyre", floor=floor(patches(0.0, 2e-6, 0.4, 45)))
+    return loaded(parts, folder / "tyre", floor=floor(patches(0.0, 3e-7, 0.4, 45)))
 
 
 def tank_with_chain(folder: Path) -> mi.Scene:
@@ -292,7 +293,7 @@ def tank_with_chain(folder: Path) -> mi.Scene:
         links.append(
             placed(
                 trimesh.creation.torus(0.028, 0.009, major_sections=32, minor_sections=12),
-                (x, y, 0.04 * math.sin(37.0 * along)),
+                (x, y, 0.01 + 0.03 * math.sin(37.0 * along)),
                 turn,
             )
         )
@@ -301,7 +302,7 @@ def tank_with_chain(folder: Path) -> mi.Scene:
         "chain": (rough(merged(links), 5e-4, 0.02, 0.004, 51), 0.02),
         "beams": (rough(merged(beams), 3e-3, 0.1, 0.008, 52), 0.03),
     }
-    return loaded(parts, folder / "chain", floor=floor(patches(0.0, 5e-5, 0.4, 53)))
+    return loaded(parts, folder / "chain", floor=floor(patches(0.0, 2e-5, 0.4, 53)))
 
 
 def small_tank(folder: Path) -> mi.Scene:
