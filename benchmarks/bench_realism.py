@@ -92,8 +92,7 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
     ensure_variant()
     poses = stage.start + np.arange(frames)[:, None] * stage.step
     poses[:, :3] += np.random.default_rng(SEED).normal(0, stage.sway_m, (frames, 3))
-    nu = fit.sonar.speckle_nu if stage.patchy else None
-    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu)
+    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=None)  # the fitted one counts objects and edges
     with tempfile.TemporaryDirectory() as made:
         scene = stage.build(Path(made))
         if sonar.volume_db is not None and sonar.noise_level_db is not None:

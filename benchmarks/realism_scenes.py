@@ -31,7 +31,6 @@ class Stage:
         sonar: fields that the recording does not tell.
         pictures: whether frames pass through fan pictures of 8 bit, as the recording did.
         video: whether these pass through MPEG-4.
-        patchy: whether the ground is of patches, by the fitted ``speckle_nu``. Elsewhere that number is of objects.
         mirrors: reflection coefficient and rms height [m] of smooth shapes.
         sway_m: standard deviation of the sonar's place from ping to ping, along each axis [m].
         volume_db: strength of the water [dB re 1/m] where the fit has no scale: noise, volume and full scale move to it.
@@ -43,7 +42,6 @@ class Stage:
     sonar: dict[str, Any]
     pictures: str = ""
     video: bool = False
-    patchy: bool = False
     mirrors: dict[str, tuple[float, float]] = field(default_factory=dict)
     volume_db: float | None = None
     sway_m: float = 0.0
