@@ -113,9 +113,10 @@ class CoherentImager:
         """
         sonar = self.sonar
         assert sonar.noise_level_db is not None
-        power = 10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 10)
+        amplitude = 10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 20)
         if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
-            return self._white(ping, NOISE, 1) * np.asarray(np.sqrt(power), np.float32)
+            return self._white(ping, NOISE, 1) * np.asarray(amplitude, np.float32)
+        power = np.square(amplitude)
         still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
         new = self._white(ping, NOISE, 1) * np.asarray(np.sqrt(power - still), np.float32)
         return np.asarray(new + self._white(0, GLOW, 1) * np.asarray(np.sqrt(still), np.float32), dtype=np.complex64)
