@@ -36,7 +36,7 @@ SHOWN_DB = 50.0
 """Span of the pictures below the 99.9th percentile [dB]."""
 
 SEED = 20
-"""Of the order of the sheet."""
+"""Of the sway."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ def main() -> None:
     parser.add_argument("--recordings", help=f"folder of the recordings; default: ${FOLDER}")
     parser.add_argument("--out", type=Path, help="folder of the pictures; default: none are drawn")
     parser.add_argument("--only", default="", help="only recordings whose name contains this")
+    parser.add_argument("--order", type=int, default=20, help="seed of the order of the sheet")
     parser.add_argument("--quick", action="store_true", help="two frames of one recording")
     asked = parser.parse_args()
     folder = recordings_folder(asked.recordings)
@@ -80,7 +81,7 @@ def main() -> None:
     print("\n" + table({name: compare(*pair) for name, pair in drawn.items()}))
     if asked.out is not None:
         asked.out.mkdir(parents=True, exist_ok=True)
-        draw(drawn, asked.out)
+        draw(drawn, asked.out, asked.order)
 
 
 # ---------------------------------------------------------------- simulation
@@ -91,8 +92,7 @@ def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFra
     ensure_variant()
     poses = stage.start + np.arange(frames)[:, None] * stage.step
     poses[:, :3] += np.random.default_rng(SEED).normal(0, stage.sway_m, (frames, 3))
-    nu = fit.sonar.speckle_nu if stage.patchy else None
-    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu)
+    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=None)  # the fitted one counts objects and edges
     with tempfile.TemporaryDirectory() as made:
         scene = stage.build(Path(made))
         if sonar.volume_db is not None and sonar.noise_level_db is not None:
@@ -196,6 +196,8 @@ def fan(frames: SonarFrames, index: int = 0) -> NDArray[np.float32]:
 
 def panels(pictures: Iterable[NDArray[np.float32]], titles: Iterable[str], columns: int, path: Path) -> None:
     """Write pictures side by side, each as high as the others."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     shown, named = list(pictures), list(titles)
@@ -206,15 +208,17 @@ def panels(pictures: Iterable[NDArray[np.float32]], titles: Iterable[str], colum
         if one < len(shown):
             axis.imshow(shown[one], cmap="gray", vmin=0, vmax=1, interpolation="antialiased", aspect="equal")
             axis.set_title(named[one], fontsize=9)
+    grey = ScalarMappable(Normalize(-SHOWN_DB, 0), "gray")
+    figure.colorbar(grey, ax=list(axes), label="level (dB below the brightest 0.1 %)", fraction=0.02, pad=0.01)
     figure.savefig(path, dpi=110)
 
 
-def draw(drawn: dict[str, tuple[SonarFrames, SonarFrames]], folder: Path) -> None:
+def draw(drawn: dict[str, tuple[SonarFrames, SonarFrames]], folder: Path, seed: int) -> None:
     """Write the figure with names, real above simulated, and the sheet without them with its key apart."""
     both = [[fan(pair[side]) for pair in drawn.values()] for side in (0, 1)]
     titles = [f"{side}: {name}" for side in ("real", "simulated") for name in drawn]
     panels(both[0] + both[1], titles, len(drawn), folder / "realism.png")
-    order = np.random.default_rng(SEED).permutation(2 * len(drawn))
+    order = np.random.default_rng(seed).permutation(2 * len(drawn))
     letters = [chr(ord("A") + place) for place in range(len(order))]
     mixed = both[0] + both[1]
     panels([mixed[k] for k in order], letters, len(drawn), folder / "sheet.png")

@@ -31,7 +31,6 @@ class Stage:
         sonar: fields that the recording does not tell.
         pictures: whether frames pass through fan pictures of 8 bit, as the recording did.
         video: whether these pass through MPEG-4.
-        patchy: whether the ground is of patches, by the fitted ``speckle_nu``. Elsewhere that number is of objects.
         mirrors: reflection coefficient and rms height [m] of smooth shapes.
         sway_m: standard deviation of the sonar's place from ping to ping, along each axis [m].
         volume_db: strength of the water [dB re 1/m] where the fit has no scale: noise, volume and full scale move to it.
@@ -43,7 +42,6 @@ class Stage:
     sonar: dict[str, Any]
     pictures: str = ""
     video: bool = False
-    patchy: bool = False
     mirrors: dict[str, tuple[float, float]] = field(default_factory=dict)
     volume_db: float | None = None
     sway_m: float = 0.0
@@ -157,7 +155,8 @@ def rough(body: trimesh.Trimesh, rms: float, longest: float, edge: float, seed: 
         edge: largest edge of the faces afterwards [m].
         seed: of the waves.
     """
-    vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, edge, max_iter=12)
+    subdivide: Callable[..., Any] = trimesh.remesh.subdivide_to_size
+    vertices, faces = subdivide(body.vertices, body.faces, edge, max_iter=12)
     body = trimesh.Trimesh(vertices, faces)
     body.merge_vertices()
     rng = np.random.default_rng(seed)
@@ -194,7 +193,7 @@ def far_bed(folder: Path) -> mi.Scene:
     """Make a bed of bars across the flow between two banks of mud, with stones."""
 
     def outside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return beside(x - 0.35, y, 0.9, 0.15, 12)
+        return beside(x - 0.35, y, 0.75, 0.2, 12)
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         bars = 0.004 * np.sin(2 * math.pi * (y + 0.6 * x + 0.5 * np.sin(1.7 * x) + 0.3 * np.sin(2.3 * y)) / 0.45)
@@ -213,17 +212,20 @@ def sparse_bottom(folder: Path) -> mi.Scene:
     """Make a flat bottom of mud with low ridges of rubble."""
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        one = np.exp(-(((y - 13.5 + 1.2 * x) / 0.12) ** 2)) * (x < 0.6)
-        other = np.exp(-(((y - 16.0 - 0.9 * x) / 0.12) ** 2)) * (x > -1.0)
-        return np.asarray(0.1 * (one + other))
+        y = y + 0.2 * np.sin(2.1 * x + 1) + 0.1 * np.sin(5.3 * x)
+        one = np.exp(-(((y - 15.0 + 0.9 * x) / 0.2) ** 2)) * (x < 1.8)
+        other = np.exp(-(((y - 16.6 - 0.6 * x) / 0.2) ** 2)) * (x > -1.0) * (x < 0.3)
+        return np.asarray(0.08 * (one + other))
 
     def low(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(0.02 - shape(x, y))
+        return np.asarray(0.03 - shape(x, y))
 
-    ridges, mud = parted(ground((8, 26), 0.03, 0.004, 1.0, 8, shape), low)
-    return loaded(
-        {"mud": (mud, patches(0.0, 5e-4, 2.0, 81)), "ridges": (ridges, patches(0.0, 0.03, 0.5, 82))}, folder / "sparse"
-    )
+    ridges, mud = parted(ground((8, 26), 0.03, 0.004, 1.0, 8, shape), low, 0.01)
+    parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
+        "mud": (mud, patches(0.0, 5e-4, 2.0, 81)),
+        "ridges": (ridges, patches(0.0, 0.02, 0.5, 82)),
+    }
+    return loaded(parts, folder / "sparse")
 
 
 def placed(body: trimesh.Trimesh, at: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -266,17 +268,17 @@ def flat(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def tank_with_tyre(folder: Path) -> mi.Scene:
     """Make a dark floor of patches, a tyre with tread on its side, a box and a wall's corner, all smooth with relief."""
-    tyre = placed(trimesh.creation.torus(0.11, 0.04, major_sections=96, minor_sections=32), (0.12, 2.4, 0.05), (12, 0, 25))
+    tyre = placed(trimesh.creation.torus(0.11, 0.04, major_sections=96, minor_sections=32), (0.12, 2.4, 0.02), (30, 0, 25))
     box = placed(trimesh.creation.box((0.05, 0.3, 0.12)), (-0.3, 3.1, 0.06), (0, 0, 35))
     lid = placed(trimesh.creation.box((0.25, 0.04, 0.1)), (-0.28, 2.95, 0.05), (0, 0, -25))
-    wall = placed(trimesh.creation.box((1.5, 0.05, 0.8)), (1.2, 3.75, 0.4), (0, 0, -40))
+    wall = placed(trimesh.creation.box((1.5, 0.05, 0.8)), (1.15, 3.55, 0.4), (0, 0, -40))
     parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
-        "tyre": (rough(tyre, 1e-3, 0.06, 0.005, 41), 5e-4),
+        "tyre": (rough(tyre, 3e-3, 0.08, 0.005, 41), 5e-4),
         "box": (rough(box, 2e-3, 0.08, 0.006, 42), 0.005),
         "lid": (rough(lid, 2e-3, 0.08, 0.006, 43), 0.008),
         "wall": (rough(wall, 3e-3, 0.15, 0.01, 44), 0.02),
     }
-    return loaded(parts, folder / "tyre", floor=floor(patches(0.0, 2e-6, 0.4, 45)))
+    return loaded(parts, folder / "tyre", floor=floor(patches(0.0, 3e-7, 0.4, 45)))
 
 
 def tank_with_chain(folder: Path) -> mi.Scene:
@@ -292,7 +294,7 @@ def tank_with_chain(folder: Path) -> mi.Scene:
         links.append(
             placed(
                 trimesh.creation.torus(0.028, 0.009, major_sections=32, minor_sections=12),
-                (x, y, 0.04 * math.sin(37.0 * along)),
+                (x, y, 0.01 + 0.03 * math.sin(37.0 * along)),
                 turn,
             )
         )
@@ -301,7 +303,7 @@ def tank_with_chain(folder: Path) -> mi.Scene:
         "chain": (rough(merged(links), 5e-4, 0.02, 0.004, 51), 0.02),
         "beams": (rough(merged(beams), 3e-3, 0.1, 0.008, 52), 0.03),
     }
-    return loaded(parts, folder / "chain", floor=floor(patches(0.0, 5e-5, 0.4, 53)))
+    return loaded(parts, folder / "chain", floor=floor(patches(0.0, 2e-5, 0.4, 53)))
 
 
 def small_tank(folder: Path) -> mi.Scene:
@@ -311,13 +313,13 @@ def small_tank(folder: Path) -> mi.Scene:
         return np.asarray(np.abs(y - 0.9 + 0.05 * np.sin(5 * x)) - 0.22 - 0.03 * np.sin(9 * x + 1))
 
     body = placed(trimesh.creation.capsule(0.1, 0.012, count=[24, 24]), (0.05, 0.95, 0.01), (90, 0, 60))
-    seam = placed(trimesh.creation.box((1.2, 0.01, 0.012)), (0.2, 1.45, 0.0), (0, 0, -20))
+    seam = rough(placed(trimesh.creation.box((1.2, 0.02, 0.012)), (0.2, 1.45, 0.0), (0, 0, -20)), 0.003, 0.2, 0.01, 93)
     strip, smooth = parted(ground((3, 2.4), 0.006, 0.004, 0.3, 9, flat), outside, 0.04)
     parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
         "strip": (strip, patches(0.02, 0.3, 0.3, 91)),
         "smooth": (smooth, patches(0.0, 0.004, 0.3, 92)),
         "body": (body, 0.1),
-        "seam": (seam, 0.1),
+        "seam": (seam, 0.04),
     }
     return loaded(parts, folder / "small")
 

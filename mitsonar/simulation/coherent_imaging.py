@@ -166,9 +166,10 @@ class CoherentImager:
         matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell), those of the part of the
         glow that stays of (seed, cell).
         """
-        sonar, power, salt = self.sonar, self._noise_power, SIDE_SALT[side]
+        sonar, amplitude, salt = self.sonar, self._noise_amplitude, SIDE_SALT[side]
         if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
-            return self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power), np.float32)
+            return self._white(ping, NOISE ^ salt, 1) * np.asarray(amplitude, np.float32)
+        power = np.square(amplitude)
         still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
         new = self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power - still), np.float32)
         stays = self._white(0, GLOW ^ salt, 1) * np.asarray(np.sqrt(still), np.float32)
@@ -199,7 +200,7 @@ class CoherentImager:
         Glow that differs from beam to beam counts by its mean.
         """
         sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
-        noise = none if sonar.noise_level_db is None else self._noise_power.mean(axis=1)
+        noise = none if sonar.noise_level_db is None else np.square(self._noise_amplitude).mean(axis=1)
         return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
 
     def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -214,11 +215,11 @@ class CoherentImager:
         return csr_array(rows @ rows.T)
 
     @cached_property
-    def _noise_power(self) -> NDArray[np.float64]:
-        """Return the power of the receiver's noise with its glow ``(bins, 1)`` or ``(bins, beams)``."""
+    def _noise_amplitude(self) -> NDArray[np.float64]:
+        """Return the amplitude of the receiver's noise with its glow ``(bins, 1)`` or ``(bins, beams)``."""
         sonar = self.sonar
         assert sonar.noise_level_db is not None
-        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 10), dtype=np.float64)
+        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 20), dtype=np.float64)
 
     @cached_property
     def _volume_amplitude(self) -> NDArray[np.float64]:
