@@ -32,11 +32,15 @@ from mitsonar.config.training_recipe import Optimiser, load_training_recipe, tra
 from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.learned.view_network import ViewNetwork, _rejection_of_profiles  # noqa: E402
+from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.mapping.view_source import open_views  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
-from mitsonar.training.evaluation import predictions  # noqa: E402
+from mitsonar.training.evaluation import evaluate, predictions  # noqa: E402
 from mitsonar.training.training_run import train  # noqa: E402
+
+GAINS = {"coherent": 268.0, "physical": 343.0}
+"""Of the sets that the shipped ProfileNet has learnt from."""
 
 PORTIONS: dict[str, Any] = {
     **DOWN,
@@ -410,3 +414,25 @@ def test_a_network_of_views_needs_a_data_set_that_holds_them(
         ViewNetwork(Checkpoint.load(learnt)).estimate(frames)
     with pytest.raises(MitsonarError, match="has no sequence 99"):
         open_views(str(portions), ["c1"], "vector", sequence=99)
+
+
+# ---------------------------------------------------------------- the shipped one
+
+
+@pytest.mark.parametrize("model", ["coherent", "physical"])
+def test_the_shipped_profilenet_knows_unseen_fields(tmp_path: Path, model: str) -> None:
+    """Twelve pairs of a field that training has not seen: far better than no motion in both models."""
+    scenes = [{"count": 1, "sequences": 12, "world": {"size_m": 30}}]
+    changes = {"seed": 4713, "sonar.model": model, "flight.pings": 2, "scenes": scenes, "gain": GAINS[model]}
+    make_dataset(load_recipe("looking-down-coherent", changes), str(tmp_path / "unseen.zarr"))
+    kept = Checkpoint.load("profilenet-quadrants-coherent")
+    report = evaluate(kept, str(tmp_path / "unseen.zarr"), part="all", noise=["none"])
+    network, zero = (np.array(report["tables"][0]["rows"][k]["rmse"][:2]) for k in (0, 1))
+    assert (network < zero / 2).all(), (network, zero)
+    assert "model" not in " ".join(report["notes"])
+    estimator = create_estimator("profilenet-quadrants-coherent")
+    assert isinstance(estimator, ViewNetwork)
+    motion = SonarPairs(tmp_path / "unseen.zarr", part="all").motion[::2]  # speckle changes with large motions
+    smallest = int(np.abs(motion[:, :2]).max(axis=1).argmin())
+    source = open_views(str(tmp_path / "unseen.zarr"), estimator.views, "vector", sequence=smallest)
+    assert estimator.estimate(source.read([0, 1])).valid
