@@ -39,6 +39,8 @@ EXTRAS = {
     "onnxscript": ("learn", "writing ONNX"),
     "sklearn": ("learn", "classical regression"),
     "s3fs": ("s3", "object storage"),
+    "rosbags": ("ros", "reading ROS bags and writing MCAP"),
+    "mcap": ("ros", "writing MCAP"),
 }
 """Optional packages: the extra that installs each, and what needs it."""
 

@@ -7,7 +7,7 @@ import shutil
 import struct
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -473,11 +473,11 @@ READERS: dict[str, Reader] = {
 }
 
 
-def attack(name: str, folder: Path, count: int, first: int = 0) -> dict[str, int]:
+def attack(name: str, folder: Path, count: int, first: int = 0, readers: Mapping[str, Reader] = READERS) -> dict[str, int]:
     """So many mutants of a reader's files: how many were read and refused."""
     from mutations import outcome
 
-    reader = READERS[name]
+    reader = readers[name]
     good, bad = folder / "good", folder / "bad"
     good.mkdir()
     reader.make(good)

@@ -36,6 +36,7 @@ def application() -> typer.Typer:
         mosaic_command,
         odometry_command,
         presets_command,
+        recording_command,
         render_command,
         reproduce_command,
         sonar_command,
@@ -69,4 +70,5 @@ def application() -> typer.Typer:
     app.add_typer(world_command.worlds(), name="world")
     app.add_typer(sonar_command.sonars(), name="sonar")
     app.add_typer(dataset_command.datasets(), name="dataset")
+    app.add_typer(recording_command.recordings(), name="recording")
     return app

@@ -16,7 +16,10 @@ from mitsonar.errors import MitsonarError
 __all__ = ["Frames", "Geometry", "odometry"]
 
 Frames = Annotated[
-    str, typer.Argument(metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, or a data set.")
+    str,
+    typer.Argument(
+        metavar="FRAMES|RUN|DATA.zarr", help="frames.npz, frames.zarr, a run's folder, a data set or a recording."
+    ),
 ]
 Geometry = Annotated[
     Path | None, typer.Option(help="YAML file that tells how the pictures of a recording are laid out.", dir_okay=False)
@@ -24,13 +27,17 @@ Geometry = Annotated[
 PAIRS_A_WORKER = 50
 """Smallest number of pairs that is worth a process."""
 
+LOOP = 8
+"""Motions over which loops of a recording are closed."""
+
 
 @answered
 def odometry(
     frames: Annotated[
         str,
         typer.Argument(
-            metavar="RUN|FRAMES|DATA.zarr", help="A run of frames or impulse responses, or a data set of frames."
+            metavar="RUN|FRAMES|DATA.zarr|FILE",
+            help="A run of frames or impulse responses, a data set of frames, or a recording of a real sonar.",
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to make: path, motions, table, figure.")],
@@ -39,7 +46,7 @@ def odometry(
         typer.Option(
             help="zero, ecc, flow, phase, direct, corrnet, or a checkpoint; NAME:key=value:key=value. Of several "
             "checkpoints, separated by commas, the one trained nearest to the height is used. For impulse responses: "
-            "zero, correlation, likelihood."
+            "zero, correlation, likelihood. Default: direct; ecc for recordings of real sonars; likelihood."
         ),
     ] = None,
     smooth: Annotated[str, typer.Option(help="none, spline or kalman. Invalid motions are bridged in any case.")] = "none",
@@ -53,7 +60,23 @@ def odometry(
         typer.Option(help="Estimator of the height of each frame: direct, or a checkpoint that was trained on heights."),
     ] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
-    sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
+    contrast: Annotated[
+        str | None,
+        typer.Option(
+            help="What is matched: levels, local (contrast) or moving (local, less the mean of the run). Default: local for "
+            "recordings of real sonars, levels for all others."
+        ),
+    ] = None,
+    closure: Annotated[
+        int | None,
+        typer.Option(
+            help="Motions over which loops are closed; covariances are raised to what they leave over. 0: none. Default: 8 "
+            "for recordings of real sonars, else 0."
+        ),
+    ] = None,
+    sequence: Annotated[
+        int | None, typer.Option(help="Sequence of a data set, or part of a recording (default: the longest).")
+    ] = None,
     view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
     geometry: Geometry = None,
     noise: Annotated[
@@ -76,6 +99,7 @@ def odometry(
     """
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
+    from mitsonar.mapping.open_frames import is_recording
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at
     from mitsonar.motion.pose import Pose
     from mitsonar.records.sonar_frames import SonarFrames
@@ -83,9 +107,9 @@ def odometry(
     factors = scale if scale is None or scale == "fit" else numbers(scale, 3, "--scale (or fit)")
     first = numbers(start, 6, "--from")
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
-    reading = Reading(sequence, view, noise, seed, height, pitch, height_by, geometry)
-    images = record_at(frames) is SonarFrames
-    estimator = estimator or ("direct" if images else "likelihood")
+    reading = Reading(sequence, view, noise, seed, height, pitch, height_by, geometry, contrast)
+    images, recorded = record_at(frames) is SonarFrames, is_recording(frames)
+    estimator = estimator or ("ecc" if recorded else "direct" if images else "likelihood")
     try:
         method = estimator_from(estimator)
     except MitsonarError:
@@ -108,6 +132,7 @@ def odometry(
             start=None if first is None else Pose.from_degrees(first),
             frame=frame,
             every=every,
+            closure=(LOOP if recorded else 0) if closure is None else closure,
             workers=processes,
             overwrite=overwrite,
             resume=resume,

@@ -137,6 +137,8 @@ class _FirstEchoes(NamedTuple):
 
 def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _FirstEchoes | None:
     """Measure how far below the sonar the steepest ray of each beam ends; None where too few beams have a first echo."""
+    if frames.level == "contrast":
+        return None  # its dark parts are no water without echoes
     image = frames.image.mean(axis=0, dtype=np.float32)
     smooth = cv2.GaussianBlur(image, (3, 13), sigmaX=0.5, sigmaY=2.0, borderType=cv2.BORDER_REPLICATE)
     start, bins = smooth[:15], len(smooth)

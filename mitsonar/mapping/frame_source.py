@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.acoustics.local_contrast import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.measured_heights import measured
@@ -31,6 +32,12 @@ Pixels = NDArray[np.generic]
 
 CHUNK_BYTES = 8 * 2**20
 """Approximate size of the pixels that are read at a time [bytes]."""
+
+PATTERN_FRAMES = 64
+"""Frames of which a static pattern is the mean, at most."""
+
+FITTED, FITTED_RUNS = 3, 4
+"""Consecutive frames of a run by which the contrast is fitted, and the number of such runs."""
 
 PLANAR = 1e-6
 """Smallest change of height, pitch or roll along a path [m, rad]: files round them."""
@@ -55,6 +62,8 @@ class FrameSource:
         first_number: number of the first frame, of which the noise is a function.
         note: which frames these are, where the name does not say it.
         altimeter: measures the height of each frame that is read, in place of ``height_m``.
+        contrast: turns levels into local contrast when frames are read.
+        pattern_db: static pattern ``(bins, beams)`` [dB] that moves with the sonar, taken out before the contrast.
     """
 
     name: str
@@ -71,6 +80,8 @@ class FrameSource:
     first_number: int = 0
     note: str = ""
     altimeter: HeightEstimator | None = None
+    contrast: LocalContrast | None = None
+    pattern_db: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -112,6 +123,25 @@ class FrameSource:
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
         """Return the same frames with noise: a function of the seed and the number of each frame."""
         return self if noise.is_none else replace(self, noise=noise, seed=seed)
+
+    def with_contrast(self, contrast: LocalContrast | None = None, *, moving: bool = False) -> Self:
+        """Return the same frames as local contrast: without the light that moves with the sonar.
+
+        Args:
+            contrast: how; default: smoothed as little as makes consecutive frames alike, by some of these frames.
+            moving: take out the mean of frames over the whole run too. A sonar at rest loses its scene by that.
+        """
+        plain = replace(self, altimeter=None)
+        pattern = None
+        if moving:
+            some = np.unique(np.linspace(0, len(self) - 1, PATTERN_FRAMES).astype(np.intp))
+            levels = np.stack([plain.read([one]).in_decibels()[0] for one in some])
+            pattern = np.asarray(levels.mean(axis=0), dtype=np.float32)
+        if contrast is None:
+            starts = np.unique(np.linspace(0, max(0, len(self) - FITTED), FITTED_RUNS).astype(np.intp))
+            runs = [plain.read(np.arange(at, min(at + FITTED, len(self)))).in_decibels() for at in starts]
+            contrast = fitted_contrast([run if pattern is None else run - pattern for run in runs])
+        return replace(self, contrast=contrast, pattern_db=pattern)
 
     def with_heights_by(self, estimator: HeightEstimator) -> Self:
         """Return the same frames, whose heights an estimator measures when they are read.
@@ -210,7 +240,14 @@ class FrameSource:
             attitude_rad=None,
             height_m=None if self.height_m is None else self.height_m[chosen],
         )
-        return frames if self.altimeter is None else measured(frames, self.altimeter)[0]
+        if self.altimeter is not None:
+            frames = measured(frames, self.altimeter)[0]
+        return frames if self.contrast is None else self._contrast_of(frames, self.contrast)
+
+    def _contrast_of(self, frames: SonarFrames, contrast: LocalContrast) -> SonarFrames:
+        level = frames.in_decibels()
+        level = level if self.pattern_db is None else level - self.pattern_db
+        return replace(frames, image=contrast.apply(level), level="contrast")
 
     def _attitudes(self, chosen: Index) -> Array | None:
         """Return poses without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
@@ -264,6 +301,7 @@ class FrameSource:
             digest.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
         digest.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
         digest.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
+        digest.update(b"" if self.contrast is None else repr(self.contrast).encode())
         if len(self):
             some = np.unique(np.linspace(0, len(self) - 1, 3).astype(np.intp))
             digest.update(np.ascontiguousarray(self.read(some).image).tobytes())

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.mode_continuity import continued
 from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
@@ -58,6 +59,7 @@ class Odometry:
         smooth: how the motions were smoothed.
         factors: by which the estimates were multiplied, for sideways, forward, yaw ``(3,)``.
         fitted: whether these factors come from the true path.
+        closure: what loops of motions leave over, where it was asked for.
     """
 
     frames: Index
@@ -68,6 +70,7 @@ class Odometry:
     smooth: Smoothing
     factors: Array
     fitted: bool
+    closure: Closure | None = None
 
     @property
     def believed(self) -> NDArray[np.bool_]:
@@ -100,6 +103,9 @@ class Odometry:
         if self.series.covariances is not None:
             std = np.sqrt(np.diagonal(self.series.covariances, axis1=1, axis2=2).mean(axis=0))
             rows += _by_axis("standard deviation of a motion as told", in_units(std))
+        if self.closure is not None:
+            rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
+            rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
         true = self.true_at_frames
         if self.true is None or true is None:
             return [*rows, ("estimated path length", path_length(self.path), "m")]
@@ -130,6 +136,7 @@ def odometry(
     scale: ArrayLike | Literal["fit"] | None = None,
     start: Pose | None = None,
     every: int = 1,
+    closure: int = 0,
     workers: int = 1,
     known: Mapping[int, Estimate] | None = None,
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
@@ -148,6 +155,7 @@ def odometry(
         scale: factors for sideways, forward, yaw ``(3,)``; ``fit``: by least squares of valid against true motions.
         start: the first pose; default: the true one, or the origin with the height, pitch and roll of the first frame.
         every: use every so many frames only.
+        closure: motions over which loops are closed; covariances are raised to what the loops leave over. 0: none.
         workers: processes beside this one; 1: none. The result is the same, to the bit.
         known: estimates of an earlier run, by the number of their pair.
         keep: called with the number and the estimate of each new pair.
@@ -158,20 +166,24 @@ def odometry(
             motion, ``fit`` without true poses.
     """
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
-    numbers = _frames_used(source, smooth, scale, every)
+    numbers = _frames_used(source, smooth, scale, every, closure)
     estimates = estimate_motions(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
     estimates = continued(estimates)
+    loops = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
+    estimates = estimates if loops is None else loops.honest(estimates)
     measured = series_of(estimates, source.time_s[numbers])
     factors = _scale_factors(measured, source.true, numbers, scale)
     series = _SMOOTHED[smooth](scaled(measured, factors))
     path = path_of(series.motions, start or _start(source, int(numbers[0])), series.time_s)
-    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str))
+    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str), loops)
 
 
-def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int) -> Index:
+def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int, closure: int) -> Index:
     """Return the numbers of the frames. Reject arguments that cannot work before hours of estimating."""
     if every < 1:
         raise MitsonarError(f"{argument('every')} must be at least 1: got {every}")
+    if closure < 0 or closure == 1:
+        raise MitsonarError(f"{argument('closure')} must be 0, or 2 motions or more: got {closure}")
     numbers = np.arange(0, len(source), every)
     if len(numbers) < 2:
         used = f", {len(numbers)} of them used" if every > 1 else ""

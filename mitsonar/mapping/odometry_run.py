@@ -174,6 +174,7 @@ def run_odometry(
     start: Pose | None = None,
     frame: str = "mitsonar",
     every: int = 1,
+    closure: int = 0,
     workers: int = 1,
     overwrite: bool = False,
     resume: bool = False,
@@ -191,6 +192,7 @@ def run_odometry(
         start: as above.
         frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
         every: as above.
+        closure: as above.
         workers: as above.
         overwrite: replace an odometry in the folder.
         resume: go on with an interrupted one.
@@ -203,7 +205,8 @@ def run_odometry(
     run = RunDirectory.begin(out, ODOMETRY, _asked(source, name, estimator, every), resume=resume, overwrite=overwrite)
     folder = OdometryFolder(run)
     kept, begun = folder.kept() if folder.run.resumed else {}, time.perf_counter()
-    pipeline = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, workers=workers, progress=progress)
+    asked = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, closure=closure)
+    pipeline = partial(asked, workers=workers, progress=progress)
     found = pipeline(source, estimator, known=kept, keep=folder.keep)
     settings = {
         **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": _named(scale), "frame": frame},

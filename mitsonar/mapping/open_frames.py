@@ -36,7 +36,7 @@ def open_frames(
     Args:
         where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
         sequence: of a data set, or part of a recording; default: the longest; of several, the first.
-        view: of a data set; default: the first.
+        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
         geometry: file that tells how the pictures of a recording are laid out.
 
     Raises:
@@ -94,9 +94,7 @@ def is_recording(where: str | Path) -> bool:
 
 def _of_recording(path: Path, number: int | None, view: str | None, geometry: str | Path | None) -> FrameSource:
     """Open a part of a recording."""
-    if view is not None:
-        raise MitsonarError(f"{path} is a recording of one sonar: view chooses among those of a data set; leave it out")
-    recording = open_recording(path, geometry)
+    recording = open_recording(path, geometry, view)
     for note in recording.notes:
         warnings.warn(f"{path}: {note}", MitsonarWarning, stacklevel=3)
     part, which = recording.part(number), ""

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, TypeVar, cast
 
+import numpy as np
+
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.estimation.height.named_height_estimators import height_estimator_from
 from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.open_frames import is_recording, open_frames
 from mitsonar.mapping.response_source import ResponseSource, holds_responses, open_responses
 from mitsonar.mapping.view_source import ViewSource, open_views
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
-__all__ = ["Reading", "Source", "frames_for", "open_source", "record_at", "views_for"]
+__all__ = ["Reading", "Source", "frames_for", "open_source", "record_at", "views_for", "with_assumed_plane"]
 
 Source = FrameSource | ResponseSource | ViewSource
 
@@ -34,8 +38,17 @@ class ViewReader(Protocol):
     def kind(self) -> str: ...
 
 
-FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad", "geometry")
+FRAME_OPTIONS = ("sequence", "view", "height_by", "pitch_rad", "geometry", "contrast")
 """Options that impulse responses lack."""
+
+
+CONTRASTS = ("levels", "local", "moving")
+
+ASSUMED_HEIGHT = 0.15
+"""Height over the ground where nothing tells it, as part of the far end of the window."""
+
+NEAREST = 0.25
+"""Least range at which the assumed ground is looked for, as part of the far end: windows may begin at 0."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,8 @@ class Reading:
         pitch_rad: of the sonar [rad], for frames that lack poses.
         height_by: measures the height in each frame: ``direct`` or a checkpoint.
         geometry: file that tells how the pictures of a recording are laid out.
+        contrast: what is matched: ``levels``; ``local`` contrast; ``moving``: the same, less the pattern that moves with the
+            sonar. None: local for recordings of real sonars, levels for all others.
     """
 
     sequence: int | None = None
@@ -61,6 +76,7 @@ class Reading:
     pitch_rad: float | None = None
     height_by: str | None = None
     geometry: Path | None = None
+    contrast: str | None = None
 
 
 def record_at(where: str | Path) -> type[SonarFrames] | type[ImpulseResponses]:
@@ -84,7 +100,9 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
         raise MitsonarError("--height gives the height and --height-by measures it: give one of them")
     source = frames_for(where, reading)
     _check_consumed(where, there, wanted)
-    return _with_heights(source, reading)
+    if is_recording(where):
+        source = with_assumed_plane(source)
+    return _with_contrast(_with_heights(source, reading), reading, recorded=is_recording(where))
 
 
 def frames_for(where: str, reading: Reading) -> FrameSource:
@@ -125,6 +143,41 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
             "--sequence, --view, --height-by, --pitch-deg and --geometry belong to frames, not to impulse responses"
         )
     return open_responses(where).with_noise(reading.noise, reading.seed).with_height(reading.height_m)
+
+
+def _with_contrast(source: FrameSource, reading: Reading, *, recorded: bool) -> FrameSource:
+    """Return the same frames, as levels or as contrast.
+
+    Raises:
+        MitsonarError: an unknown word.
+    """
+    contrast = reading.contrast or ("local" if recorded else "levels")
+    if contrast not in CONTRASTS:
+        raise MitsonarError(f"unknown contrast {contrast!r}: {nearest_names(contrast, CONTRASTS)}")
+    return source if contrast == "levels" else source.with_contrast(moving=contrast == "moving")
+
+
+def with_assumed_plane(source: FrameSource) -> FrameSource:
+    """Return the same frames with a height and a pitch where neither they nor the user tell a height, and a warning.
+
+    The plane is seen over the whole window within the opening of the beams. Motions hardly depend on it: they are scaled by
+    the cosine of the angle at which the sonar looks at the ground.
+    """
+    if source.altimeter is not None or (source.height_m is not None and np.isfinite(source.height_m).all()):
+        return source
+    far = float(source.like.range_m[-1])
+    near = max(float(source.like.range_m[0]), NEAREST * far)
+    opening = math.radians(source.like.sonar.elevation_fov_deg)
+    height = min(ASSUMED_HEIGHT * far, opening * near * far / max(far - near, 1e-3 * far))
+    pitch = (math.asin(height / near) + math.asin(height / far)) / 2
+    warnings.warn(
+        f"{source.name} tells no height over the ground: {height:.3g} m and a pitch of {math.degrees(pitch):.1f} deg are "
+        "assumed, so that the beams meet the ground over the whole window; give --height and --pitch-deg",
+        MitsonarWarning,
+        stacklevel=3,
+    )
+    known = source.pitch_rad if source.pitch_rad is not None else pitch
+    return replace(source, height_m=np.full(len(source), height), pitch_rad=known)
 
 
 def _with_heights(source: Framed, reading: Reading) -> Framed:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.beam_table import aris_bearings
+from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
 from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, mapped
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
 from mitsonar.records.sonar_frames import SonarFrames
@@ -40,13 +41,12 @@ SIGNATURE = b"DDF\x05"
 FILE_HEADER = 1024
 
 FRAME = layout(
-    {
+    MOTION
+    | {
         "index": (0, "<u4"), "time_us": (4, "<u8"), "signature": (12, "S4"), "sonar_time_us": (20, "<u8"),
-        "gain_db": (68, "<u4"), "depth_m": (128, "<f4"), "altitude_m": (132, "<f4"),
-        "heading_deg": (160, "<f4"), "pitch_deg": (164, "<f4"), "roll_deg": (168, "<f4"),
-        "latitude_deg": (172, "<f8"), "longitude_deg": (180, "<f8"), "temperature_c": (224, "<f4"),
+        "window_start_m": (52, "<f4"), "window_length_m": (56, "<f4"), "gain_db": (68, "<u4"), "temperature_c": (224, "<f4"),
         "ping_mode": (436, "<u4"), "high_frequency": (440, "<u4"), "pulse_us": (444, "<u4"),
-        "sample_period_us": (452, "<u4"),
+        "sample_period_us": (452, "<u4"), "transmits": (456, "<u4"),
         "frame_rate_hz": (460, "<f4"), "sound_speed": (464, "<f4"), "samples": (468, "<u4"), "start_delay_us": (476, "<u4"),
         "large_lens": (480, "<u4"), "system": (484, "<u4"), "serial": (488, "<u4"), "reordered": (516, "<u4"),
         "salinity": (520, "<u4"),
@@ -78,9 +78,6 @@ LEAST_SPEED, MOST_SPEED = 1000.0, 2000.0
 
 SAME_SPEED = 0.002
 """Relative change of the sound speed up to which a window counts as the same."""
-
-EARTH_M = 6_371_008.8
-"""Mean radius of the earth [m]."""
 
 
 class Kind(NamedTuple):
@@ -118,7 +115,7 @@ def read_aris(path: str | Path) -> Recording:
     if bytes(data[:4]) != SIGNATURE:
         raise MitsonarError(f"{name} is no ARIS file: it begins with {bytes(data[:4])!r}, not with {SIGNATURE!r}")
     frames, beams = _frames_of(data, name)
-    headers = frames.headers()
+    headers = frames.table()
     whole, notes = _whole(headers, frames)
     kept, sorting = in_time_order(np.where(whole, headers["time_us"] * 1e-6, np.nan), headers["index"])
     parts = tuple(_part(frames, headers, kept[run], beams) for _, run in runs_of(windows_of(headers[kept])))
@@ -181,16 +178,14 @@ def _part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], beams:
     mine = headers[places]
     samples = int(mine["samples"][0])
     raw = _Samples(frames, places, samples, beams, int(mine["ping_mode"][0]), bool(mine["reordered"].all()))
-    attitude = np.radians(np.stack([-mine["pitch_deg"], mine["roll_deg"], mine["heading_deg"]], axis=1).astype(float))
-    attitude = np.where(np.abs(attitude) <= 2 * np.pi, attitude, np.nan)
-    attitude = attitude if np.any(attitude) else None
+    attitude = attitude_of(mine)
     return Part(
         like=like_of(mine, samples, beams),
         time_s=mine["time_us"] * 1e-6,
         images=raw,
-        poses=_poses(mine, attitude),
+        poses=poses_of(mine, attitude),
         attitude_rad=attitude,
-        height_m=_height(mine["altitude_m"].astype(float)),
+        height_m=height_of(mine),
         gain_db=mine["gain_db"].astype(float),
     )
 
@@ -277,24 +272,6 @@ def _rate(headers: Header) -> float:
         return stated
     seconds = float(headers["time_us"][-1] - headers["time_us"][0]) * 1e-6
     return (len(headers) - 1) / seconds if seconds > 0 else 10.0
-
-
-def _height(altitude_m: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Return the altitudes where the vehicle's integration filled them in [m]; None where it did not."""
-    known = np.isfinite(altitude_m) & (altitude_m > 0) & (altitude_m < 1e4)
-    return np.where(known, altitude_m, np.nan) if known.any() else None
-
-
-def _poses(headers: Header, attitude: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """Return the poses ``(frames, 6)`` by latitude and longitude; None where a frame lacks them."""
-    latitude, longitude = np.radians(headers["latitude_deg"]), np.radians(headers["longitude_deg"])
-    known = (np.abs(latitude) < np.pi / 2) & (np.abs(longitude) <= np.pi) & ((latitude != 0) | (longitude != 0))
-    if attitude is None or not known.all() or not np.isfinite(attitude).all():
-        return None
-    depth = headers["depth_m"].astype(float)
-    east = (longitude - longitude[0]) * np.cos(latitude[0]) * EARTH_M
-    north = (latitude - latitude[0]) * EARTH_M
-    return np.column_stack([east, north, -np.where(np.abs(depth) < 1.2e4, depth, 0.0), attitude])
 
 
 def facts_of(headers: Header, beams: int) -> Facts:

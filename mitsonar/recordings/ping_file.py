@@ -88,6 +88,11 @@ class EqualFrames:
         """Return the headers ``(frames,)``: a view into the file."""
         return np.ndarray((len(self),), self.header, self.data, self.start, (self.stride,))
 
+    def table(self) -> Header:
+        """Return the headers ``(frames,)`` in memory, their known fields only."""
+        names = self.header.names or ()
+        return self.headers().astype([(name, self.header[name]) for name in names])
+
     def read(self, index: NDArray[np.intp], shape: tuple[int, int]) -> Bytes:
         """Return the samples of frames ``(n, *shape)``, copied."""
         begin = self.start + self.header.itemsize + index.astype(np.int64) * self.stride

@@ -17,7 +17,13 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_npz, refuse_beyond_memory
 from mitsonar.records.columns import Column, check_column, number_of, open_group, table_in, text_of
 
-__all__ = ["LABELS", "SonarFrames", "to_uint8"]
+__all__ = ["LABELS", "LEVELS", "SonarFrames", "to_uint8"]
+
+LEVELS = ("linear", "dB", "gamma", "contrast")
+"""How image values stand for level; ``contrast`` is :class:`~mitsonar.acoustics.local_contrast.LocalContrast`'s."""
+
+FLOOR_DB = -100.0
+"""Least level over full scale [dB]: an image has zeros."""
 
 LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
 """Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
@@ -54,7 +60,7 @@ class SonarFrames:
         time_s: time of each frame ``(frames,)``, or of each beam ``(frames, beams)`` [s].
         poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
         height_m: height over the ground below, measured straight down ``(frames,)``; nan where nothing is below.
-        level: how image values stand for level: ``linear`` (level = value * level_scale), ``dB`` or ``gamma``.
+        level: how image values stand for level: ``linear`` (level = value * level_scale), ``dB``, ``gamma`` or ``contrast``.
         level_scale: what undoes the constant gain.
         sonar: the instrument.
         elevation_rad: elevation of the strongest echo of each pixel, like ``image``, float32.
@@ -93,8 +99,8 @@ class SonarFrames:
                 f"image must be (frames, bins, beams) = ({len(self.time_s)}, {len(self.range_m)}, "
                 f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
             )
-        if self.level not in ("linear", "dB", "gamma"):
-            raise MitsonarError(f"level must be linear, dB or gamma: got {shortened(self.level)}")
+        if self.level not in LEVELS:
+            raise MitsonarError(f"level must be one of {', '.join(LEVELS)}: got {shortened(self.level)}")
         for name in PER_FRAME:
             values = getattr(self, name)
             if values is not None and len(values) != frames:
@@ -122,18 +128,36 @@ class SonarFrames:
 
         Codings ``dB`` and ``gamma`` are undone with the numbers of the sonar. A value 0 of the coding dB becomes its least
         level.
+
+        Raises:
+            MitsonarError: images of contrast, of which levels cannot be had back.
         """
-        values = np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
-        return replace(self, image=decoded(values, self.sonar, self.level).astype(np.float32), level="linear")
+        if self.level == "contrast":
+            raise MitsonarError("images of contrast hold no levels: take the frames before their contrast")
+        return replace(self, image=decoded(self._values(), self.sonar, self.level).astype(np.float32), level="linear")
+
+    def in_decibels(self) -> NDArray[np.float32]:
+        """Return levels relative to full scale, like ``image`` [dB], -100 at least.
+
+        Raises:
+            MitsonarError: as :meth:`to_linear`.
+        """
+        level = np.maximum(self.to_linear().image, np.float32(10 ** (FLOOR_DB / 10)))
+        return np.asarray(10 * np.log10(level), dtype=np.float32)
+
+    def _values(self) -> NDArray[np.float32]:
+        """Return the image as float32 in 0..1."""
+        return np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
 
     def matching_values(self) -> NDArray[np.float32]:
         """Return the images as float32 in 0..1, as estimators and mosaics match them, like ``image``.
 
-        Linear images are as they are. Of images in the codings ``dB`` and ``gamma`` the root of the amplitude is returned:
-        of level, amplitude, root of the amplitude and dB it made the smallest errors on speckle, with all estimators.
+        Linear images and those of contrast are as they are. Of images in the codings ``dB`` and ``gamma`` the root of the
+        amplitude is returned: of level, amplitude, its root and dB it made the smallest errors on speckle, with all
+        estimators.
         """
-        values = np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
-        if self.level == "linear":
+        values = self._values()
+        if self.level in ("linear", "contrast"):
             return values
         return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level) ** 0.25, dtype=np.float32)
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
+from recording_files import aris_file
 
 from mitsonar import MitsonarError, open_recording
 from mitsonar.mapping.open_frames import open_frames
-from mitsonar.recordings.aris import FRAME, in_beam_order
+from mitsonar.recordings.aris import in_beam_order
 from mitsonar.recordings.recording import in_time_order, runs_of
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
@@ -70,22 +71,9 @@ def test_the_order_of_other_ping_modes_is_refused() -> None:
         in_beam_order(np.zeros((8, 48), np.uint8), 2)
 
 
-def written(path: Path, frames: int = 5, samples: int = 40, **changed: NDArray[np.generic]) -> Path:
-    """Write an ARIS 3000 with 64 beams; fields of the headers may be changed ``(frames,)``."""
-    head = np.zeros(frames, FRAME)
-    head["index"], head["time_us"], head["signature"] = (
-        np.arange(frames),
-        1_000_000 + 100_000 * np.arange(frames),
-        b"DDF\x05",
-    )
-    head["ping_mode"], head["samples"], head["system"], head["reordered"] = 6, samples, 1, 1
-    head["sample_period_us"], head["start_delay_us"], head["sound_speed"] = 10, 2000, 1500.0
-    for name, values in changed.items():
-        head[name] = values
-    body = np.random.default_rng(3).integers(0, 256, (frames, samples * 64), dtype=np.uint8)
-    path.write_bytes(
-        b"DDF\x05".ljust(1024, b"\0") + b"".join(h.tobytes() + b.tobytes() for h, b in zip(head, body, strict=True))
-    )
+def written(path: Path, **changed: ArrayLike) -> Path:
+    """Write an ARIS 3000 of 5 frames; fields of the headers may be changed ``(frames,)``."""
+    path.write_bytes(aris_file(frames=5, samples=40, **changed))
     return path
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_rejection, rejected, two_frames
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
@@ -16,8 +17,11 @@ from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Ecc"]
 
-LEVELS = ((0.04, 9), (0.01, 5))
-"""Edge of a pixel [m] and size of OpenCV's Gaussian filter, coarse to fine."""
+LEVELS = ((4, 9), (1, 5))
+"""Edge of a pixel in fine ones, and size of OpenCV's Gaussian filter, coarse to fine."""
+
+FINE = 0.43
+"""Edge of a fine pixel in distances of neighbouring beams at the middle of the window: 0.01 m with a DIDSON at 4.4 m."""
 
 SETTLED = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-5)
 
@@ -29,14 +33,30 @@ class Ecc:
     Args:
         height_m: over the ground, where the window shows no first echoes; default: that of the frames.
         pitch_rad: default: that of the frames.
+        pixel_m: edge of a fine pixel [m]; default: 0.43 times the distance of beams at the middle of the window.
+
+    Raises:
+        MitsonarError: a pixel that is not positive.
     """
 
     height_m: float | None = None
     pitch_rad: float | None = None
+    pixel_m: float | None = None
 
     consumes = SonarFrames
     inputs = INPUTS
     digest = ""
+
+    def __post_init__(self) -> None:
+        if self.pixel_m is not None and not self.pixel_m > 0:
+            raise MitsonarError(f"ecc takes a pixel above 0 m: got {self.pixel_m:g}")
+
+    def _pixel_m(self, frames: SonarFrames) -> float:
+        """Return the edge of a fine pixel [m], to two digits."""
+        if self.pixel_m is not None:
+            return self.pixel_m
+        spacing = float(np.ptp(frames.bearing_rad)) / (len(frames.bearing_rad) - 1)
+        return float(f"{FINE * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2:.1e}")
 
     def estimate(self, frames: SonarFrames) -> Estimate:
         """Estimate the motion; reject frames for which OpenCV finds none.
@@ -49,8 +69,9 @@ class Ecc:
         if attitude.reason or any(blank(image) for image in images):
             return rejected(attitude.reason or "nothing in the frames to match")
         motion = Motion(0.0, 0.0, 0.0)
-        for cell_m, size in LEVELS:
-            view = GroundView(frames, attitude, cell_m)
+        pixel_m = self._pixel_m(frames)
+        for pixels, size in LEVELS:
+            view = GroundView(frames, attitude, pixels * pixel_m)
             first, second = (view.draw(image) for image in images)
             warp = view.warp(motion)
             mask = (view.inside * np.uint8(255)).astype(np.uint8)

@@ -1,0 +1,177 @@
+"""``mitsonar recording``: look at recordings of real sonars and at runs, and convert them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.odometry_command import Geometry
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.io.run_directory import refuse_to_replace
+
+if TYPE_CHECKING:
+    from mitsonar.recordings.recording import Part, Recording
+    from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["convert", "info", "recordings", "show", "video"]
+
+File = Annotated[
+    str, typer.Argument(metavar="FILE|RUN", help="A recording of a sonar, frames.npz, frames.zarr or a run's folder.")
+]
+PartNumber = Annotated[int | None, typer.Option("--part", help="Part of the recording (default: the longest).")]
+TopicName = Annotated[str | None, typer.Option("--topic", help="Topic of a ROS bag (default: the only sonar's).")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
+Span = Annotated[float, typer.Option("--span-db", help="Levels from full scale down that are shown [dB].")]
+
+
+def recordings() -> typer.Typer:
+    """Create the group of commands."""
+    app = typer.Typer(help="Look at recordings of real sonars and at runs, and convert them.", no_args_is_help=True)
+    for command in (info, show, video, convert):
+        app.command()(command)
+    return app
+
+
+@answered
+def info(
+    file: File,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print what a recording holds: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
+    from mitsonar.recordings.recording_summary import summary_lines, summary_of
+
+    summary = summary_of(_opened(file, topic, geometry))
+    if as_json:
+        say(json.dumps(summary, indent=2))
+        return
+    for line in summary_lines(summary):
+        say(line)
+
+
+@answered
+def show(
+    file: File,
+    out: Annotated[Path, typer.Option("-o", "--out", help="PNG to write.")],
+    frame: Annotated[int, typer.Option(min=0, help="Number of the frame in its part.")] = 0,
+    part: PartNumber = None,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    span_db: Span = 60.0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Draw one frame as a fan with axes in metres and a colour bar in dB."""
+    from mitsonar.plotting.decibel_frames import in_decibels
+    from mitsonar.plotting.fan_figure import save_fan
+
+    refuse_to_replace(out, overwrite=overwrite)
+    recording = _opened(file, topic, geometry)
+    frames = in_decibels(recording.part(part).read([frame]), span_db)
+    save_fan(out, frames, title=f"{Path(file).name}, frame {frame}")
+    say(f"picture: {out}")
+
+
+@answered
+def video(
+    file: File,
+    out: Annotated[Path, typer.Option("-o", "--out", help="MP4 or AVI to write.")],
+    part: PartNumber = None,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    span_db: Span = 60.0,
+    rate: Annotated[float | None, typer.Option(help="Frames a second (default: those of the recording).")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write the frames as a video of fans."""
+    from mitsonar.plotting.fan_video import write_fan_video
+
+    recording = _opened(file, topic, geometry)
+    _say_notes(recording)
+    chosen = recording.part(part)
+    steps = np.diff(chosen.time_s)
+    found = 1 / float(np.median(steps)) if len(steps) and np.median(steps) > 0 else 10.0
+    if rate is not None and not 0 < rate <= 1000:
+        raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
+    with progress_bar("drawing", len(chosen), "frames") as progress:
+        options = {"span_db": span_db, "overwrite": overwrite}
+        count = write_fan_video(chosen.chunks(), out, rate or min(1000.0, found), **options, progress=progress)
+    say(f"{count:,} frames at {rate or found:.4g} a second in {out}")
+
+
+@answered
+def convert(
+    file: File,
+    out: Annotated[Path, typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make.")],
+    part: PartNumber = None,
+    topic: TopicName = None,
+    geometry: Geometry = None,
+    picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: png or jpeg.")] = "png",
+    beams: Annotated[
+        int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
+) -> None:
+    """Convert frames to the folder of a run (frames.npz, or frames.zarr of more than 1,000), to ROS (.mcap) or to .aris."""
+    from mitsonar.recordings.frame_folder import write_frames
+    from mitsonar.recordings.mcap_writer import write_mcap
+
+    if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
+        raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
+    if resume and out.suffix:
+        raise MitsonarError("--resume is for folders: files are whole or absent")
+    recording = _opened(file, topic, geometry)
+    _say_notes(recording)
+    chosen = recording.part(part)
+    if len(recording.parts) > 1:
+        number = recording.longest if part is None else part
+        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {len(recording):,} frames")
+    made = out
+    with progress_bar("converting", len(chosen), "frames") as progress:
+        if out.suffix == ".mcap":
+            write_mcap(chosen.chunks(), out, picture=picture, overwrite=overwrite, progress=progress)
+        elif out.suffix == ".aris":
+            _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
+        else:
+            made = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
+    say(f"{len(chosen):,} frames in {made}")
+
+
+def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:
+    from mitsonar.mapping.any_recording import recording_at
+
+    return recording_at(file, view=topic, geometry=geometry)
+
+
+def _say_notes(recording: Recording) -> None:
+    for note in recording.notes:
+        warn(note)
+
+
+def _to_aris(part: Part, out: Path, *, beams: int | None, overwrite: bool, progress: Callable[[int], None]) -> None:
+    """Write a part as an ARIS file; what had to be changed is warned of."""
+    from mitsonar.recordings.aris_writer import write_aris
+
+    refuse_to_replace(out, overwrite=overwrite)
+    part_file = out.with_name(f".{out.stem}.new.aris")  # the writer replaces nothing
+    part_file.unlink(missing_ok=True)
+
+    def counted() -> Iterator[SonarFrames]:
+        for frames in part.chunks():
+            yield frames
+            progress(len(frames))
+
+    try:
+        written = write_aris(part_file, counted(), beams=beams)
+        part_file.replace(out)
+    finally:
+        part_file.unlink(missing_ok=True)
+    for note in written.notes:
+        warn(note)

@@ -1,0 +1,280 @@
+"""Frames of any sonar, simulated or real, as an ARIS file (``.aris``, DDF 5), for programs that read such files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError, argument
+from mitsonar.recordings.aris import CODING_DB, FRAME, SIGNATURE
+from mitsonar.recordings.aris_axes import ArisTable, ArisWindow, Values, half_spacing, interpolated, table_of, window_of
+from mitsonar.recordings.header_motion import EARTH_M
+from mitsonar.recordings.ping_file import Bytes, Header, layout
+from mitsonar.recordings.recording import CHUNK_BYTES
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["ORIGIN_DEG", "WrittenAris", "write_aris"]
+
+Array = NDArray[np.float64]
+
+FILE = layout(
+    {
+        "signature": (0, "S4"), "frames": (4, "<u4"), "high_frequency": (12, "<u4"), "beams": (16, "<u4"),
+        "samples": (24, "<u4"), "window_start_m": (32, "<f4"), "window_length_m": (36, "<f4"), "size": (424, "<u8"),
+        "large_lens": (452, "<u4"),
+    },
+    1024,
+)  # fmt: skip
+"""Fields of the file's header that are filled in: offset [bytes] and type."""
+
+MODES = {48: 1, 96: 3, 64: 6, 128: 9}
+"""A ping mode for each number of beams."""
+
+SALINITIES = (0, 15, 35)
+"""Salinities that a header may state [parts per thousand]: fresh, brackish, sea."""
+
+ORIGIN_DEG = (0.0, -30.0)
+"""Latitude and longitude [deg] that stand for x = y = 0, where the user gives none: in the open Atlantic, on the equator."""
+
+LATEST_S = 2.0**53 / 1e6
+"""Latest time that whole microseconds stand for exactly [s]."""
+
+
+class WrittenAris(NamedTuple):
+    """What was written: the file, its number of frames, and sentences on what had to be changed."""
+
+    path: Path
+    frames: int
+    notes: tuple[str, ...]
+
+
+def write_aris(
+    path: str | Path,
+    frames: SonarFrames | Iterable[SonarFrames],
+    *,
+    beams: int | None = None,
+    origin_deg: tuple[float, float] = ORIGIN_DEG,
+) -> WrittenAris:
+    """Write frames as an ARIS file, which appears whole or not at all.
+
+    Values become 0..255 over 80 dB below full scale: 8-bit values of that coding are kept to the bit, those of others go
+    through their levels. An ARIS file holds no bearings: the beams are those of the vendor's table that is nearest. Ranges
+    are a delay and a period in whole microseconds: frames with other ranges are interpolated along them. Attitude goes into
+    the fields of the compass, and the path, where poses are known, into those of a GPS receiver and of the depth. A compass
+    that tells nothing but zeros counts as none.
+
+    Args:
+        path: of the file; it ends in ``.aris`` and must not exist.
+        frames: all of them, or some at a time in the order of time, of one geometry.
+        beams: number of beams to interpolate to, 48, 64, 96 or 128; default: the frames' own, which must fit a table.
+        origin_deg: latitude and longitude of x = y = 0 [deg].
+
+    Raises:
+        MitsonarError: a file that exists, no frames, beams or times that such a file cannot hold.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".aris":
+        raise MitsonarError(f"an ARIS file ends in .aris: got {path}; rename it")
+    if path.exists():
+        raise MitsonarError(f"{path} exists: give another name, or remove it first")
+    if not path.parent.is_dir():
+        raise MitsonarError(f"there is no folder {path.parent}: make it first")
+    part = path.with_name(f".{path.name}.part")
+    chunks = _pieces(frames) if isinstance(frames, SonarFrames) else frames
+    try:
+        with part.open("wb") as file:
+            writer = _Writer(file, beams, origin_deg)
+            for chunk in chunks:
+                writer.add(chunk)
+            writer.finish()
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise MitsonarError(f"cannot write {path}: {error.strerror or error}") from None
+    finally:
+        part.unlink(missing_ok=True)
+    return WrittenAris(path, writer.count, tuple(writer.notes()))
+
+
+def _pieces(frames: SonarFrames) -> Iterator[SonarFrames]:
+    """Return frames some at a time."""
+    count = max(1, CHUNK_BYTES // max(1, 4 * frames.image[:1].size))
+    for start in range(0, len(frames), count):
+        yield frames.select(slice(start, start + count))
+
+
+class _Writer:
+    """Writes frames as they come; the first ones decide on the form of all."""
+
+    def __init__(self, file: IO[bytes], beams: int | None, origin_deg: tuple[float, float]) -> None:
+        self.file, self.beams, self.origin_deg = file, beams, origin_deg
+        self.count, self.last_us, self.echoes, self.lost = 0, -1, 0, 0
+        self.form: _Form | None = None
+        self.first_latitude = origin_deg[0]
+
+    def add(self, frames: SonarFrames) -> None:
+        """Write frames behind those that were written."""
+        if not len(frames):
+            return
+        if self.form is None:
+            self.form = _form_of(frames, self.beams)
+            self.file.write(bytes(FILE.itemsize))
+        elif not self.form.fits(frames):
+            raise MitsonarError(
+                "all frames of an ARIS file have one geometry: write each part of the recording to its own file"
+            )
+        time_us = self._times(frames)
+        codes = self.form.image(self._codes(frames))
+        heads = self.form.headers(frames, time_us, self.count)
+        self._place(heads, frames)
+        for head, image in zip(heads, codes, strict=True):
+            self.file.write(head.tobytes())
+            self.file.write(image[:, ::-1].tobytes())  # beam 0 is the one most to starboard
+        self.count += len(frames)
+
+    def finish(self) -> None:
+        """Write the header of the file, now that the number of frames is known."""
+        if self.form is None:
+            raise MitsonarError("there are no frames to write")
+        head = np.zeros(1, FILE)
+        window, table = self.form.window, self.form.table
+        told = {
+            "signature": SIGNATURE, "frames": self.count, "high_frequency": table.high, "beams": table.beams,
+            "samples": window.samples, "window_start_m": window.start_m, "size": self.file.tell(),
+            "window_length_m": window.samples * window.step_m, "large_lens": table.lens,
+        }  # fmt: skip
+        for name, value in told.items():
+            head[name] = value
+        self.file.seek(0)
+        self.file.write(head.tobytes())
+
+    def notes(self) -> list[str]:
+        """Return sentences on what had to be changed."""
+        notes = list(self.form.notes) if self.form else []
+        if self.lost:
+            share = 100 * self.lost / self.echoes
+            notes.append(f"{share:.2g} % of the echoes lie {CODING_DB:g} dB and more below full scale: they are 0")
+        return notes
+
+    def _times(self, frames: SonarFrames) -> NDArray[np.int64]:
+        """Return the times of frames ``(n,)`` in whole microseconds."""
+        time_s = frames.time_s.mean(axis=1) if frames.time_s.ndim == 2 else frames.time_s
+        if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < LATEST_S).all()):
+            raise MitsonarError("times of an ARIS file are seconds since 1970, at least 0: the frames have others")
+        time_us = np.rint(time_s * 1e6).astype(np.int64)
+        if time_us[0] <= self.last_us or (np.diff(time_us) <= 0).any():
+            raise MitsonarError("times of frames must rise, by a microsecond at least: sort the frames by their times")
+        self.last_us = int(time_us[-1])
+        return time_us
+
+    def _codes(self, frames: SonarFrames) -> Values:
+        """Return values 0..255 over 80 dB like the image: as they are, or from their levels."""
+        if frames.level == "dB" and frames.sonar.coding_db == CODING_DB:
+            return frames.image if frames.image.dtype == np.uint8 else np.clip(frames.image, 0, 1) * np.float32(255)
+        level = frames.to_linear().image
+        with np.errstate(divide="ignore"):
+            codes = (1 + np.log10(level) * np.float32(10 / CODING_DB)) * np.float32(255)
+        there = frames.image > 0
+        self.echoes += int(np.count_nonzero(there))
+        self.lost += int(np.count_nonzero(there & (codes < 0.5)))
+        return np.where(there, np.clip(codes, 0, 255), np.float32(0))
+
+    def _place(self, heads: Header, frames: SonarFrames) -> None:
+        """Fill in latitude, longitude and depth, where poses are known."""
+        if frames.poses is None:
+            return
+        east, north, up = frames.poses[:, :3].T
+        latitude = self.origin_deg[0] + np.degrees(north / EARTH_M)
+        if not self.count:
+            self.first_latitude = float(latitude[0])
+        longitude = self.origin_deg[1] + np.degrees(east / (EARTH_M * np.cos(np.radians(self.first_latitude))))
+        if not ((np.abs(latitude) < 90) & (np.abs(longitude) <= 180)).all():
+            raise MitsonarError(
+                f"the path leaves the earth from {argument('origin_deg')} {self.origin_deg}: give another origin, latitude "
+                "in -90..90 and longitude in -180..180 deg"
+            )
+        heads["latitude_deg"], heads["longitude_deg"], heads["depth_m"] = latitude, longitude, -up
+
+
+@dataclass(frozen=True)
+class _Form:
+    """How frames of one geometry become those of an ARIS file."""
+
+    like: SonarFrames
+    table: ArisTable
+    window: ArisWindow
+    turned: bool
+    notes: tuple[str, ...]
+
+    def fits(self, frames: SonarFrames) -> bool:
+        """Return whether other frames have the same geometry."""
+        same = (frames.range_m.shape, frames.bearing_rad.shape) == (self.like.range_m.shape, self.like.bearing_rad.shape)
+        return (
+            same
+            and bool((frames.range_m == self.like.range_m).all() and (frames.bearing_rad == self.like.bearing_rad).all())
+            and frames.sonar.sound_speed == self.like.sonar.sound_speed
+        )
+
+    def image(self, codes: Values) -> Bytes:
+        """Return values ``(n, samples, beams)`` on the axes of the file; interpolated only where these are others."""
+        if not self.window.exact:
+            wanted = self.window.start_m + np.arange(self.window.samples, dtype=np.float64) * self.window.step_m
+            codes = interpolated(codes, self.like.range_m, wanted, axis=1)
+        if self.turned:
+            codes = interpolated(codes, self.like.bearing_rad, self.table.bearings, axis=2)
+        return np.rint(codes).astype(np.uint8)
+
+    def headers(self, frames: SonarFrames, time_us: NDArray[np.int64], first: int) -> Header:
+        """Return the headers of frames ``(n,)``."""
+        sonar, window, table = frames.sonar, self.window, self.table
+        heads = np.zeros(len(frames), FRAME)
+        told = {
+            "index": first + np.arange(len(frames)), "time_us": time_us, "sonar_time_us": time_us, "signature": SIGNATURE,
+            "window_start_m": window.start_m, "window_length_m": window.samples * window.step_m,
+            "temperature_c": sonar.temperature_c, "ping_mode": MODES[table.beams], "high_frequency": table.high,
+            "pulse_us": max(1, round(2e6 * sonar.resolution_m / sonar.sound_speed)), "sample_period_us": window.period_us,
+            "transmits": 1, "frame_rate_hz": sonar.frame_rate_hz, "sound_speed": window.sound_speed,
+            "samples": window.samples, "start_delay_us": window.delay_us, "large_lens": table.lens, "system": table.system,
+            "reordered": 1, "salinity": min(SALINITIES, key=lambda one: abs(one - sonar.salinity_psu)),
+        }  # fmt: skip
+        attitude = frames.attitude_rad if frames.attitude_rad is not None else frames.poses
+        if attitude is not None:
+            pitch, roll, heading = np.degrees(attitude[:, -3:]).T
+            told |= {"pitch_deg": -pitch, "roll_deg": roll, "heading_deg": heading % 360}
+        if frames.height_m is not None:
+            told["altitude_m"] = np.nan_to_num(frames.height_m)
+        for name, values in told.items():
+            heads[name] = values
+        return heads
+
+
+def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
+    """Decide on the table of beams and on the range axis.
+
+    Raises:
+        MitsonarError: beams that fit no table, a sound speed or a window that the format cannot hold.
+    """
+    if min(len(frames.range_m), len(frames.bearing_rad)) < 2:
+        raise MitsonarError("frames of an ARIS file have 2 bins and 2 beams at least: give an image, not a profile")
+    table, moved = table_of(frames.bearing_rad, frames.sonar, beams)
+    window = window_of(frames.range_m, frames.sonar.sound_speed)
+    turned = moved > half_spacing(frames.bearing_rad) or table.beams != len(frames.bearing_rad)
+    notes = []
+    if turned:
+        low, high = np.degrees(table.bearings[[0, -1]])
+        notes.append(f"{len(frames.bearing_rad)} beams were interpolated to {table.beams}, from {low:.4g} to {high:.4g} deg")
+    elif moved > np.radians(1e-3):
+        notes.append(
+            f"the beams are those of the vendor's table: they differ from the frames' by {np.degrees(moved):.2g} deg"
+        )
+    if not window.exact:
+        step = float(np.diff(frames.range_m).mean()) if len(frames.range_m) > 1 else window.step_m
+        notes.append(f"ranges were interpolated from steps of {step:.5g} m to {window.step_m:.5g} m: whole microseconds")
+    return _Form(frames.select(slice(0)), table, window, turned, tuple(notes))

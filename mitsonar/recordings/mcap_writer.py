@@ -1,0 +1,144 @@
+"""Sonar frames as an MCAP file of ROS 2 messages, for Foxglove, RViz and ``ros2 bag play``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.recordings.mcap_metadata import RECORD, WRITTEN, metadata_of
+from mitsonar.recordings.ros_encoding import TOPICS, Encoded, FrameEncoder
+from mitsonar.records.sonar_frames import PER_FRAME, SonarFrames
+
+if TYPE_CHECKING:
+    from mcap.writer import Writer
+
+__all__ = ["write_mcap"]
+
+CHUNK_BYTES = 4 * 2**20
+"""Size of the pieces that are compressed at a time [bytes]."""
+
+
+def write_mcap(
+    chunks: Iterable[SonarFrames],
+    path: str | Path,
+    *,
+    picture: str = "png",
+    overwrite: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Write frames of one sonar as MCAP (profile ``ros2``, CDR, chunks in Zstandard); the file is whole or absent.
+
+    Topics: ``/sonar/image`` (``marine_acoustic_msgs/ProjectedSonarImage``: samples uint8 or float32, bit for bit),
+    ``/sonar/fan/compressed`` (``sensor_msgs/CompressedImage``). Of frames with elevations ``/sonar/points``
+    (``sensor_msgs/PointCloud2``), with poses ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``, with attitudes
+    ``/sonar/imu`` (``sensor_msgs/Imu``), with heights ``/sonar/altitude`` (``sensor_msgs/Range``). Times in headers are
+    those of the frames. Sonar, exact ranges and bearings, and coding are in a metadata record, which
+    :func:`~mitsonar.recordings.open_recording.open_recording` reads back.
+
+    Args:
+        chunks: the frames, some at a time, of one geometry; the first say which arrays all have.
+        path: of the file; its name ends with ``.mcap``.
+        picture: format of the fans: ``png``, or the smaller ``jpeg``.
+        overwrite: replace a file that is there.
+        progress: called with how many more frames are written.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        MitsonarError: a file that is there, a name that ends otherwise, no frames, or times that ROS cannot hold.
+    """
+    path = Path(path)
+    if path.suffix != ".mcap":
+        raise MitsonarError(f"{path} must end with .mcap: ROS tells bags by their names")
+    refuse_to_replace(path, overwrite=overwrite)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            writer = _writer(file)
+            count = _write(writer, iter(chunks), picture, progress or (lambda done: None))
+            writer.finish()  # type: ignore[no-untyped-call]
+        part.replace(path)
+    except FileNotFoundError:
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; make it first") from None
+    finally:
+        part.unlink(missing_ok=True)
+    return count
+
+
+def _writer(file: object) -> Writer:
+    try:
+        from mcap.writer import CompressionType, Writer
+    except ModuleNotFoundError as error:
+        raise explain_missing(error) from None
+    return Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
+
+
+def _write(writer: Writer, chunks: Iterator[SonarFrames], picture: str, progress: Callable[[int], None]) -> int:
+    """Write all frames and return their number."""
+    first = next((one for one in chunks if len(one)), None)
+    if first is None:
+        raise MitsonarError("there are no frames to write")
+    encoder = FrameEncoder(first.select(slice(0)), picture)
+    writer.start(profile="ros2", library="mitsonar")
+    writer.add_metadata(RECORD, metadata_of(first))
+    channels = _channels(writer, encoder)
+    count, fixed = 0, False
+    for frames in _all(first, chunks):
+        for message in encoder.messages(frames):
+            if not fixed:
+                _add(writer, channels, encoder.fixed(message.time_ns), 0)
+                fixed = True
+            _add(writer, channels, message, count)
+            if message.topic == WRITTEN:
+                count += 1
+                progress(1)
+    return count
+
+
+def _all(first: SonarFrames, rest: Iterator[SonarFrames]) -> Iterator[SonarFrames]:
+    """Yield the first chunk and the others.
+
+    Raises:
+        MitsonarError: frames of another geometry, or with other arrays.
+    """
+    yield first
+    for one in rest:
+        if one.image.shape[1:] != first.image.shape[1:] or _known(one) != _known(first):
+            raise MitsonarError("all frames of an MCAP file must have one geometry and the same arrays: write two files")
+        yield one
+
+
+def _known(frames: SonarFrames) -> list[bool]:
+    """Return which arrays frames have."""
+    return [getattr(frames, name) is not None for name in PER_FRAME]
+
+
+def _channels(writer: Writer, encoder: FrameEncoder) -> dict[str, int]:
+    """Register types and topics; return the number of each topic."""
+    schemas: dict[str, int] = {}
+    channels = {}
+    for topic in encoder.topics:
+        kind = TOPICS[topic]
+        if kind not in schemas:
+            schemas[kind] = writer.register_schema(kind, "ros2msg", encoder.definition(topic).encode())
+        channels[topic] = writer.register_channel(topic, "cdr", schemas[kind], _quality(topic))
+    return channels
+
+
+def _quality(topic: str) -> dict[str, str]:
+    """Return the channel's metadata: fixed transforms are kept for subscribers that come later."""
+    if topic != "/tf_static":
+        return {}
+    ever = "{sec: 9223372036, nsec: 854775807}"
+    quality = f"{{history: 1, depth: 1, reliability: 1, durability: 1, deadline: {ever}, lifespan: {ever}, liveliness: 1, "
+    return {
+        "offered_qos_profiles": f"- {quality}liveliness_lease_duration: {ever}, avoid_ros_namespace_conventions: false}}"
+    }
+
+
+def _add(writer: Writer, channels: dict[str, int], message: Encoded, sequence: int) -> None:
+    writer.add_message(channels[message.topic], message.time_ns, message.data, message.time_ns, sequence)

@@ -1,0 +1,359 @@
+"""Oculus recordings of Blueprint Subsea: dumps of messages (``.raw``) and logs (``.oculus``), message versions 0, 1 and 2.
+
+Source of the layout: the public headers of Blueprint Subsea's SDK, as liboculus (BSD-3-Clause) quotes them. Version 0 and 8
+bits were checked on real pings. Version 2, other widths, gains of rows and logs were not: no such file was at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import preset
+from mitsonar.recordings.oculus_images import OculusImages
+from mitsonar.recordings.oculus_messages import HEADER, Messages, find_messages
+from mitsonar.recordings.ping_file import Header, layout, mapped
+from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["LATER", "OLDER", "read_oculus"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+FIRE = {
+    "version": (8, "<u2"), "mode": (16, "u1"), "ping_rate": (17, "u1"), "gamma": (19, "u1"), "flags": (20, "u1"),
+    "range_demand": (21, "<f8"), "gain_percent": (29, "<f8"), "salinity": (45, "<f8"),
+}  # fmt: skip
+"""What each version holds at the same place."""
+
+OLDER = layout(
+    FIRE
+    | {
+        "number": (53, "<u4"), "status": (57, "<u4"), "frequency": (61, "<f8"), "sound_speed": (85, "<f8"),
+        "start": (93, "<u4"), "width": (97, "u1"), "resolution": (98, "<f8"), "ranges": (106, "<u2"), "beams": (108, "<u2"),
+        "image": (110, "<u4"), "image_size": (114, "<u4"), "size": (118, "<u4"),
+    },
+    122,
+)  # fmt: skip
+"""Fields of a message of version 0 or 1: offset from its begin [bytes] and type."""
+
+LATER = layout(
+    FIRE
+    | {
+        "number": (89, "<u4"), "status": (93, "<u4"), "frequency": (97, "<f8"),
+        "heading": (121, "<f8"), "pitch": (129, "<f8"), "roll": (137, "<f8"), "sound_speed": (145, "<f8"),
+        "start": (153, "<f8"), "width": (161, "u1"), "resolution": (162, "<f8"), "ranges": (170, "<u2"),
+        "beams": (172, "<u2"), "image": (190, "<u4"), "image_size": (194, "<u4"), "size": (198, "<u4"),
+    },
+    202,
+)  # fmt: skip
+"""Fields of a message of version 2."""
+
+GAINED = 4
+"""Bit of the flags: each row of the image begins with its gain, 4 bytes."""
+
+RATES = {0: 10.0, 1: 15.0, 2: 40.0, 3: 5.0, 4: 2.0}
+"""Greatest ping rates by their code [Hz]."""
+
+SAME_STEP = 0.002
+"""Relative change of the range resolution up to which a window counts as the same: the sound speed drifts."""
+
+WIDEST_DEG = 85.0
+"""Largest bearing that is believed [deg]."""
+
+MOST_CELLS = 2**28
+LONGEST_M = 1e4
+"""What is believed of an image: cells, and its far end [m]."""
+
+LONGEST_S = 1e4
+"""What is believed of the time between two pings [s]."""
+
+BANDS = {
+    "oculus-m750d-750khz": (6e5, 9e5),
+    "oculus-m1200d-1200khz": (1e6, 1.5e6),
+    "oculus-m1200d-2100khz": (1.9e6, 2.4e6),
+}
+"""Presets that tell the opening over elevation and the width of a beam, by the carrier [Hz]."""
+
+ELEVATION_DEG = 20.0
+"""Opening over elevation where no preset tells it [deg]."""
+
+
+def read_oculus(path: str | Path) -> Recording:
+    """Open a dump of Oculus messages, or an Oculus log; pixels are read on demand.
+
+    Row r lies at (r + 1/2) times the range resolution. Columns follow the bearings of each message, which need not be even,
+    from negative (port) to positive (starboard): the sonar stands upright. Counts are amplitude^gamma: 0.5 for the gamma
+    byte 127, 1 for 0 and 255. Where rows begin with a gain, counts are divided by its root, as two public readers do.
+    Where a frame has 8 bits and no gains its image is uint8, else float32.
+
+    Times are those of a log, or the start times of version 2 [s]. The counter of older versions has no known unit: frames
+    of a dump then follow each other at the ping rate, or at 10 Hz where that has no known code, by their numbers.
+    Attitude is that of version 2 [deg], its pitch taken as upward positive.
+
+    Raises:
+        MitsonarError: no such file, another format, an encrypted log, or no ping that can be read.
+    """
+    data = mapped(path, "an Oculus recording", HEADER.size)
+    name = str(path)
+    messages = find_messages(data, name)
+    pings, notes = _pings_of(messages)
+    log = bool(np.isfinite(messages.time_s).any())
+    time_s, timing = _times(pings, messages.time_s[pings.place])
+    kept, sorting = in_time_order(time_s, pings.head["number"])
+    pings = pings.select(kept)
+    parts = tuple(_part(messages, pings.select(run), time_s[kept][run]) for _, run in runs_of(_windows(pings)))
+    words = "Oculus log (.oculus)" if log or data[:2].tobytes() != b"SO" else "Oculus messages (.raw)"
+    return Recording(name, words, parts, _facts(pings.head), (*notes, *timing, *sorting, *_notes(pings.head)))
+
+
+class _Pings(NamedTuple):
+    """Pings that can be read: numbers among the messages, fields, and which of the fans of bearings each has."""
+
+    place: Index
+    head: Header
+    fan: Index
+    fans: list[Array]
+
+    def select(self, index: Index) -> _Pings:
+        return _Pings(self.place[index], self.head[index], self.fan[index], self.fans)
+
+
+def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
+    """Return the messages whose header can be, and sentences on all others."""
+    if not len(messages):
+        raise MitsonarError(f"{messages.name} holds no ping of an Oculus: {len(messages.data):,} bytes without an image")
+    blocks = b"".join(messages.head(one, LATER.itemsize).ljust(LATER.itemsize, b"\0") for one in range(len(messages)))
+    head = _fields(np.frombuffer(blocks, np.dtype((np.void, LATER.itemsize))))
+    whole = _whole(head, messages.size)
+    fans: dict[bytes, int] = {}
+    tables: list[Array] = []
+    fan = np.full(len(messages), -1, dtype=np.intp)
+    for one in np.flatnonzero(whole):
+        start, beams = _header_size(int(head["version"][one])), int(head["beams"][one])
+        content = messages.head(int(one), start + 2 * beams)[start:]
+        if content not in fans:
+            table = np.frombuffer(content, "<i2") / 100.0 if len(content) == 2 * beams else np.zeros(0)
+            fans[content] = len(tables) if _is_fan(table) else -1
+            tables += [table] if _is_fan(table) else []
+        fan[one] = fans[content]
+    place = np.flatnonzero(fan >= 0)
+    notes = []
+    if len(place) < len(messages):
+        notes.append(f"{len(messages) - len(place):,} pings are damaged and are left out")
+    if messages.skipped:
+        notes.append(f"{messages.skipped:,} messages or items of other kinds hold no image and are left out")
+    if messages.left_over:
+        notes.append(f"{messages.left_over:,} bytes are no whole message and are left out")
+    if not len(place):
+        raise MitsonarError(f"{messages.name} holds no ping of an Oculus that can be read: {'; '.join(notes)}")
+    return _Pings(place, head[place], fan[place], tables), notes
+
+
+def _header_size(version: int) -> int:
+    return LATER.itemsize if version >= 2 else OLDER.itemsize
+
+
+def _fields(blocks: NDArray[np.void]) -> Header:
+    """Return the fields of messages ``(n,)`` of any version; those that older ones lack are nan."""
+    older, later = (np.ndarray((len(blocks),), kind, blocks, 0, (LATER.itemsize,)) for kind in (OLDER, LATER))
+    assert LATER.names is not None
+    kinds = {name: "<f8" if name == "start" else LATER[name].str for name in LATER.names}
+    made = np.zeros(len(blocks), dtype=list(kinds.items()))
+    newer = later["version"] >= 2
+    for name in LATER.names:
+        made[name] = np.where(newer, later[name], older[name] if name in (OLDER.names or ()) else np.nan)
+    return made
+
+
+def _whole(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which headers ``(n,)`` can be, in messages of these sizes ``(n,)`` [bytes]."""
+    ranges, beams, image = (head[name].astype(np.int64) for name in ("ranges", "beams", "image"))
+    rows = ranges * beams * (np.minimum(head["width"], 3) + 1)
+    start = np.where(head["version"] >= 2, LATER.itemsize, OLDER.itemsize)
+    far = head["resolution"] * ranges
+    return np.asarray(
+        (head["version"] <= 2)
+        & (head["width"] <= 3)
+        & (ranges > 0)
+        & (beams > 1)
+        & (ranges * beams <= MOST_CELLS)
+        & (head["resolution"] > 1e-6)
+        & (far < LONGEST_M)
+        & (image >= start + 2 * beams)
+        & (head["image_size"] >= rows)
+        & (image + head["image_size"] <= size)
+    )
+
+
+def _is_fan(bearings_deg: Array) -> bool:
+    """Return whether bearings rise or fall, and stay in front of the sonar."""
+    steps = np.diff(bearings_deg)
+    return len(steps) > 0 and bool((steps > 0).all() or (steps < 0).all()) and np.abs(bearings_deg).max() <= WIDEST_DEG
+
+
+def _gained(head: Header) -> NDArray[np.bool_]:
+    """Return whether the rows of each image begin with a gain: by the flags, where there is room for them."""
+    ranges = head["ranges"].astype(np.int64)
+    stride = head["beams"].astype(np.int64) * (head["width"] + 1) + 4
+    return np.asarray((head["flags"] & GAINED > 0) & (head["image_size"] >= ranges * stride))
+
+
+def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
+    """Return the times of the pings ``(n,)`` [s], and a sentence where they are assumed."""
+    if np.isfinite(logged_s).any():
+        return logged_s, []
+    head = pings.head
+    start: Array = head["start"].astype(np.float64)
+    if (head["version"] >= 2).all() and len(head) > 1 and _rise(start):
+        return start, []
+    number = np.diff(head["number"].astype(np.int64))
+    number = np.where((number > 0) & (number < 1_000_000), number, 1)
+    codes = np.unique(head["ping_rate"])
+    rate = RATES.get(int(codes[0]), 10.0) if len(codes) == 1 else 10.0
+    why = "the greatest ping rate" if len(codes) == 1 and int(codes[0]) in RATES else "assumed"
+    note = f"the file tells no times in a known unit: pings follow each other at {rate:g} Hz ({why}), by their numbers"
+    return np.concatenate([[0.0], np.cumsum(number)]) / rate, [note]
+
+
+def _rise(time_s: Array) -> bool:
+    """Return whether each time comes after the one before, and not long after."""
+    steps = time_s[1:] - time_s[:-1]
+    return bool(((steps > 0) & (steps < LONGEST_S)).all())
+
+
+def _windows(pings: _Pings) -> list[tuple[float, ...]]:
+    """Return what the geometry of each frame follows from; small drifts of the range resolution count as none."""
+    keys, step = [], 0.0
+    gained = _gained(pings.head)
+    for one, ping in enumerate(pings.head):
+        if abs(float(ping["resolution"]) - step) > SAME_STEP * step:
+            step = float(ping["resolution"])
+        rest = (ping["ranges"], pings.fan[one], ping["width"], ping["gamma"], ping["mode"], gained[one])
+        keys.append((step, *(float(value) for value in rest)))
+    return keys
+
+
+def _part(messages: Messages, pings: _Pings, time_s: Array) -> Part:
+    head, bearings = pings.head, np.radians(pings.fans[int(pings.fan[0])])
+    falling = bool(bearings[0] > bearings[-1])
+    images = OculusImages(
+        messages=messages,
+        place=pings.place,
+        offset=head["image"].astype(np.int64),
+        shape=(int(head["ranges"][0]), int(head["beams"][0])),
+        width=int(head["width"][0]) + 1,
+        gained=bool(_gained(head[:1])[0]),
+        falling=falling,
+    )
+    like = _like(head, bearings[::-1] if falling else bearings, time_s, images)
+    return Part(like=like, time_s=time_s, images=images, attitude_rad=_attitude(head))
+
+
+def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) -> SonarFrames:
+    """Return frames without images: the geometry of a part."""
+    first = head[0]
+    bins, beams = images.shape
+    step = float(np.median(head["resolution"]))
+    frequency = float(first["frequency"])
+    known = next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
+    named = preset(known) if known else None
+    layout_name, fan_deg = _layout(bearings)
+    sonar = Sonar.create(
+        name=known or "oculus",
+        azimuth_fov_deg=fan_deg,
+        elevation_fov_deg=named.elevation_fov_deg if named else ELEVATION_DEG,
+        beam_width_deg=named.beam_width_deg if named else None,
+        beams=beams,
+        range_min=0.0,
+        range_max=bins * step,
+        range_bins=bins,
+        sound_speed=_speed(head),
+        bearing="cone",
+        beam_layout=layout_name,
+        frequency_hz=frequency if 1e4 < frequency < 1e8 else None,
+        frame_rate_hz=_rate(time_s),
+        coding="gamma",
+        coding_gamma=_gamma(int(first["gamma"])),
+    )
+    return SonarFrames(
+        image=np.zeros((0, bins, beams), np.uint8 if images.eight_bit else np.float32),
+        range_m=(np.arange(bins, dtype=np.float64) + 0.5) * step,
+        bearing_rad=bearings,
+        time_s=np.zeros(0),
+        sonar=sonar,
+        level="gamma",
+    )
+
+
+def _layout(bearings: Array) -> tuple[str, float]:
+    """Return whether beams are even in the angle or in its sine, and the field of view [deg]."""
+    spread = [float(np.std(steps) / np.mean(steps)) for steps in (np.diff(bearings), np.diff(np.sin(bearings)))]
+    sides = len(bearings) / (len(bearings) - 1)
+    if spread[0] <= spread[1]:
+        return "even", min(180.0, float(np.degrees(bearings[-1] - bearings[0])) * sides)
+    half = float(np.sin(bearings[-1]) - np.sin(bearings[0])) / 2 * sides
+    return "sine", 2 * math.degrees(math.asin(min(1.0, half)))
+
+
+def _gamma(code: int) -> float:
+    """Return the exponent that a gamma byte stands for: 0 and 255 none, 127 a half, those between in proportion."""
+    return 1.0 if code in (0, 255) else code / 254
+
+
+def _speed(head: Header) -> float:
+    speed = head["sound_speed"][(head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)]
+    return float(np.median(speed)) if len(speed) else 1500.0
+
+
+def _rate(time_s: Array) -> float:
+    seconds = float(time_s[-1] - time_s[0])
+    return min(1e6, (len(time_s) - 1) / seconds) if seconds > 0 else 10.0
+
+
+def _attitude(head: Header) -> Array | None:
+    """Return pitch, roll, heading ``(frames, 3)`` [rad], downward pitch positive; None where no message tells them."""
+    degrees = np.stack([-head["pitch"], head["roll"], head["heading"]], axis=1).astype(float)
+    degrees = np.where(np.abs(degrees) <= 360, degrees, np.nan)
+    return np.radians(degrees) if np.nan_to_num(degrees).any() else None
+
+
+def _facts(head: Header) -> Facts:
+    """Return what the messages tell, by name."""
+    if not len(head):
+        return {}
+    first = head[0]
+    facts: Facts = {name: int(first[name]) for name in ("version", "mode", "gamma", "flags", "ranges", "beams")}
+    facts |= {"bits": 8 * (int(first["width"]) + 1), "row_gains": bool(_gained(head[:1])[0])}
+    facts |= {"ping_numbers": [int(head["number"][0]), int(head["number"][-1])]}
+    for name, field in (("gain_percent", "gain_percent"), ("frequency_hz", "frequency"), ("sound_speed", "sound_speed")):
+        if math.isfinite(first[field]):
+            facts[name] = float(first[field])
+    return facts
+
+
+def _notes(head: Header) -> list[str]:
+    """Return sentences on what changes inside the file, and on what is assumed."""
+    notes = []
+    gains = np.unique(head["gain_percent"][np.isfinite(head["gain_percent"])])
+    if len(gains) > 1:
+        notes.append(f"the gain changes between {gains[0]:.4g} and {gains[-1]:.4g} %")
+    if _gained(head).any():
+        notes.append(
+            "rows have gains: counts were divided by their roots, relative to the least gain of a part's first frame"
+        )
+    codes = [int(code) for code in np.unique(head["gamma"]) if code not in (0, 127, 255)]
+    if codes:
+        notes.append(
+            f"the gamma byte {codes[0]} is taken as an exponent of {_gamma(codes[0]):.3g}: only 0, 127 and 255 are known"
+        )
+    if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
+        notes.append("the sound speed of the messages cannot be: 1500 m/s is taken; ranges do not depend on it")
+    return notes

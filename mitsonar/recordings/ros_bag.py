@@ -1,0 +1,270 @@
+"""ROS bags: ROS 1 (.bag), ROS 2 (a folder, .db3 or .mcap), with ``ProjectedSonarImage`` or ``OculusPing``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.recordings.bag_file import BagFile, Topic
+from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
+from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
+from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, short
+from mitsonar.recordings.ros_pictures import read_ros_pictures
+from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
+from mitsonar.recordings.ros_poses import motion_in, with_motion
+from mitsonar.recordings.ros_scan import TopicScan
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["read_ros_bag", "sonar_topic"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Samples = NDArray[np.generic]
+
+ELEVATION_DEG = 20.0
+"""Opening over elevation where the bag does not tell it [deg]; that of an Oculus M750d, M1200d at the low frequency."""
+
+TRIED = 8
+"""Frames by which the order of samples is found."""
+
+LATER_S = 86_400.0
+"""Largest delay between a message's own time and its reception that counts as one [s]."""
+
+
+def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: str | None = None) -> Recording:
+    """Open the recording of a sonar in a ROS bag; pixels are read on demand.
+
+    Times are those in the headers of the messages; where they are all 0, or all the same, those of reception. Values count
+    as amplitudes. Poses are those of the bag, where they are unambiguous (:mod:`mitsonar.recordings.ros_poses`). A file that
+    mitsonar wrote tells its sonar and coding (:mod:`mitsonar.recordings.mcap_metadata`).
+
+    Args:
+        path: of a ``.bag``, ``.mcap`` or ``.db3``, or of the folder of a ROS 2 bag.
+        geometry: a geometry file, for topics of pictures; images of sonars tell their geometry themselves.
+        topic: of the sonar, or of pictures; default: the only one of a sonar, or with a geometry the only one of pictures.
+
+    Raises:
+        MitsonarError: damaged, no topic of a sonar, or several and none chosen.
+    """
+    bag = BagFile(path)
+    chosen = sonar_topic(bag, topic, FANS if geometry is not None else (*PROJECTED, *OCULUS))
+    if chosen.kind in FANS:
+        return read_ros_pictures(bag, chosen, None if geometry is None else Path(geometry))
+    if geometry is not None:
+        raise MitsonarError(f"{path}: {chosen.name} tells its geometry itself: leave {geometry} out")
+    scan = TopicScan(bag, chosen)
+    scan.read()
+    if not scan.layouts:
+        raise MitsonarError(f"{path}: no message of {chosen.name} can be read: {scan.reason or 'there is none'}")
+    kept, notes = in_time_order(scan.frame_times())
+    notes = [*scan.notes(), *notes]
+    coding = _coding(scan, kept, notes)
+    numbers = np.array(scan.numbers)[kept]
+    layout = scan.layouts[numbers[0]]
+    times = scan.frame_times()[kept]
+    motion = motion_in(bag, layout.frame_id, layout.axes, times)
+    written = _as_written(scan, layout, coding)
+    parts = []
+    for number, run in runs_of(numbers.tolist()):
+        part = _part(scan, kept[run], scan.layouts[int(str(number))], coding)
+        part = with_motion(part, motion, run)
+        parts.append(part if written is None else replace(part, like=written))
+    if not all(one.elevation_rad for one in scan.layouts):
+        notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")
+    facts = _facts(scan, kept) | ({"poses": motion.origin} if motion.origin else {})
+    words = f"ROS {1 if bag.is_ros1 else 2} bag, {short(chosen.kind)}"
+    return Recording(str(path), words, tuple(parts), facts, (*notes, *motion.notes))
+
+
+def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (*PROJECTED, *OCULUS)) -> Topic:
+    """Return the topic of the sonar: the one that is named, or the only one of some types.
+
+    Args:
+        bag: with the topics.
+        topic: its name.
+        kinds: types among which the only one is found.
+
+    Raises:
+        MitsonarError: no such topic, of a type that cannot be read, or several.
+    """
+    there = bag.topics()
+    readable = [one for one in there if one.kind in (*PROJECTED, *OCULUS, *FANS) and one.messages]
+    if topic is not None:
+        named = next((one for one in there if one.name == topic), None)
+        if named is None:
+            raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in there])}")
+        if named not in readable:
+            raise MitsonarError(
+                f"{bag.path}: {topic} holds {named.messages:,} messages {short(named.kind)}; a sonar's are {_words(*kinds)}"
+            )
+        return named
+    found = [one for one in readable if one.kind in kinds]
+    if len(found) > 1:
+        raise MitsonarError(
+            f"{bag.path} holds several sonars: choose one of the topics {', '.join(one.name for one in found)} "
+            "(topic= in Python, --topic or --view on the command line)"
+        )
+    if not found:
+        others = ", ".join(f"{one.name} ({short(one.kind)})" for one in there[:8]) or "none"
+        more = "; pictures need a geometry file (--geometry)" if readable and not set(FANS) & set(kinds) else ""
+        raise MitsonarError(f"{bag.path} holds no messages {_words(*kinds)}: its topics are {others}{more}")
+    return found[0]
+
+
+def _words(*kinds: str) -> str:
+    """Return the names of types for a sentence."""
+    return " or ".join(short(one) for one in kinds if not one.startswith("acoustic_msgs"))
+
+
+class Coding(NamedTuple):
+    """How samples become pixels: their order, and what floats are divided by."""
+
+    beam_major: bool
+    scale: float
+
+
+def _coding(scan: TopicScan, kept: Index, notes: list[str]) -> Coding:
+    """Return how the samples of a recording become pixels, and add notes on it.
+
+    Raises:
+        MitsonarError: floats below 0.
+    """
+    if scan.low < 0:
+        raise MitsonarError(
+            f"{scan.bag.path}: {scan.topic.name} holds floats from {scan.low:.4g} to {scan.high:.4g}; what levels in dB "
+            "stand for the message does not tell: convert them to amplitudes of 0..1"
+        )
+    scale = scan.high if scan.high > 1 else 1.0
+    if scale > 1:
+        notes.append(f"samples are floats up to {scale:.6g}: they are divided by that")
+    layout = scan.layouts[scan.numbers[int(kept[0])]]
+    if scan.topic.kind not in PROJECTED:
+        return Coding(False, scale)
+    same = kept[np.array(scan.numbers)[kept] == scan.numbers[int(kept[0])]]
+    some = same[np.unique(np.linspace(0, len(same) - 1, TRIED).astype(int))]
+    flat = [np.frombuffer(np.asarray(one.image.data, np.uint8).tobytes(), layout.dtype) for _, one in scan.frames(some)]
+    major = is_beam_major(flat, len(layout.range_m), len(layout.bearing_rad))
+    if major:
+        notes.append("samples are in the order of beams, unlike those of drivers, by how they correlate")
+    return Coding(major, scale)
+
+
+def _part(scan: TopicScan, places: Index, layout: PingLayout, coding: Coding) -> Part:
+    """Return the frames of one layout."""
+    time_s = scan.frame_times()[places]
+    return Part(_like(layout, time_s, scan.topic.name), time_s, _Frames(scan, places, layout, coding))
+
+
+def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> SonarFrames | None:
+    """Return frames without images as mitsonar wrote them; None where the bag is not its file, or other images are read."""
+    path = scan.bag.path
+    if path.suffix != ".mcap" or scan.topic.name != WRITTEN or len(scan.layouts) > 1 or coding != Coding(False, 1.0):
+        return None
+    like = frames_like(path, np.dtype(np.uint8 if _is_uint8(layout) else np.float32))
+    if like is None or like.image.shape[1:] != (len(layout.range_m), len(layout.bearing_rad)):
+        return None
+    near = np.allclose(like.range_m, layout.range_m, rtol=1e-6)
+    return like if near and np.allclose(like.bearing_rad, layout.bearing_rad, atol=1e-6) else None
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The pixels of a part's frames."""
+
+    scan: TopicScan
+    places: Index
+    layout: PingLayout
+    coding: Coding
+
+    def __call__(self, index: Index) -> Pixels:
+        """Return ``(n, bins, beams)``, uint8 or float32."""
+        wanted = self.places[index]
+        shape = (len(index), len(self.layout.range_m), len(self.layout.bearing_rad))
+        image = np.zeros(shape, np.uint8 if _is_uint8(self.layout) else np.float32)
+        for place, message in self.scan.frames(wanted):
+            try:
+                raw = samples_of(message, self.scan.topic.kind, self.layout, beam_major=self.coding.beam_major)
+            except ValueError as error:
+                raise MitsonarError(
+                    f"{self.scan.bag.path}: a message of {self.scan.topic.name} is damaged: {error}"
+                ) from None
+            image[wanted == place] = _values(raw, self.coding.scale)
+        return image
+
+
+def _is_uint8(layout: PingLayout) -> bool:
+    return np.dtype(layout.dtype) == np.uint8
+
+
+def _values(raw: Samples, scale: float) -> Pixels:
+    """Return samples as uint8, or as float32 in 0..1."""
+    if raw.dtype == np.uint8:
+        return raw
+    if raw.dtype.kind == "f":
+        known = np.nan_to_num(raw.astype(np.float32), nan=0, posinf=0, neginf=0)
+        return known if scale == 1 else known / np.float32(scale)
+    most = np.iinfo(np.dtype(raw.dtype.name)).max
+    return np.asarray(np.maximum(raw, 0) / most, dtype=np.float32)
+
+
+def _like(layout: PingLayout, time_s: Array, name: str) -> SonarFrames:
+    """Return frames without images: the geometry of a part."""
+    bins, beams = len(layout.range_m), len(layout.bearing_rad)
+    steps = np.diff(layout.range_m) if bins > 1 else np.array([min(0.01, layout.range_m[0])])
+    across = np.diff(layout.bearing_rad).mean() if beams > 1 else layout.beam_width_rad or math.radians(1)
+    sonar = Sonar.create(
+        name=name.strip("/").replace("/", "_") or "ros",
+        azimuth_fov_deg=min(360.0, math.degrees(float(layout.bearing_rad[-1] - layout.bearing_rad[0] + across))),
+        elevation_fov_deg=min(180.0, math.degrees(layout.elevation_rad) or ELEVATION_DEG),
+        beams=beams,
+        range_min=max(0.0, float(layout.range_m[0] - steps[0] / 2)),
+        range_max=float(layout.range_m[-1] + steps[-1] / 2),
+        range_bins=bins,
+        sound_speed=layout.sound_speed if 1000 < layout.sound_speed < 2000 else 1500.0,
+        beam_width_deg=math.degrees(layout.beam_width_rad) or None,
+        frequency_hz=layout.frequency_hz if 0 < layout.frequency_hz <= 1e8 else None,
+        frame_rate_hz=_rate(time_s),
+        coding="gamma",
+        coding_gamma=layout.gamma,
+    )
+    return SonarFrames(
+        image=np.zeros((0, bins, beams), np.uint8 if _is_uint8(layout) else np.float32),
+        range_m=layout.range_m,
+        bearing_rad=layout.bearing_rad,
+        time_s=np.zeros(0),
+        sonar=sonar,
+        level="gamma",
+    )
+
+
+def _rate(time_s: Array) -> float:
+    """Return the frames a second [Hz], by the times."""
+    steps = np.diff(time_s)
+    return float(np.clip(1 / np.median(steps), 1e-3, 1e6)) if len(steps) else 10.0
+
+
+def _facts(scan: TopicScan, kept: Index) -> Facts:
+    """Return what the bag tells, by name."""
+    first = scan.layouts[scan.numbers[int(kept[0])]]
+    facts: Facts = {
+        "topic": scan.topic.name,
+        "type": short(scan.topic.kind),
+        "frame_id": first.frame_id,
+        "samples": first.dtype,
+    }
+    if first.sound_speed:
+        facts["sound_speed"] = first.sound_speed
+    if first.frequency_hz:
+        facts["frequency_hz"] = first.frequency_hz
+    delay = np.array(scan.received, dtype=float)[kept] * 1e-9 - scan.frame_times()[kept]
+    if np.abs(delay).max() < LATER_S:
+        facts["received_after_s"] = [round(float(delay.min()), 6), round(float(delay.max()), 6)]
+    return facts

@@ -1,0 +1,317 @@
+"""Sonar frames as ROS 2 messages (CDR): polar image, fan, points, odometry and transforms.
+
+| frame | axes | parent |
+|---|---|---|
+| ``map`` | east, north, up (REP 103) | |
+| ``sonar_link`` | forward, left, up (REP 103) | ``map``: the pose of the sonar |
+| ``sonar`` | down, left, forward: as drivers write ``ProjectedSonarImage`` | ``sonar_link``, fixed |
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from mitsonar.errors import MitsonarError
+from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
+from mitsonar.instruments.beam_directions import directions
+from mitsonar.motion.conventions import CONVENTIONS
+from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.recordings.mcap_metadata import WRITTEN
+from mitsonar.recordings.ros_messages import PROJECTED, ros2_types
+from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+
+__all__ = ["BODY", "SENSOR", "TOPICS", "WORLD", "Encoded", "FrameEncoder", "nanoseconds"]
+
+Array = NDArray[np.float64]
+
+RosObject: TypeAlias = Any
+"""An object of a message type that ``rosbags`` made."""
+
+WORLD, BODY, SENSOR = "map", "sonar_link", "sonar"
+"""Names of the frames."""
+
+TOPICS = {
+    WRITTEN: PROJECTED[0],
+    "/sonar/fan/compressed": "sensor_msgs/msg/CompressedImage",
+    "/sonar/points": "sensor_msgs/msg/PointCloud2",
+    "/sonar/odometry": "nav_msgs/msg/Odometry",
+    "/sonar/imu": "sensor_msgs/msg/Imu",
+    "/sonar/altitude": "sensor_msgs/msg/Range",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+}
+"""Topics that a run may become, with their types."""
+
+LARGEST_FAN = 800
+"""Rows of a fan, at most."""
+
+PICTURES = {"png": ("PNG", {"compress_level": 3}), "jpeg": ("JPEG", {"quality": 92})}
+"""Formats of fans: Pillow's name and options."""
+
+UINT8, FLOAT32 = 0, 8
+"""Numbers of types of samples in ``SonarImageData``."""
+
+POINT_TYPES = {np.dtype(np.float32): 7, np.dtype(np.int32): 5}
+"""Numbers of types of fields in ``PointField``."""
+
+
+class Encoded(NamedTuple):
+    """A message: its topic, time [ns] and bytes."""
+
+    topic: str
+    time_ns: int
+    data: bytes
+
+
+class FrameEncoder:
+    """Encodes frames of one sonar.
+
+    Args:
+        like: frames with the sonar, ranges, bearings, level and arrays of all frames that follow; its images are not read.
+        picture: format of the fans, ``png`` or ``jpeg``.
+
+    Raises:
+        MitsonarError: an unknown format.
+    """
+
+    def __init__(self, like: SonarFrames, picture: str = "png") -> None:
+        if picture not in PICTURES:
+            raise MitsonarError(f"fans are written as {' or '.join(PICTURES)}: got {picture!r}")
+        self.like, self.picture, self.types = like, picture, ros2_types()
+
+    @property
+    def topics(self) -> list[str]:
+        """Return the topics that these frames become."""
+        needs = {
+            "/sonar/points": self.like.elevation_rad,
+            "/sonar/odometry": self.like.poses,
+            "/tf": self.like.poses,
+            "/sonar/imu": self.like.attitude_rad,
+            "/sonar/altitude": self.like.height_m,
+        }
+        absent = [name for name, values in needs.items() if values is None]
+        return [name for name in TOPICS if name not in absent]
+
+    def definition(self, topic: str) -> str:
+        """Return the definition of a topic's type, with those of its parts."""
+        return self.types.generate_msgdef(TOPICS[topic], ros_version=2)[0]
+
+    def messages(self, frames: SonarFrames) -> Iterator[Encoded]:
+        """Encode frames, in the order of time."""
+        time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
+        for index, time in enumerate(nanoseconds(time_s)):
+            yield self._encoded(WRITTEN, time, self._image(frames, index, time))
+            yield self._encoded("/sonar/fan/compressed", time, self._fan(frames, index, time))
+            if frames.elevation_rad is not None:
+                yield self._encoded("/sonar/points", time, self._points(frames, index, time))
+            if frames.attitude_rad is not None:
+                yield self._encoded("/sonar/imu", time, self._imu(frames.attitude_rad[index], time))
+            if frames.height_m is not None:
+                yield self._encoded("/sonar/altitude", time, self._altitude(float(frames.height_m[index]), time))
+            if frames.poses is not None:
+                place, turn = _ros_pose(frames.poses[index])
+                yield self._encoded("/tf", time, self._transform(WORLD, BODY, time, place, turn))
+                yield self._encoded("/sonar/odometry", time, self._odometry(time, place, turn))
+
+    def fixed(self, time: int) -> Encoded:
+        """Encode the transform from the messages' frame to the sonar's body."""
+        turn = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+        return self._encoded("/tf_static", time, self._transform(BODY, SENSOR, time, np.zeros(3), turn))
+
+    def _encoded(self, topic: str, time: int, message: RosObject) -> Encoded:
+        return Encoded(topic, time, bytes(self.types.serialize_cdr(message, TOPICS[topic], little_endian=True)))
+
+    def _make(self, kind: str, **fields: RosObject) -> RosObject:
+        """Make a message of a type."""
+        package, _, name = kind.partition("/")
+        return self.types.types[f"{package}/msg/{name}"](**fields)
+
+    def _header(self, time: int, frame: str) -> RosObject:
+        stamp = self._make("builtin_interfaces/Time", sec=time // 10**9, nanosec=time % 10**9)
+        return self._make("std_msgs/Header", stamp=stamp, frame_id=frame)
+
+    def _vector(self, values: Array, kind: str = "geometry_msgs/Vector3") -> RosObject:
+        return self._make(kind, **dict(zip("xyzw", (float(one) for one in values), strict=False)))
+
+    # ------------------------------------------------------------ images
+
+    @cached_property
+    def _directions(self) -> list[RosObject]:
+        """Axes of the beams in the frame ``sonar``: y to port, z forward."""
+        bearing = self.like.bearing_rad
+        axes = np.stack([np.zeros_like(bearing), -np.sin(bearing), np.cos(bearing)], axis=-1)
+        return [self._vector(one) for one in axes]
+
+    @cached_property
+    def _ping_info(self) -> RosObject:
+        sonar, beams = self.like.sonar, len(self.like.bearing_rad)
+        return self._make(
+            "marine_acoustic_msgs/PingInfo",
+            frequency=float(sonar.frequency_hz or 0),
+            sound_speed=sonar.sound_speed,
+            tx_beamwidths=np.full(beams, math.radians(sonar.elevation_fov_deg), np.float32),
+            rx_beamwidths=np.full(beams, sonar.beam_width_rad, np.float32),
+        )
+
+    def _image(self, frames: SonarFrames, index: int, time: int) -> RosObject:
+        """Return a polar image; all beams of a range follow each other, as drivers write them."""
+        image = frames.image[index]
+        image = image if image.dtype == np.uint8 else image.astype("<f4")
+        data = self._make(
+            "marine_acoustic_msgs/SonarImageData",
+            is_bigendian=False,
+            dtype=UINT8 if image.dtype == np.uint8 else FLOAT32,
+            beam_count=image.shape[1],
+            data=np.frombuffer(np.ascontiguousarray(image).tobytes(), np.uint8),
+        )
+        return self._make(
+            "marine_acoustic_msgs/ProjectedSonarImage",
+            header=self._header(time, SENSOR),
+            ping_info=self._ping_info,
+            beam_directions=self._directions,
+            ranges=self.like.range_m.astype(np.float32),
+            image=data,
+        )
+
+    @cached_property
+    def _map(self) -> CartesianMap:
+        rows = min(LARGEST_FAN, max(2, len(self.like.range_m)))
+        return cartesian_map(self.like.range_m, self.like.bearing_rad, rows=rows)
+
+    def _fan(self, frames: SonarFrames, index: int, time: int) -> RosObject:
+        """Return a picture of a fan: forward up, starboard right, 0 outside."""
+        image = frames.image[index]
+        scale = np.float32(1 / 255 if image.dtype == np.uint8 else 1)
+        fan = to_uint8(np.asarray(self._map.apply(image.astype(np.float32) * scale)))
+        buffer = io.BytesIO()
+        name, options = PICTURES[self.picture]
+        Image.fromarray(fan).save(buffer, format=name, **options)
+        return self._make(
+            "sensor_msgs/CompressedImage",
+            header=self._header(time, SENSOR),
+            format=self.picture,
+            data=np.frombuffer(buffer.getvalue(), np.uint8),
+        )
+
+    def _points(self, frames: SonarFrames, index: int, time: int) -> RosObject:
+        """Return the places of the strongest echoes, with value and labels."""
+        assert frames.elevation_rad is not None
+        image, elevation = frames.image[index], frames.elevation_rad[index]
+        rows, columns = np.nonzero(np.isfinite(elevation) & (image > 0))
+        ways = directions(frames.sonar.bearing, frames.bearing_rad[columns], elevation[rows, columns])
+        starboard, forward, up = (ways * frames.range_m[rows, None]).T
+        value = image[rows, columns].astype(np.float32) / np.float32(255 if image.dtype == np.uint8 else 1)
+        table: dict[str, NDArray[Any]] = {"x": forward, "y": -starboard, "z": up, "intensity": value}
+        table = {name: one.astype(np.float32) for name, one in table.items()}
+        labels = {"shape_id": frames.shape_id, "object_id": frames.object_id}
+        table |= {name: one[index][rows, columns].astype(np.int32) for name, one in labels.items() if one is not None}
+        return self._cloud(table, time)
+
+    def _cloud(self, table: dict[str, NDArray[Any]], time: int) -> RosObject:
+        """Return points with these fields ``(points,)``."""
+        kind = np.dtype([(name, one.dtype.newbyteorder("<")) for name, one in table.items()])
+        points = np.zeros(len(table["x"]), kind)
+        for name, one in table.items():
+            points[name] = one
+        fields = [
+            self._make("sensor_msgs/PointField", name=name, offset=4 * at, datatype=POINT_TYPES[one.dtype], count=1)
+            for at, (name, one) in enumerate(table.items())
+        ]
+        return self._make(
+            "sensor_msgs/PointCloud2",
+            header=self._header(time, BODY),
+            height=1,
+            width=len(points),
+            fields=fields,
+            is_bigendian=False,
+            point_step=kind.itemsize,
+            row_step=kind.itemsize * len(points),
+            data=np.frombuffer(points.tobytes(), np.uint8),
+            is_dense=True,
+        )
+
+    # ------------------------------------------------------------ poses
+
+    def _transform(self, parent: str, child: str, time: int, place: Array, turn: Rotation) -> RosObject:
+        where = self._make(
+            "geometry_msgs/Transform",
+            translation=self._vector(place),
+            rotation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
+        )
+        header = self._header(time, parent)
+        one = self._make("geometry_msgs/TransformStamped", header=header, child_frame_id=child, transform=where)
+        return self._make("tf2_msgs/TFMessage", transforms=[one])
+
+    def _odometry(self, time: int, place: Array, turn: Rotation) -> RosObject:
+        """Return the true pose; the twist is not known, which a covariance of -1 says."""
+        zero, unknown = np.zeros(3), np.zeros(36)
+        unknown[0] = -1
+        pose = self._make(
+            "geometry_msgs/Pose",
+            position=self._vector(place, "geometry_msgs/Point"),
+            orientation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
+        )
+        twist = self._make("geometry_msgs/Twist", linear=self._vector(zero), angular=self._vector(zero))
+        return self._make(
+            "nav_msgs/Odometry",
+            header=self._header(time, WORLD),
+            child_frame_id=BODY,
+            pose=self._make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+            twist=self._make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=unknown),
+        )
+
+    def _imu(self, attitude: Array, time: int) -> RosObject:
+        """Return pitch, roll, heading ``(3,)`` as the orientation of an IMU; rates are not known, which -1 says."""
+        known = bool(np.isfinite(attitude).all())
+        _, turn = _ros_pose(np.concatenate([np.zeros(3), np.where(np.isfinite(attitude), attitude, 0)]))
+        unknown = np.zeros(9)
+        unknown[0] = -1
+        return self._make(
+            "sensor_msgs/Imu",
+            header=self._header(time, BODY),
+            orientation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
+            orientation_covariance=np.zeros(9) if known else unknown,
+            angular_velocity=self._vector(np.zeros(3)),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=self._vector(np.zeros(3)),
+            linear_acceleration_covariance=unknown,
+        )
+
+    def _altitude(self, height_m: float, time: int) -> RosObject:
+        """Return the height over the ground as an altimeter measures it; infinite where nothing is below (REP 117)."""
+        return self._make(
+            "sensor_msgs/Range",
+            header=self._header(time, BODY),
+            radiation_type=0,
+            field_of_view=0.0,
+            min_range=0.0,
+            max_range=1e5,
+            range=height_m if math.isfinite(height_m) else math.inf,
+        )
+
+
+def nanoseconds(time_s: Array) -> list[int]:
+    """Return times as whole nanoseconds ``(n,)``, from which dividing by 10^9 gives back the same float.
+
+    Raises:
+        MitsonarError: times that ROS cannot hold.
+    """
+    if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < 2**31).all()):
+        raise MitsonarError("frame times must lie in 0..2^31 s for ROS: write the frames with other times")
+    whole = np.floor(time_s)
+    return [int(one) * 10**9 + round(float(part) * 1e9) for one, part in zip(whole, time_s - whole, strict=True)]
+
+
+def _ros_pose(pose: Array) -> tuple[Array, Rotation]:
+    """Return position and rotation of a pose ``(6,)`` in the convention of ROS."""
+    place, turn = CONVENTIONS["ros-enu"].from_ours(pose[None, :3], vehicle_rotation(pose))
+    return place[0], turn[0]

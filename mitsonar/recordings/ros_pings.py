@@ -1,0 +1,266 @@
+"""Messages of sonars as images: geometry, coding and samples of ``ProjectedSonarImage`` and ``OculusPing``."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.recordings.bag_file import Message
+from mitsonar.recordings.ros_messages import DTYPES, PROJECTED
+
+__all__ = ["FORWARD_LEFT_UP", "PingLayout", "is_beam_major", "layout_of", "picture_of", "samples_of"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Samples = NDArray[np.generic]
+
+RED, GREEN, BLUE = 0.299, 0.587, 0.114
+"""Weights of colours in the luminance (ITU-R BT.601)."""
+
+CHANNELS = {
+    "mono8": (1.0,),
+    "8UC1": (1.0,),
+    "rgb8": (RED, GREEN, BLUE),
+    "bgr8": (BLUE, GREEN, RED),
+    "8UC3": (BLUE, GREEN, RED),
+    "rgba8": (RED, GREEN, BLUE, 0.0),
+    "bgra8": (BLUE, GREEN, RED, 0.0),
+}
+"""Encodings of ``sensor_msgs/Image`` that are read: the weight of each channel."""
+
+SAME_RANGE = 0.002
+"""Relative change of ranges up to which a window counts as the same: the sound speed drifts."""
+
+SAME_BEARING = 1e-4
+"""Change of a bearing up to which it counts as the same [rad]."""
+
+CENTIDEGREE = math.pi / 18_000
+"""Unit of the bearings of an Oculus [rad]."""
+
+FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+"""Starboard, forward and up in axes forward, left, up (REP 103), as columns."""
+
+CLEARLY = 0.05
+"""By how much a correlation must exceed the other one to decide on the order of samples."""
+
+
+@dataclass(frozen=True)
+class PingLayout:
+    """What a message tells of its image, besides the samples.
+
+    Attributes:
+        range_m: centres of the bins ``(bins,)`` [m].
+        bearing_rad: axes of the beams ``(beams,)`` [rad], rising, starboard positive.
+        order: columns of the message in the order of the bearings ``(beams,)``.
+        dtype: of the samples, as NumPy names it.
+        axes: starboard, forward and up in the axes of the message's frame, as columns ``(3, 3)``.
+        frame_id: of the message.
+        frequency_hz: carrier; 0 where unknown.
+        sound_speed: m/s; 0 where unknown.
+        elevation_rad: opening over elevation; 0 where unknown.
+        beam_width_rad: of one beam; 0 where unknown.
+        gamma: value = amplitude^gamma.
+    """
+
+    range_m: Array
+    bearing_rad: Array
+    order: Index
+    dtype: str
+    axes: Array
+    frame_id: str = ""
+    frequency_hz: float = 0.0
+    sound_speed: float = 0.0
+    elevation_rad: float = 0.0
+    beam_width_rad: float = 0.0
+    gamma: float = 1.0
+
+    @property
+    def cells(self) -> int:
+        """Return the number of samples."""
+        return len(self.range_m) * len(self.bearing_rad)
+
+    def resembles(self, other: PingLayout) -> bool:
+        """Return whether frames of both belong to one part."""
+        return (
+            self.range_m.shape == other.range_m.shape
+            and self.bearing_rad.shape == other.bearing_rad.shape
+            and (self.dtype, self.frame_id, self.gamma) == (other.dtype, other.frame_id, other.gamma)
+            and bool((self.order == other.order).all())
+            and bool(np.allclose(self.range_m, other.range_m, rtol=SAME_RANGE, atol=0))
+            and bool(np.allclose(self.bearing_rad, other.bearing_rad, rtol=0, atol=SAME_BEARING))
+        )
+
+
+def layout_of(message: Message, kind: str) -> PingLayout:
+    """Return the layout of a message.
+
+    Raises:
+        ValueError: sizes or numbers that contradict each other; the message is damaged.
+    """
+    layout = _projected(message) if kind in PROJECTED else _oculus(message)
+    rising = np.all(np.diff(layout.range_m) > 0) and np.all(np.diff(layout.bearing_rad) > 0)
+    if not (layout.cells and rising and np.isfinite(layout.range_m).all() and layout.range_m[0] >= 0):
+        raise ValueError("ranges or bearings are none, or do not rise")
+    if kind in PROJECTED and len(message.image.data) != layout.cells * np.dtype(layout.dtype).itemsize:
+        raise ValueError("the samples are not as many as ranges and beams say")
+    return layout
+
+
+def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: bool = False) -> Samples:
+    """Return the samples of a message as they are stored ``(bins, beams)``, column 0 most to port.
+
+    Args:
+        message: decoded.
+        kind: its type.
+        layout: of the message, or of one like it.
+        beam_major: whether all ranges of a beam follow each other. Drivers write all beams of a range.
+
+    Raises:
+        ValueError: samples that are not as many as the layout says, or a picture that cannot be decoded.
+    """
+    shape = (len(layout.range_m), len(layout.bearing_rad))
+    if kind in PROJECTED:
+        flat = np.frombuffer(np.asarray(message.image.data, np.uint8).tobytes(), layout.dtype)
+        if flat.size != layout.cells:
+            raise ValueError("the samples are not as many as ranges and beams say")
+        image = flat.reshape(shape[::-1]).T if beam_major else flat.reshape(shape)
+    else:
+        image = picture_of(message.ping)
+        if image.shape != shape:
+            raise ValueError(f"the picture is {image.shape[0]} x {image.shape[1]}, not {shape[0]} x {shape[1]}")
+    return image[:, layout.order]
+
+
+def is_beam_major(flat: Sequence[Samples], bins: int, beams: int) -> bool:
+    """Return whether samples are in the order of beams, by how they correlate.
+
+    The definition of ``SonarImageData`` speaks of beams after one another. The drivers of Oculus sonars and the simulators
+    that were seen write ranges after one another. The number of samples is the same. But neighbours resemble each other:
+    they are ``beams`` samples apart in the order of ranges, and ``bins`` samples apart in the order of beams. Where that
+    does not decide, as with as many bins as beams, it is the order of the drivers.
+
+    Args:
+        flat: samples of some frames as they are stored, each ``(bins * beams,)``.
+        bins: number of ranges.
+        beams: number of beams.
+    """
+    if bins == beams or min(bins, beams) < 2:
+        return False
+    by_range = np.mean([_correlation(one, beams) for one in flat])
+    by_beam = np.mean([_correlation(one, bins) for one in flat])
+    return bool(by_beam > by_range + CLEARLY)
+
+
+def _correlation(values: Samples, lag: int) -> float:
+    """Return the correlation of values with those ``lag`` places later; 0 where they are all the same."""
+    known = np.nan_to_num(values.astype(np.float64), posinf=0, neginf=0)
+    first, second = known[:-lag] - known[:-lag].mean(), known[lag:] - known[lag:].mean()
+    power = math.sqrt(float(first @ first) * float(second @ second))
+    return float(first @ second) / power if power > 0 else 0.0
+
+
+def _projected(message: Message) -> PingLayout:
+    """Return the layout of a ``ProjectedSonarImage``."""
+    vectors = np.array([(one.x, one.y, one.z) for one in message.beam_directions], dtype=float).reshape(-1, 3)
+    bearing, axes = _bearings(vectors)
+    order = np.argsort(bearing, kind="stable")
+    info, image = message.ping_info, message.image
+    ranges: Array = np.asarray(message.ranges).astype(np.float64)
+    if int(image.dtype) not in DTYPES:
+        raise ValueError(f"unknown type {image.dtype} of samples")
+    return PingLayout(
+        range_m=ranges,
+        bearing_rad=bearing[order],
+        order=order,
+        dtype=(">" if image.is_bigendian else "<") + DTYPES[int(image.dtype)],
+        axes=axes,
+        frame_id=str(message.header.frame_id),
+        frequency_hz=_amount(info.frequency),
+        sound_speed=_amount(info.sound_speed),
+        elevation_rad=_middle(info.tx_beamwidths),
+        beam_width_rad=_middle(info.rx_beamwidths),
+    )
+
+
+def _bearings(vectors: Array) -> tuple[Array, Array]:
+    """Return the bearings of directions ``(beams, 3)`` [rad], and starboard, forward, up in their axes.
+
+    Forward is the axis z, as the definition says, or the axis x, as in Gazebo. To port is the axis y in both: so write the
+    driver of the Oculus (y = -sin) and Gazebo (REP 103), and so does ``sonar_image_proc`` draw.
+    """
+    if not len(vectors) or not np.isfinite(vectors).all() or not (np.linalg.norm(vectors, axis=1) > 0).all():
+        raise ValueError("directions of beams are none, or not finite")
+    forward = 0 if np.abs(vectors[:, 0]).mean() > np.abs(vectors[:, 2]).mean() else 2
+    axis = np.eye(3)
+    starboard = -axis[1]
+    up = np.cross(starboard, axis[forward])
+    return np.arctan2(-vectors[:, 1], vectors[:, forward]), np.column_stack([starboard, axis[forward], up])
+
+
+def _oculus(message: Message) -> PingLayout:
+    """Return the layout of an ``OculusPing``; its frame counts as forward, left, up (REP 103)."""
+    bearing = np.asarray(message.bearings, dtype=float) * CENTIDEGREE
+    if len(bearing) != int(message.num_beams):
+        raise ValueError("bearings are not as many as beams")
+    order = np.argsort(bearing, kind="stable")
+    step, bins = float(message.range_resolution), int(message.num_ranges)
+    if not (0 < step < 100 and 0 < bins < 2**16):
+        raise ValueError("ranges that cannot be")
+    fire = message.fire_msg
+    gamma = float(fire.gamma)
+    return PingLayout(
+        range_m=np.asarray((np.arange(bins) + 0.5) * step, dtype=np.float64),
+        bearing_rad=bearing[order],
+        order=order,
+        dtype="|u1",
+        axes=FORWARD_LEFT_UP,
+        frame_id=str(message.header.frame_id),
+        frequency_hz=_amount(getattr(message, "frequency", 0.0)),
+        sound_speed=_amount(getattr(message, "speed_of_sound", 0.0)) or _amount(fire.speed_of_sound),
+        gamma=gamma / 255 if 0 < gamma < 255 else 1.0,
+    )
+
+
+def picture_of(picture: Message) -> NDArray[np.uint8]:
+    """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``.
+
+    Raises:
+        ValueError: it cannot be decoded, or its samples are not as many as it says.
+    """
+    data = np.asarray(picture.data, np.uint8)
+    if hasattr(picture, "format"):
+        from PIL import Image
+
+        try:
+            with Image.open(io.BytesIO(data.tobytes())) as shown:
+                return np.asarray(shown.convert("L"))
+        except Exception as error:  # damaged pictures raise errors of many kinds
+            raise ValueError(f"a picture cannot be decoded: {error}") from None
+    rows, columns = int(picture.height), int(picture.width)
+    if picture.encoding not in CHANNELS:
+        raise ValueError(f"a picture is {picture.encoding}: mitsonar reads {', '.join(CHANNELS)}")
+    channels = len(CHANNELS[picture.encoding])
+    width = columns * channels
+    stride = int(picture.step) if int(picture.step) * rows == len(data) else width
+    if stride < width or stride * rows != len(data):
+        raise ValueError("a picture's samples are not as many as its height and width say")
+    values = data.reshape(rows, stride)[:, :width].reshape(rows, columns, channels)
+    return np.asarray(np.rint(values @ np.array(CHANNELS[picture.encoding])), dtype=np.uint8)
+
+
+def _amount(value: object) -> float:
+    """Return a number above 0; 0 where it is none."""
+    number = float(value)  # type: ignore[arg-type]
+    return number if math.isfinite(number) and number > 0 else 0.0
+
+
+def _middle(values: object) -> float:
+    """Return the median of the numbers above 0; 0 where there are none."""
+    known = np.asarray(values, dtype=float)
+    known = known[np.isfinite(known) & (known > 0) & (known < 2 * math.pi)]
+    return float(np.median(known)) if len(known) else 0.0

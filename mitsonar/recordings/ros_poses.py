@@ -1,0 +1,282 @@
+"""Poses, attitudes and heights of a sonar by other topics of its ROS bag, in mitsonar's convention."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from mitsonar.motion.conventions import CONVENTIONS
+from mitsonar.motion.pose import poses_from
+from mitsonar.recordings.bag_file import BagFile, Message, Topic
+from mitsonar.recordings.recording import Part
+
+__all__ = ["Motion", "motion_in", "with_motion"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+OLD_TRANSFORMS = "tf/msg/tfMessage"
+ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
+RANGE = "sensor_msgs/msg/Range"
+POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+
+MOST_LINKS = 32
+"""Transforms between a sonar and the world, at most."""
+
+BEYOND_S = 0.25
+"""Time before the first and after the last pose in which that pose is held [s]."""
+
+LARGEST_GAP_S = 2.0
+"""Longest time between two poses over which poses are interpolated [s]."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What other topics tell of a sonar at the times of its frames; None where they do not.
+
+    Attributes:
+        poses: ``(frames, 6)`` [m, rad].
+        attitude_rad: pitch, roll, heading by an IMU ``(frames, 3)``.
+        height_m: by an altimeter ``(frames,)``; nan where unknown.
+        notes: sentences on what is assumed of the poses, or why there are none.
+        origin: topic or transforms of the poses, and the world, in words.
+    """
+
+    poses: Array | None = None
+    attitude_rad: Array | None = None
+    height_m: Array | None = None
+    notes: tuple[str, ...] = ()
+    origin: str = ""
+
+
+@dataclass
+class Link:
+    """Transforms from one frame to its parent over time.
+
+    Attributes:
+        parent: name of the parent frame.
+        numbers: time [s], position [m] and quaternion x, y, z, w of each.
+        fixed: whether it never changes.
+        topic: where it is from.
+    """
+
+    parent: str
+    topic: str
+    fixed: bool = False
+    numbers: list[tuple[float, ...]] = field(default_factory=list)
+
+    def at(self, time_s: Array) -> tuple[Array, Rotation] | None:
+        """Return positions ``(n, 3)`` and rotations at these times; None where a time lies beyond what is known."""
+        table = np.array(self.numbers, dtype=float).reshape(-1, 8)
+        table = table[np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 4:], axis=1) > 1e-6)]
+        table = table[np.unique(table[:, 0], return_index=True)[1]]
+        if not len(table):
+            return None
+        if self.fixed or len(table) == 1:
+            last = np.repeat(table[-1:], len(time_s), axis=0)
+            return (last[:, 1:4], Rotation.from_quat(last[:, 4:])) if self.fixed else None
+        known = table[:, 0]
+        held = np.clip(time_s, known[0], known[-1])
+        after = np.clip(np.searchsorted(known, held), 1, len(known) - 1)
+        near = np.minimum(held - known[after - 1], known[after] - held)
+        if np.abs(held - time_s).max() > BEYOND_S or (near > LARGEST_GAP_S / 2).any():
+            return None
+        place = np.column_stack([np.interp(held, known, axis) for axis in table[:, 1:4].T])
+        return place, Slerp(known, Rotation.from_quat(table[:, 4:]))(held)
+
+
+def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
+    """Return poses, attitudes and heights of a sonar by the other topics of its bag.
+
+    Args:
+        bag: with the topics.
+        frame_id: frame of the sonar's messages.
+        axes: starboard, forward and up of the sonar in that frame ``(3, 3)``.
+        time_s: of the frames ``(frames,)``.
+    """
+    poses = _poses_in(bag, frame_id, axes, time_s)
+    attitude = _attitude_in(bag, frame_id, axes, time_s)
+    return replace(poses, attitude_rad=attitude, height_m=_heights_in(bag, time_s))
+
+
+def with_motion(part: Part, motion: Motion, places: Index) -> Part:
+    """Return a part with what is known of the motion of its frames, which are at these places ``(n,)``."""
+    return replace(
+        part,
+        poses=part.poses if motion.poses is None else motion.poses[places],
+        attitude_rad=part.attitude_rad if motion.attitude_rad is None else motion.attitude_rad[places],
+        height_m=part.height_m if motion.height_m is None else motion.height_m[places],
+    )
+
+
+def _poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
+    """Return the poses of a sonar by the transforms, or else the odometry or the poses, of its bag.
+
+    Transforms (TF) that lead from the sonar's frame to a world come first. Next is the only odometry: its child frame must
+    lead to the sonar's by fixed transforms, or it counts as the sonar's, which a note says. The only topic of poses counts
+    as the sonar's. Several of a kind are ambiguous: then there are no poses, and a note names them.
+    """
+    topics = [one for one in bag.topics() if one.messages]
+    links = _transforms(bag, topics)
+    chain = _chain(links, _plain(frame_id))
+    if chain and any(not one.fixed for one in chain):
+        return _along(chain, axes, time_s, "the transforms")
+    found, notes = _only(bag, topics)
+    if found is None:
+        return Motion(notes=notes)
+    child, link = found
+    mount = _between(links, _plain(frame_id), child) if child else None
+    if mount is None:
+        notes = (*notes, f"poses of {link.topic} count as those of the sonar: no transform leads from them to {frame_id!r}")
+    moved = _along([*(mount or []), link], axes, time_s, link.topic)
+    return replace(moved, notes=notes if moved.poses is not None else moved.notes)
+
+
+def _attitude_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Array | None:
+    """Return pitch, roll and heading of a sonar ``(frames, 3)`` [rad] by the only IMU of its bag; None without one.
+
+    Fixed transforms must lead from the sonar's frame to that of the IMU. Its orientation is relative to east, north, up
+    (REP 145).
+    """
+    topics = [one for one in bag.topics() if one.messages]
+    these = [one for one in topics if one.kind == IMU]
+    if len(these) != 1:
+        return None
+    child, link = "", Link("", these[0].name)
+    for _, raw in bag.messages(these[0].name):
+        message = bag.decode(raw, IMU)
+        child = _plain(message.header.frame_id)
+        if float(message.orientation_covariance[0]) != -1:
+            link.numbers.append((_seconds(message), 0.0, 0.0, 0.0, *_numbers(message.orientation)))
+    mount = _between(_transforms(bag, topics), _plain(frame_id), child)
+    if mount is None:
+        return None
+    found = _along([*mount, link], axes, time_s, link.topic).poses
+    return None if found is None else found[:, 3:]
+
+
+def _heights_in(bag: BagFile, time_s: Array) -> Array | None:
+    """Return heights over the ground ``(frames,)`` [m] by the only topic of an altimeter; nan where unknown, None without.
+
+    A topic is one of an altimeter where it holds ``sensor_msgs/Range`` and its name holds ``alti``.
+    """
+    these = [one for one in bag.topics() if one.messages and one.kind == RANGE and "alti" in one.name.lower()]
+    if len(these) != 1:
+        return None
+    numbers = []
+    for _, raw in bag.messages(these[0].name):
+        message = bag.decode(raw, RANGE)
+        numbers.append((_seconds(message), float(message.range)))
+    table = np.array(sorted(numbers), dtype=float)
+    after = np.clip(np.searchsorted(table[:, 0], time_s), 1, max(1, len(table) - 1))
+    ends = np.stack([table[after - 1], table[np.minimum(after, len(table) - 1)]])
+    near = np.abs(ends[:, :, 0] - time_s).min(axis=0) <= LARGEST_GAP_S / 2
+    table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0), 1] = np.nan
+    height = np.where(near, np.interp(time_s, table[:, 0], table[:, 1]), np.nan)
+    return height if np.isfinite(height).any() else None
+
+
+def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Motion:
+    """Return the poses along links from the sonar to the world."""
+    place, turn = np.zeros((len(times), 3)), Rotation.from_matrix(np.repeat(axes[None], len(times), axis=0))
+    for link in chain:
+        here = link.at(times)
+        if here is None:
+            return Motion(notes=(f"poses are not used: {link.topic} does not cover the times of all frames",))
+        place, turn = here[0] + here[1].apply(place), here[1] * turn
+    world = chain[-1].parent
+    if world.lower().endswith("ned"):
+        down = Rotation.from_matrix(CONVENTIONS["ned"].world)
+        place, turn = down.apply(place), down * turn
+    return Motion(poses_from(place, turn), origin=f"{source}, in the frame {world!r}")
+
+
+def _only(bag: BagFile, topics: Sequence[Topic]) -> tuple[tuple[str, Link] | None, tuple[str, ...]]:
+    """Return child frame and transforms of the only topic of odometry, or else of poses; or why there is none."""
+    for kinds, what in (((ODOMETRY,), "odometry"), (POSES, "poses")):
+        these = [one for one in topics if one.kind in kinds]
+        if len(these) > 1:
+            names = ", ".join(one.name for one in these)
+            return None, (f"poses are not used: the bag holds several topics of {what} ({names})",)
+        if these:
+            return _stamped(bag, these[0]), ()
+    return None, ()
+
+
+def _stamped(bag: BagFile, topic: Topic) -> tuple[str, Link]:
+    """Return the child frame and the transforms of a topic of odometry or poses."""
+    child, link = "", Link("", topic.name)
+    for _, raw in bag.messages(topic.name):
+        message = bag.decode(raw, topic.kind)
+        pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        link.parent = _plain(message.header.frame_id)
+        child = _plain(getattr(message, "child_frame_id", ""))
+        link.numbers.append((_seconds(message), *_numbers(pose.position), *_numbers(pose.orientation)))
+    return child, link
+
+
+def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
+    """Return the transforms of the bag by child frame."""
+    links: dict[str, Link] = {}
+    for topic in topics:
+        if topic.kind not in (TRANSFORMS, OLD_TRANSFORMS):
+            continue
+        fixed = topic.name.endswith("tf_static")
+        for _, raw in bag.messages(topic.name):
+            for one in bag.decode(raw, topic.kind).transforms:
+                child, parent = _plain(one.child_frame_id), _plain(one.header.frame_id)
+                link = links.setdefault(child, Link(parent, topic.name, fixed))
+                if link.parent == parent:
+                    where = one.transform
+                    link.numbers.append((_seconds(one), *_numbers(where.translation), *_numbers(where.rotation)))
+    return links
+
+
+def _chain(links: dict[str, Link], frame: str) -> list[Link]:
+    """Return the links from a frame upwards to its root; none where they go in a circle."""
+    chain: list[Link] = []
+    while frame in links:
+        chain.append(links[frame])
+        frame = links[frame].parent
+        if len(chain) > MOST_LINKS:
+            return []
+    return chain
+
+
+def _between(links: dict[str, Link], frame: str, wanted: str) -> list[Link] | None:
+    """Return the fixed links from a frame up to another one; None where they do not lead there."""
+    if frame == wanted:
+        return []
+    names = list(_parents(links, frame))
+    if wanted not in names:
+        return None
+    chain = _chain(links, frame)[: names.index(wanted) + 1]
+    return chain if all(link.fixed for link in chain) else None
+
+
+def _parents(links: dict[str, Link], frame: str) -> Iterator[str]:
+    """Yield the parents of a frame, the nearest first."""
+    for link in _chain(links, frame):
+        yield link.parent
+
+
+def _plain(name: object) -> str:
+    """Return the name of a frame without the slash with which ROS 1 may begin it."""
+    return str(name).lstrip("/")
+
+
+def _seconds(message: Message) -> float:
+    """Return the time in a message's header [s]."""
+    stamp = message.header.stamp
+    return float((int(stamp.sec) * 10**9 + int(stamp.nanosec)) / 10**9)
+
+
+def _numbers(vector: Message) -> tuple[float, ...]:
+    """Return x, y, z, and w where there is one."""
+    return tuple(float(getattr(vector, name)) for name in ("x", "y", "z", "w") if hasattr(vector, name))

@@ -1,0 +1,110 @@
+"""Small recordings as sonars write them, byte by byte: for tests of readers, and to be made hostile."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+
+from mitsonar.recordings.aris import FRAME
+from mitsonar.recordings.didson import FILE, FRAME_HEADER
+from mitsonar.recordings.oculus import LATER, OLDER
+
+Values = np.ndarray[Any, Any]
+
+
+def oculus_ping(
+    counts: Values,
+    *,
+    version: int = 0,
+    width: int = 1,
+    gains: Values | None = None,
+    bearings: Values | None = None,
+    **fields: Any,
+) -> bytes:
+    """A message with an image: counts ``(ranges, beams)`` of ``width`` bytes, a gain of each row where they are given."""
+    ranges, beams = counts.shape
+    kind = LATER if version >= 2 else OLDER
+    bearings = np.linspace(-3000, 3000, beams) if bearings is None else bearings
+    rows = counts.astype("<u4")[:, :, None].view("u1")[:, :, :width].reshape(ranges, beams * width)
+    if gains is not None:
+        rows = np.hstack([gains.astype("<u4")[:, None].view("u1"), rows])
+    angles, image = bearings.astype("<i2").tobytes(), rows.tobytes()
+    head = np.zeros(1, kind)
+    offset = kind.itemsize + len(angles) + 6  # a gap, as the sonar leaves one
+    told = {
+        "mode": 2, "gamma": 127, "flags": 0x09 | (0 if gains is None else 4), "gain_percent": 50.0, "number": 7,
+        "frequency": 2.1e6, "sound_speed": 1490.0, "resolution": 0.003, "ranges": ranges, "beams": beams,
+        "width": width - 1, "image": offset, "image_size": len(image), "size": offset + len(image),
+    }  # fmt: skip
+    for name, value in (told | fields).items():
+        head[name] = value
+    body = (head.tobytes()[16:] + angles).ljust(offset - 16, b"\0") + image
+    return struct.pack("<HHHHHIH", 0x4F53, 1, 0, 0x23, version, len(body), 0) + body
+
+
+def other_message(kind: int = 0x15, size: int = 20) -> bytes:
+    """A message without an image."""
+    return struct.pack("<HHHHHIH", 0x4F53, 1, 0, kind, 0, size, 0) + bytes(size)
+
+
+def oculus_log(messages: list[bytes], times: list[float], *, packed: bool, header: int = 48, item: int = 40) -> bytes:
+    """A log: its header, and an item with each message; with headers that are longer than needed where that is asked."""
+    made = struct.pack("<II16sHH4xqd", 0x11223344, header, b"Oculus", 1, 0, 0, times[0]).ljust(header, b"\0")
+    for message, time_s in zip(messages, times, strict=True):
+        body = struct.pack(">I", len(message)) + zlib.compress(message) if packed else message
+        head = struct.pack("<IIHH4xdH2xII", 0xAABBCCDD, item, 10, 0, time_s, int(packed), len(message), len(body))
+        made += head.ljust(item, b"\0") + body
+    return made
+
+
+def some_pings(count: int = 3, version: int = 0, **fields: Any) -> list[bytes]:
+    """Pings of 12 ranges and 8 beams, in rising numbers."""
+    rng = np.random.default_rng(5)
+    return [
+        oculus_ping(rng.integers(0, 256, (12, 8)), version=version, number=40 + one, **({"start": one / 4} | fields))
+        for one in range(count)
+    ]
+
+
+def aris_file(frames: int = 4, samples: int = 20, **changed: Any) -> bytes:
+    """An ARIS 3000 with 64 beams; fields of the headers may be changed ``(frames,)``."""
+    head = np.zeros(frames, FRAME)
+    head["index"], head["signature"] = np.arange(frames), b"DDF\x05"
+    head["time_us"] = 1_000_000 + 100_000 * np.arange(frames)
+    head["ping_mode"], head["samples"], head["system"], head["reordered"] = 6, samples, 1, 1
+    head["sample_period_us"], head["start_delay_us"], head["sound_speed"] = 10, 2000, 1500.0
+    for name, values in changed.items():
+        head[name] = values
+    body = np.random.default_rng(3).integers(0, 256, (frames, samples * 64), dtype=np.uint8)
+    pairs = zip(head, body, strict=True)
+    return b"DDF\x05".ljust(1024, b"\0") + b"".join(one.tobytes() + pixels.tobytes() for one, pixels in pairs)
+
+
+def didson_file(
+    images: Values, *, version: int = 3, header: int | None = None, file: dict[str, Any] | None = None, **changed: Any
+) -> bytes:
+    """A DIDSON file: images ``(frames, samples, beams)``; fields of the file's header, and of the frames' ``(frames,)``."""
+    frames, samples, beams = images.shape
+    mark = b"DDF" + bytes([version])
+    first = np.zeros(1, FILE)
+    told = {
+        "signature": mark, "frames": frames, "frame_rate_hz": 8, "high_frequency": int(beams == 96), "beams": beams,
+        "sample_rate_hz": samples * 1500 / (2 * 10.0), "samples": samples, "length_code": 3 if beams == 96 else 1,
+        "serial": 200,
+    }  # fmt: skip
+    for name, value in (told | (file or {})).items():
+        first[name] = value
+    head = np.zeros(frames, FRAME_HEADER[version])
+    told = {
+        "index": np.arange(frames), "signature": mark, "year": 2010, "month": 6, "day": 3, "hour": 23, "minute": 59,
+        "second": 58 + np.arange(frames) // 8, "hundredth": np.arange(frames) % 8 * 12, "start_code": 4,
+        "length_code": first["length_code"][0],
+    }  # fmt: skip
+    for name, value in (told | changed).items():
+        head[name] = value
+    size = header or {3: 512, 4: 1024}[version]
+    pairs = zip(head, images.astype(np.uint8), strict=True)
+    return first.tobytes().ljust(size, b"\0")[:size] + b"".join(one.tobytes() + image.tobytes() for one, image in pairs)

@@ -1,0 +1,196 @@
+"""Recordings that are damaged or made to harm: every reader gives frames that can be, or one sentence, and never ends.
+
+Another format is one more entry of :data:`RECORDINGS`.
+"""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile_readers import Reader, attack
+from mutations import Rng, changed_bytes, changed_text, outcome
+from recording_files import aris_file, didson_file, oculus_log, oculus_ping, some_pings
+
+from mitsonar import MitsonarError, open_recording
+
+USUAL, MANY = 200, 10_000
+"""Mutants of each format in the test that is always run, and in the slow one."""
+
+MEMORY_FLOOR, MEMORY_FACTOR = 4 * 2**20, 40
+"""What a reader may hold at a time: so many bytes, and so many times the size of the recording."""
+
+TEXT = (".csv", ".txt", ".yaml", ".yml", ".json", ".tum")
+"""Files that are spoilt by their words."""
+
+NUMBERS = [
+    *(struct.pack("<B", value) for value in (0, 1, 127, 128, 255)),
+    *(struct.pack("<H", value) for value in (0, 1, 32767, 65535)),
+    *(struct.pack("<I", value) for value in (0, 1, 2, 1000, 10**6, 2**31 - 1, 2**31, 2**32 - 1)),
+    *(struct.pack("<Q", value) for value in (0, 2**33, 2**63 - 1, 2**64 - 1)),
+    *(struct.pack("<f", value) for value in (np.nan, np.inf, -np.inf, -1.0, 1e30, 1e-30)),
+    *(struct.pack("<d", value) for value in (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e300, 1e-300)),
+]
+"""What may stand where a field of a header should."""
+
+IMAGES = np.random.default_rng(2).integers(0, 256, (4, 6, 48))
+
+RECORDINGS: dict[str, Callable[[Path], object]] = {
+    "aris": lambda folder: (folder / "a.aris").write_bytes(aris_file(samples=8)),
+    "oculus dump": lambda folder: (folder / "a.raw").write_bytes(b"".join(some_pings(4))),
+    "oculus dump, version 2, 16 bits and gains": lambda folder: (folder / "a.raw").write_bytes(_gained()),
+    "oculus log": lambda folder: (folder / "a.oculus").write_bytes(oculus_log(some_pings(3), [1, 2, 3], packed=False)),
+    "oculus log, packed": lambda folder: (folder / "a.oculus").write_bytes(
+        oculus_log(some_pings(3), [1, 2, 3], packed=True)
+    ),
+    "didson 3": lambda folder: (folder / "a.ddf").write_bytes(didson_file(IMAGES)),
+    "didson 4": lambda folder: (folder / "a.ddf").write_bytes(didson_file(IMAGES, version=4)),
+}
+"""What writes a small recording of each format into an empty folder: one file, or one folder of files."""
+
+
+def _gained() -> bytes:
+    rng = np.random.default_rng(1)
+    pings = [
+        oculus_ping(rng.integers(0, 65536, (9, 7)), version=2, width=2, gains=rng.integers(1, 999, 9), number=one, start=one)
+        for one in range(3)
+    ]
+    return b"".join(pings)
+
+
+def spoil(rng: Rng, folder: Path) -> None:
+    """Change one or two files of the recording: numbers in headers, bytes, words, length, or name."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    for _ in range(1 if rng.random() < 0.8 else 2):
+        path = paths[int(rng.integers(len(paths)))]
+        if not path.is_file():
+            continue
+        content, chance = path.read_bytes(), rng.random()
+        if chance < 0.02:
+            path.write_bytes(b"")
+        elif chance < 0.04:
+            path.write_bytes(content[: int(rng.integers(len(content) + 1))])
+        elif chance < 0.06:
+            path.rename(path.with_suffix(str(rng.choice([".aris", ".ddf", ".raw", ".npz", ".png", ".json", ""]))))
+        elif path.suffix in TEXT:
+            path.write_bytes(changed_text(rng, content))
+        elif chance < 0.6:
+            path.write_bytes(changed_numbers(rng, content))
+        else:
+            path.write_bytes(changed_bytes(rng, content))
+
+
+def changed_numbers(rng: Rng, content: bytes) -> bytes:
+    """Up to four fields replaced by strange numbers, half of them near the begin, where headers are."""
+    made = bytearray(content)
+    for _ in range(int(rng.integers(1, 5))):
+        place = int(rng.integers(min(len(made), 1600) if rng.random() < 0.5 else len(made))) if made else 0
+        value = NUMBERS[int(rng.integers(len(NUMBERS)))]
+        made[place : place + len(value)] = value
+    return bytes(made)
+
+
+def read(folder: Path) -> None:
+    """Read all frames of the recording in a folder, and check that they can be."""
+    path = next(iter(sorted(folder.iterdir())))
+    size = sum(one.stat().st_size for one in [path, *path.rglob("*")] if one.is_file())
+    tracemalloc.start()
+    try:
+        _read(path)
+    except MitsonarError as error:
+        said = str(error)
+        assert "\n" not in said, f"a refusal is not one line: {said[:300]}"
+        assert len(said) < 700, f"a refusal is {len(said)} letters long: {said[:300]}"
+        raise
+    finally:
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert most < MEMORY_FLOOR + MEMORY_FACTOR * size, f"{most:,} bytes of memory for {size:,} of a recording"
+
+
+def _read(path: Path) -> None:
+    recording = open_recording(path)
+    assert all("\n" not in note for note in recording.notes)
+    for part in recording.parts:
+        assert (np.diff(part.time_s) > 0).all()
+        assert np.isfinite(part.time_s).all()
+        for axis in (part.like.range_m, part.like.bearing_rad):
+            assert np.isfinite(axis).all()
+            assert (np.diff(axis) > 0).all()
+        for frames in part.chunks():
+            assert frames.image.dtype in (np.uint8, np.float32)
+            if frames.image.dtype != np.uint8:
+                assert np.isfinite(frames.image).all()
+                assert frames.image.min() >= 0
+                assert frames.image.max() <= 1
+            assert np.isfinite(frames.to_linear().image).all()
+            assert frames.poses is None or np.isfinite(frames.poses).all()
+
+
+READERS = {name: Reader(lambda folder, write=write: write(folder), spoil, read) for name, write in RECORDINGS.items()}  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    found = attack(name, tmp_path, USUAL, readers=READERS)
+    assert found["read"] + found["refused"] == USUAL
+    assert min(found.values()) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_ten_thousand_mutants(name: str, tmp_path: Path) -> None:
+    found = attack(name, tmp_path, MANY, first=USUAL, readers=READERS)
+    print(f"\n{name}: {found['read']:,} read, {found['refused']:,} refused")
+    assert min(found.values()) > 0
+
+
+def test_nothing_but_zeros_behind_each_signature(tmp_path: Path) -> None:
+    """Also of a length that is no multiple of anything."""
+    for first in (b"DDF\x05", b"DDF\x04", b"DDF\x03", b"SO", b"\x44\x33\x22\x11"):
+        for length in (16, 17, 511, 512, 1023, 1024, 2047, 2048, 5000):
+            (tmp_path / "a").write_bytes(first.ljust(length, b"\0"))
+            assert outcome(lambda: open_recording(tmp_path / "a")) == "refused"
+
+
+def test_a_log_that_unpacks_to_more_than_it_says_is_refused(tmp_path: Path) -> None:
+    """100 MiB of zeros behind a good header, packed a thousandfold: what the header does not say is never made."""
+    ping = some_pings(1)[0]
+    log = oculus_log([ping], [1.0], packed=True)
+    head = log[: len(log) - len(zlib.compress(ping))]
+    (tmp_path / "a.oculus").write_bytes(_longer(head, zlib.compress(ping + bytes(100 * 2**20), 9)))
+    tracemalloc.start()
+    frames = open_recording(tmp_path / "a.oculus").part().read([0])
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert frames.image.shape == (1, 12, 8)
+    assert most < MEMORY_FLOOR
+
+
+def test_a_log_that_says_that_it_unpacks_to_much_is_left_out(tmp_path: Path) -> None:
+    ping = some_pings(1)[0]
+    packed = zlib.compress(ping + bytes(200 * 2**20), 9)
+    head = bytearray(oculus_log([ping], [1.0], packed=True)[: 48 + 40 + 4])
+    head[48 + 28 : 48 + 32] = struct.pack("<I", len(ping) + 200 * 2**20)
+    head[-4:] = struct.pack(">I", len(ping) + 200 * 2**20)
+    (tmp_path / "a.oculus").write_bytes(_longer(bytes(head), packed))
+    with pytest.raises(MitsonarError, match="holds no ping"):
+        open_recording(tmp_path / "a.oculus")
+
+
+def _longer(head: bytes, packed: bytes) -> bytes:
+    """A log of one item with other packed bytes."""
+    made = bytearray(head + packed)
+    made[48 + 32 : 48 + 36] = struct.pack("<I", 4 + len(packed))
+    return bytes(made)
+
+
+def test_many_marks_of_messages_do_not_take_long(tmp_path: Path) -> None:
+    """Two million marks, none of which begins a message, behind a good ping."""
+    (tmp_path / "a.raw").write_bytes(some_pings(1)[0] + b"SO" * 2_000_000)
+    assert outcome(lambda: len(open_recording(tmp_path / "a.raw"))) == "read"

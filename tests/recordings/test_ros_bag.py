@@ -1,0 +1,384 @@
+"""ROS bags: pings of ROS 1, SQLite and MCAP, order and types of samples, poses, topics, damaged files."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bags import Maker, Sent, write_bag
+from mutations import changed_bytes, outcome
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from mitsonar import MitsonarError, open_recording
+from mitsonar.mapping.open_frames import open_frames
+from mitsonar.motion.conventions import CONVENTIONS
+from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.recordings.ros_messages import OCULUS, PROJECTED, ros1_types
+
+pytest.importorskip("rosbags")
+
+BEARING = np.radians(np.linspace(-30, 28, 24)) + 0.01 * np.sin(np.arange(24))
+RANGE: NDArray[np.float64] = 1.0 + 0.05 * np.arange(40, dtype=np.float64)
+TIME = 1_700_000_000 + np.array([0.1, 0.35, 0.5, 0.7, 1.0, 1.1])
+KINDS = ["one.bag", "two", "three_mcap"]
+"""A bag of ROS 1, one of ROS 2 in SQLite, one of ROS 2 in MCAP."""
+
+
+def smooth(count: int = len(TIME), kind: type[np.generic] = np.uint8) -> NDArray[Any]:
+    """Images whose neighbours resemble each other, as those of a sonar do ``(count, bins, beams)``."""
+    noise = np.random.default_rng(5).normal(size=(count, len(RANGE), len(BEARING)))
+    drawn = ndimage.gaussian_filter(noise, (0, 1.5, 1.5))
+    level = (drawn - drawn.min()) / np.ptp(drawn)
+    letters = np.dtype(kind)
+    return np.asarray(level if letters.kind == "f" else level * np.iinfo(letters.name).max, dtype=letters)
+
+
+def pings(maker: Maker, images: NDArray[Any], topic: str = "/sonar", **options: Any) -> list[Sent]:
+    bearing, distance = options.pop("bearing_rad", BEARING), options.pop("range_m", RANGE)
+    return [
+        (topic, time + 0.02, maker.ping(image, time, bearing, distance, **options))
+        for time, image in zip(TIME, images, strict=True)
+    ]
+
+
+def bag(path: Path, *more: Sent, images: NDArray[Any] | None = None, **options: Any) -> Path:
+    maker = Maker(path.suffix == ".bag")
+    return write_bag(path, maker, [*pings(maker, smooth() if images is None else images, **options), *more])
+
+
+def test_definitions_are_the_published_ones() -> None:
+    sums = {
+        PROJECTED[0]: "c72fc8e29ab227a547720a36666022fd",
+        OCULUS[0]: "9f6ad8a7bb36e92c4f0225b11da7ca2e",
+        "sonar_oculus/msg/OculusFire": "0ab4b9458f99dac20a81bfd379cffcb5",
+    }
+    assert {name: ros1_types().generate_msgdef(name)[1] for name in sums} == sums
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("beam_major", [False, True])
+def test_pings_are_read_as_they_were_sent(tmp_path: Path, name: str, beam_major: bool) -> None:
+    images = smooth()
+    recording = open_recording(bag(tmp_path / name, images=images, beam_major=beam_major))
+    assert (len(recording), len(recording.parts)) == (6, 1)
+    assert any("order of beams" in note for note in recording.notes) == beam_major
+    frames = recording.part().read([0, 3, 5, 1])
+    assert frames.image.dtype == np.uint8
+    assert (frames.image == images[[0, 3, 5, 1]]).all()
+    assert frames.time_s == pytest.approx(TIME[[0, 3, 5, 1]], abs=1e-6)
+    assert frames.bearing_rad == pytest.approx(BEARING, abs=1e-15)
+    assert frames.range_m == pytest.approx(RANGE, rel=1e-6)
+    assert frames.sonar.sound_speed == 1480
+    assert frames.sonar.elevation_fov_deg == pytest.approx(np.degrees(0.35), rel=1e-6)
+    assert frames.sonar.range_min == pytest.approx(0.975, abs=1e-6)
+    assert recording.facts["received_after_s"] == pytest.approx([0.02, 0.02], abs=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["u2", "u4", "i2", "f4", "f8"])
+@pytest.mark.parametrize("big", [False, True])
+def test_samples_of_any_type_become_levels(tmp_path: Path, kind: str, big: bool) -> None:
+    images = smooth(kind=np.dtype(kind).type)
+    frames = open_recording(bag(tmp_path / "two", images=images, big=big)).part().read(np.arange(6))
+    assert frames.image.dtype == np.float32
+    most = 1.0 if kind[0] == "f" else np.iinfo(kind).max
+    assert frames.image == pytest.approx(images / most, abs=1e-6)
+
+
+def test_floats_beyond_1_are_divided_by_the_greatest_and_decibels_are_refused(tmp_path: Path) -> None:
+    images = smooth(kind=np.float32) * np.float32(7)
+    images[2, 3, 4] = np.nan
+    recording = open_recording(bag(tmp_path / "two", images=images))
+    assert any("floats up to 7" in note for note in recording.notes)
+    assert any("nan" in note for note in recording.notes)
+    read = recording.part().read([2]).image[0]
+    assert read[3, 4] == 0
+    assert read[0] == pytest.approx(images[2, 0] / 7, rel=1e-6)
+    with pytest.raises(MitsonarError, match="holds floats from -20"):
+        open_recording(bag(tmp_path / "dB", images=images - np.float32(20)))
+
+
+@pytest.mark.parametrize("forward", ["x", "z"])
+def test_beams_are_sorted_from_port_to_starboard_in_either_frame(tmp_path: Path, forward: str) -> None:
+    images = smooth()
+    path = bag(tmp_path / "two", images=images[:, :, ::-1], bearing_rad=BEARING[::-1], forward=forward)
+    frames = open_recording(path).part().read([1])
+    assert frames.bearing_rad == pytest.approx(BEARING, abs=1e-15)
+    assert (frames.image[0] == images[1]).all()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_pings_of_an_oculus(tmp_path: Path, name: str) -> None:
+    maker, images = Maker(name.endswith(".bag")), smooth()
+    centidegrees = np.linspace(-6500, 6500, len(BEARING)).astype(np.int16)
+    sent = [("/ping", time, maker.oculus(one, time, centidegrees, 0.02)) for time, one in zip(TIME, images, strict=True)]
+    recording = open_recording(write_bag(tmp_path / name, maker, sent))
+    frames = recording.part().read(np.arange(6))
+    assert (frames.image == images).all()
+    assert np.degrees(frames.bearing_rad) == pytest.approx(centidegrees / 100)
+    assert frames.range_m[:2] == pytest.approx([0.01, 0.03])
+    assert frames.sonar.sound_speed == 1490
+    assert frames.sonar.coding_gamma == pytest.approx(127 / 255)
+    assert "opening over elevation" in " ".join(recording.notes)
+
+
+def test_a_window_that_changes_makes_parts_and_drifts_of_the_sound_speed_none(tmp_path: Path) -> None:
+    maker, images = Maker(False), smooth()
+    windows = [RANGE, RANGE * 1.0005, RANGE * 1.001, RANGE + 2, RANGE + 2, RANGE]
+    sent = [
+        ("/sonar", time, maker.ping(image, time, BEARING, window))
+        for time, image, window in zip(TIME, images, windows, strict=True)
+    ]
+    recording = open_recording(write_bag(tmp_path / "two", maker, sent))
+    assert [len(part) for part in recording.parts] == [3, 2, 1]
+    assert recording.parts[1].like.range_m == pytest.approx(RANGE + 2, rel=1e-6)
+    assert (recording.parts[1].read([0, 1]).image == images[3:5]).all()
+
+
+def test_without_times_in_the_headers_those_of_reception_count(tmp_path: Path) -> None:
+    maker = Maker(True)
+    sent = [("/sonar", time, maker.ping(one, 0.0, BEARING, RANGE)) for time, one in zip(TIME, smooth(), strict=True)]
+    recording = open_recording(write_bag(tmp_path / "a.bag", maker, sent))
+    assert recording.part().time_s == pytest.approx(TIME, abs=1e-6)
+    assert any("hold no times" in note for note in recording.notes)
+
+
+def test_messages_of_one_time_of_reception_are_told_apart(tmp_path: Path) -> None:
+    maker, images = Maker(False), smooth()
+    sent = [("/sonar", 1.0, maker.ping(one, time, BEARING, RANGE)) for time, one in zip(TIME, images, strict=True)]
+    frames = open_recording(write_bag(tmp_path / "two", maker, sent)).part().read([4, 2])
+    assert (frames.image == images[[4, 2]]).all()
+
+
+def test_a_reader_can_be_sent_to_another_process(tmp_path: Path) -> None:
+    source = open_frames(bag(tmp_path / "a.bag"))
+    again = pickle.loads(pickle.dumps(source.images))
+    assert (again(np.array([2])) == source.images(np.array([2]))).all()
+
+
+# ---------------------------------------------------------------- topics
+
+
+def test_of_several_sonars_one_is_chosen(tmp_path: Path) -> None:
+    maker = Maker(False)
+    path = write_bag(tmp_path / "two", maker, [*pings(maker, smooth()), *pings(maker, 255 - smooth(), "/other")])
+    with pytest.raises(MitsonarError, match=r"several sonars: choose one of the topics /other, /sonar"):
+        open_recording(path)
+    assert (open_recording(path, topic="/other").part().read([0]).image == 255 - smooth()[:1]).all()
+    assert (open_frames(path, view="/sonar").read([0]).image == smooth()[:1]).all()
+    with pytest.raises(MitsonarError, match=r"no topic '/sonr': did you mean /sonar"):
+        open_recording(path, topic="/sonr")
+
+
+def test_bags_without_a_sonar_say_what_they_hold(tmp_path: Path) -> None:
+    maker = Maker(True)
+    path = write_bag(tmp_path / "a.bag", maker, [("/odom", 1.0, maker.odometry(1.0, [0, 0, 0], [0, 0, 0, 1], "base"))])
+    with pytest.raises(
+        MitsonarError,
+        match=r"holds no messages marine_acoustic_msgs/ProjectedSonarImage or .*: its topics are /odom \(nav_msgs/O",
+    ):
+        open_recording(path)
+    with pytest.raises(MitsonarError, match=r"/odom holds 1 messages nav_msgs/Odometry; a sonar's are"):
+        open_recording(path, topic="/odom")
+
+
+# ---------------------------------------------------------------- poses
+
+
+def flown() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses of a vehicle at every 50 ms in mitsonar's convention, and their times."""
+    time = TIME[0] + np.arange(-2, 24) * 0.05
+    t = time - TIME[0]
+    return np.column_stack([0.3 * t, 0.5 * t, 2 + 0.1 * t, 0.02 * t, 0.01 * t, 0.4 + 0.3 * t]), time
+
+
+MOUNT = Rotation.from_euler("y", 30, degrees=True)
+"""Of the sonar on the vehicle in forward, left, up: 30 deg down."""
+
+
+def expected(frame: str) -> NDArray[np.float64]:
+    """Poses of the sonar at the times of the frames by the angles alone: pitch adds up on a level vehicle."""
+    t = TIME - TIME[0]
+    pitch = np.radians(30) if frame else 0
+    return np.column_stack([0.3 * t, 0.5 * t, 2 + 0.1 * t, 0.02 * t + pitch, 0 * t, 0.4 + 0.3 * t])
+
+
+def in_ros(poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    place, turn = CONVENTIONS["ros-enu"].from_ours(poses[:, :3], vehicle_rotation(poses))
+    return place, turn.as_quat()
+
+
+def to_message_axes(mount: Rotation) -> NDArray[np.float64]:
+    """Rotation of (down, left, forward) in the vehicle's axes."""
+    return np.asarray((mount * Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])).as_quat())
+
+
+@pytest.mark.parametrize("source", ["tf", "odometry"])
+@pytest.mark.parametrize("name", KINDS[:2])
+def test_poses_are_those_of_transforms_or_odometry_with_the_mount(tmp_path: Path, source: str, name: str) -> None:
+    maker = Maker(name.endswith(".bag"))
+    poses, times = flown()
+    poses[:, 4] = 0
+    place, quaternion = in_ros(poses)
+    sent = [("/tf_static", TIME[0], maker.transform(0.0, "base_link", "sonar", [0, 0, 0], to_message_axes(MOUNT)))]
+    for time, where, turn in zip(times, place, quaternion, strict=True):
+        if source == "tf":
+            sent.append(("/tf", time, maker.transform(time, "odom", "base_link", where, turn)))
+        else:
+            sent.append(("/odom", time, maker.odometry(time, where, turn, "base_link")))
+    recording = open_recording(write_bag(tmp_path / name, maker, [*pings(maker, smooth()), *sent]))
+    assert recording.part().poses == pytest.approx(expected("mount"), abs=1e-4)
+    assert recording.facts["poses"].endswith("in the frame 'odom'")
+    assert open_frames(tmp_path / name).true is not None
+
+
+def test_poses_without_a_mount_count_as_the_sonars_and_a_note_says_so(tmp_path: Path) -> None:
+    maker = Maker(False)
+    poses, times = flown()
+    poses[:, 4] = 0
+    sent = [("/pose", time, maker.pose_stamped(time, *one)) for time, *one in zip(times, *in_ros(poses), strict=True)]
+    path = write_bag(tmp_path / "two", maker, [*pings(maker, smooth(), forward="x"), *sent])
+    recording = open_recording(path)
+    assert recording.part().poses == pytest.approx(expected(""), abs=1e-4)
+    assert any("count as those of the sonar" in note for note in recording.notes)
+
+
+def test_a_world_of_north_east_down_is_turned(tmp_path: Path) -> None:
+    maker = Maker(False)
+    poses, times = flown()
+    poses[:, 4] = 0
+    turn = vehicle_rotation(poses)
+    down = Rotation.from_matrix(CONVENTIONS["ned"].world)
+    body = Rotation.from_matrix(CONVENTIONS["ros-enu"].body)
+    place, quaternion = down.inv().apply(poses[:, :3]), (down.inv() * turn * body.inv()).as_quat()
+    sent = [
+        ("/odom", time, maker.odometry(time, where, one, "sonar", "world_ned"))
+        for time, where, one in zip(times, place, quaternion, strict=True)
+    ]
+    path = write_bag(tmp_path / "two", maker, [*pings(maker, smooth(), forward="x"), *sent])
+    assert open_recording(path).part().poses == pytest.approx(expected(""), abs=1e-4)
+
+
+def test_ambiguous_or_short_poses_are_not_used(tmp_path: Path) -> None:
+    maker = Maker(False)
+    level = [0, 0, 0, 1]
+    two = [(topic, time, maker.odometry(time, [0, 0, 0], level, "sonar")) for topic in ("/a", "/b") for time in TIME]
+    recording = open_recording(write_bag(tmp_path / "two", maker, [*pings(maker, smooth()), *two]))
+    assert recording.part().poses is None
+    assert any("several topics of odometry (/a, /b)" in note for note in recording.notes)
+    short = [("/a", time, maker.odometry(time, [0, 0, 0], level, "sonar")) for time in TIME[:3]]
+    recording = open_recording(write_bag(tmp_path / "short", maker, [*pings(maker, smooth()), *short]))
+    assert recording.part().poses is None
+    assert any("does not cover" in note for note in recording.notes)
+
+
+# ---------------------------------------------------------------- damage
+
+
+@pytest.mark.parametrize("name", ["one.bag", "three_mcap", "two"])
+def test_cut_bags_are_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
+    path = bag(tmp_path / name)
+    file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
+    content = file.read_bytes()
+    for end in (0.9, 0.5, 0.1):
+        file.write_bytes(content[: int(len(content) * end)])
+        with pytest.raises(MitsonarError, match=r"cannot read the bag .*: .*damaged|is no recording"):
+            open_recording(path).part().read(np.arange(6))
+
+
+@pytest.mark.parametrize("name", ["one.bag", "three_mcap", "two"])
+def test_mutants_are_read_or_refused(tmp_path: Path, name: str) -> None:
+    path = bag(tmp_path / name)
+    file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
+    content, found = file.read_bytes(), {"read": 0, "refused": 0}
+
+    def read() -> None:
+        recording = open_recording(path)
+        for part in recording.parts:
+            for frames in part.chunks():
+                assert np.isfinite(frames.image).all()
+
+    for seed in range(60):
+        file.write_bytes(changed_bytes(np.random.default_rng(seed), content))
+        found[outcome(read)] += 1
+    assert found["refused"] > 0
+
+
+def test_a_wrong_name_is_said(tmp_path: Path) -> None:
+    path = bag(tmp_path / "a.bag")
+    path.rename(tmp_path / "a.orig")
+    with pytest.raises(MitsonarError, match=r"must end with \.bag: rename it"):
+        open_recording(tmp_path / "a.orig")
+
+
+# ---------------------------------------------------------------- pictures
+
+POLAR = """
+layout: polar
+range_min: 1
+range_max: 3
+azimuth_fov_deg: 58
+level: dB
+"""
+
+
+def pictures(maker: Maker, images: NDArray[np.uint8], compressed: bool, encoding: str = "mono8") -> list[Sent]:
+    sent: list[Sent] = []
+    for time, image in zip(TIME, images, strict=True):
+        header, (rows, columns) = maker.header(time), image.shape
+        if compressed:
+            buffer = io.BytesIO()
+            Image.fromarray(image).save(buffer, format="PNG")
+            data = np.frombuffer(buffer.getvalue(), np.uint8)
+            fields: dict[str, Any] = {"header": header, "format": "png", "data": data}
+            sent.append(("/fan", time, maker.make("sensor_msgs/CompressedImage", **fields)))
+        else:
+            values = image if encoding == "mono8" else np.repeat(image[:, :, None], 3, axis=2)
+            step = columns * values.size // image.size
+            fields = {
+                "header": header,
+                "height": rows,
+                "width": columns,
+                "encoding": encoding,
+                "is_bigendian": 0,
+                "step": step,
+            }
+            sent.append(("/fan", time, maker.make("sensor_msgs/Image", **fields, data=values.ravel())))
+    return sent
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(("compressed", "encoding"), [(True, ""), (False, "mono8"), (False, "bgr8")])
+def test_pictures_with_a_geometry_are_a_recording(tmp_path: Path, name: str, compressed: bool, encoding: str) -> None:
+    maker, images = Maker(name.endswith(".bag")), smooth()
+    (tmp_path / "polar.yaml").write_text(POLAR)
+    path = write_bag(tmp_path / name, maker, [*pictures(maker, images, compressed, encoding), *pings(maker, images)])
+    recording = open_recording(path, tmp_path / "polar.yaml")
+    assert recording.facts["topic"] == "/fan"
+    frames = recording.part().read([0, 4, 2])
+    assert (frames.image == images[[0, 4, 2]]).all()
+    assert frames.time_s == pytest.approx(TIME[[0, 4, 2]], abs=1e-6)
+    assert frames.level == "dB"
+    assert (frames.sonar.range_min, frames.sonar.range_max) == (1, 3)
+    assert open_recording(path).facts["topic"] == "/sonar"
+    assert open_recording(path, tmp_path / "polar.yaml", "/fan").facts["topic"] == "/fan"
+
+
+def test_pictures_without_a_geometry_ask_for_one(tmp_path: Path) -> None:
+    maker = Maker(False)
+    path = write_bag(tmp_path / "two", maker, pictures(maker, smooth(), True))
+    with pytest.raises(MitsonarError, match=r"its topics are /fan .*; pictures need a geometry file"):
+        open_recording(path)
+    with pytest.raises(MitsonarError, match="give a geometry file"):
+        open_recording(path, topic="/fan")
+
+
+def test_a_geometry_is_refused_for_a_sonar(tmp_path: Path) -> None:
+    with pytest.raises(MitsonarError, match="tells its geometry itself"):
+        open_recording(bag(tmp_path / "two"), "geometry.yaml", "/sonar")
