@@ -88,29 +88,39 @@ def main() -> None:
 
 def simulate(stage: Stage, fit: SonarFit, frames: int, folder: Path) -> SonarFrames:
     """Return as many frames of a stage, with the fitted sonar, after the recording's way."""
-    nu = fit.sonar.speckle_nu if stage.patchy else None
-    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu)
-    quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0, volume_db=None)
     ensure_variant()
     poses = stage.start + np.arange(frames)[:, None] * stage.step
+    poses[:, :3] += np.random.default_rng(SEED).normal(0, stage.sway_m, (frames, 3))
+    nu = fit.sonar.speckle_nu if stage.patchy else None
+    sonar = fit.sonar.replace(**stage.sonar, speckle_nu=nu)
     with tempfile.TemporaryDirectory() as made:
         scene = stage.build(Path(made))
+        if sonar.volume_db is not None and sonar.noise_level_db is not None:
+            scale_db = (sonar.volume_db if stage.volume_db is None else stage.volume_db) - sonar.volume_db
+            sonar = sonar.replace(volume_db=sonar.volume_db + scale_db, noise_level_db=sonar.noise_level_db + scale_db)
+            full_db = fit.full_scale_db + scale_db - sonar.source_level_db
+            return recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses, full_db, stage, folder)
+        quiet = sonar.replace(noise_level_db=None, near_glow_db=0.0)
         silent = Simulator(scene, quiet, mirrors=stage.mirrors)
         bright = np.percentile(next(iter(silent.pings(poses[:1]))).levels[:, statistics.GLOW_BINS :], 99.9)
         assert silent.coherent is not None
-        gain = float(10 ** (fit.bright_db / 10) / bright)
-        if fit.noise_db is not None and sonar.volume_db is None:
-            middle = silent.coherent.gain[sonar.range_bins // 2]
-            level = 10 * math.log10(bright / middle) + fit.noise_db - fit.bright_db + sonar.source_level_db
-            sonar = sonar.replace(noise_level_db=level)
-        elif sonar.volume_db is not None:
-            gain = 10 ** ((sonar.source_level_db - fit.full_scale_db) / 10)
-        made_frames = Simulator(scene, sonar, mirrors=stage.mirrors).render(poses, gain=gain)
-    image = np.rint(made_frames.image * 255).astype(np.float32) / 255
-    if stage.pictures:
-        image = as_recorded(image, folder, stage.pictures, stage.video)
-    made_frames.image = image
+        middle_db = 10 * math.log10(silent.coherent.gain[sonar.range_bins // 2])
+        full_db = 10 * math.log10(bright) - fit.bright_db
+        for few in (2, frames):  # pictures dim glints of single cells: full scale moves by what is missing
+            if fit.noise_db is not None:
+                level = full_db - middle_db + fit.noise_db + sonar.source_level_db
+                sonar = sonar.replace(noise_level_db=level)
+            made_frames = recorded(Simulator(scene, sonar, mirrors=stage.mirrors), poses[:few], full_db, stage, folder)
+            full_db += np.percentile(levels(made_frames)[:, statistics.GLOW_BINS :], 99.9) - fit.bright_db
     return made_frames
+
+
+def recorded(simulator: Simulator, poses: NDArray[np.float64], full_db: float, stage: Stage, folder: Path) -> SonarFrames:
+    """Return frames whose full scale stands for a level [dB], in 8 bit, after the recording's way."""
+    frames = simulator.render(poses, gain=float(10 ** (-full_db / 10)))
+    image = np.rint(frames.image * 255).astype(np.float32) / 255
+    frames.image = as_recorded(image, folder, stage.pictures, stage.video) if stage.pictures else image
+    return frames
 
 
 # ---------------------------------------------------------------- table

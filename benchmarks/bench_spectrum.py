@@ -32,7 +32,8 @@ from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.store import DataStore
 from mitsonar.datasets.torch_pairs import SonarPairs
-from mitsonar.estimation.crlb.image_crlb import bound, overall
+from mitsonar.estimation.crlb.fisher_bound import overall
+from mitsonar.estimation.crlb.image_crlb import bound
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.motion_errors import in_units

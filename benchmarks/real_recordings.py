@@ -129,7 +129,11 @@ def aris1200(folder: Path) -> SonarFrames:
 
 
 def oculus(folder: Path) -> SonarFrames:
-    """Return three raw pings of a resting Oculus at 2.1 MHz, amplitude^0.5. BSD-3-Clause, University of Washington."""
+    """Return three raw pings of a resting Oculus at 2.1 MHz, amplitude^0.5. BSD-3-Clause, University of Washington.
+
+    Of the gain: what is new in every ping, so noise, is 34 dB stronger at 1.85 m than at 0.18 m. R^3 and absorption undone
+    (1.14 dB/m) make 34.1 dB.
+    """
     data = (folder / "oculus-m1200d-three-pings" / "three_pings_8bit.raw").read_bytes()
     images, at = [], 0
     while at < len(data):
@@ -140,8 +144,8 @@ def oculus(folder: Path) -> SonarFrames:
         images.append(np.frombuffer(data, np.uint8, bins * beams, at + begin).reshape(bins, beams))
         at += 16 + payload
     sonar = preset("oculus-m1200d-2100khz").replace(
-        **PLAIN, frequency_hz=2.1e6, beams=beams, range_min=0.0, range_max=bins * step, range_bins=bins,
-        sound_speed=1490.66, gain_exponent=2, coding="gamma", coding_gamma=0.5,
+        **PLAIN | {"gain_absorption": True, "absorption_db_per_m": 1.14}, frequency_hz=2.1e6, beams=beams, range_min=0.0,
+        range_max=bins * step, range_bins=bins, sound_speed=1490.66, gain_exponent=3, coding="gamma", coding_gamma=0.5,
     )  # fmt: skip
     return _frames(np.stack(images).astype(np.float32) / 255, sonar, 1 / 40, "gamma")
 

@@ -33,6 +33,8 @@ class Stage:
         video: whether these pass through MPEG-4.
         patchy: whether the ground is of patches, by the fitted ``speckle_nu``. Elsewhere that number is of objects.
         mirrors: reflection coefficient and rms height [m] of smooth shapes.
+        sway_m: standard deviation of the sonar's place from ping to ping, along each axis [m].
+        volume_db: strength of the water [dB re 1/m] where the fit has no scale: noise, volume and full scale move to it.
     """
 
     build: Callable[[Path], mi.Scene]
@@ -43,6 +45,8 @@ class Stage:
     video: bool = False
     patchy: bool = False
     mirrors: dict[str, tuple[float, float]] = field(default_factory=dict)
+    volume_db: float | None = None
+    sway_m: float = 0.0
 
 
 def pose(height: float, pitch_deg: float, y: float = 0.0, x: float = 0.0, heading_deg: float = 0.0) -> NDArray[np.float64]:
@@ -51,6 +55,10 @@ def pose(height: float, pitch_deg: float, y: float = 0.0, x: float = 0.0, headin
 
 
 STILL = np.zeros(6)
+
+RIVER_SWAY_M = 1.3e-3
+"""How far sonars in a river sway from ping to ping, along each axis [m]. Of the mounts nothing is known. The bright ground
+of lamprey2 gave this number, lamprey4 follows."""
 
 
 Shape = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -109,7 +117,11 @@ def stones(
     return merged(made)
 
 
-def loaded(parts: dict[str, tuple[trimesh.Trimesh, float]], folder: Path, **others: dict[str, Any]) -> mi.Scene:
+Paint = float | dict[str, Any]
+"""A reflectivity, or Mitsuba's dictionary of a texture."""
+
+
+def loaded(parts: dict[str, tuple[trimesh.Trimesh, Paint]], folder: Path, **others: dict[str, Any]) -> mi.Scene:
     """Load meshes with their reflectivities, and other shapes."""
     import mitsuba as mi
 
@@ -118,46 +130,100 @@ def loaded(parts: dict[str, tuple[trimesh.Trimesh, float]], folder: Path, **othe
     return scene
 
 
+def patches(low: float, high: float, size: float, seed: int) -> dict[str, Any]:
+    """Return a reflectivity that varies in patches of several sizes, the largest of ``size`` [m]."""
+    where = {"coordinates": "position", "cell_size": size, "octaves": 5, "contrast": 3.0, "seed": seed}
+    return {"type": "perlin", **where, "low": low, "high": high}
+
+
+def parted(body: trimesh.Trimesh, outside: Shape, soft: float = 0.0) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """Part ground into its faces where ``outside`` is negative, and the others; they mix over a width of ``soft`` [m]."""
+    middle = body.vertices[body.faces].mean(axis=1)
+    mixed = soft * np.random.default_rng(len(middle)).logistic(size=len(middle))
+    beyond = outside(middle[:, 0], middle[:, 1]) + mixed > 0
+    both = (trimesh.Trimesh(body.vertices, body.faces[part], process=False) for part in (~beyond, beyond))
+    for one in (kept := list(both)):
+        one.remove_unreferenced_vertices()
+    return kept[0], kept[1]
+
+
+def rough(body: trimesh.Trimesh, rms: float, longest: float, edge: float, seed: int) -> trimesh.Trimesh:
+    """Give a body relief: its surface moves along its normals by a sum of waves of random directions.
+
+    Args:
+        body: closed.
+        rms: of the relief [m].
+        longest: largest wavelength, the smallest is a fifth of it [m].
+        edge: largest edge of the faces afterwards [m].
+        seed: of the waves.
+    """
+    vertices, faces = trimesh.remesh.subdivide_to_size(body.vertices, body.faces, edge, max_iter=12)
+    body = trimesh.Trimesh(vertices, faces)
+    body.merge_vertices()
+    rng = np.random.default_rng(seed)
+    way = rng.normal(size=(48, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    wave = 2 * math.pi / (longest * 5 ** -rng.random(48))
+    height = np.cos(body.vertices @ (way * wave[:, None]).T + rng.uniform(0, 2 * math.pi, 48)).sum(axis=1)
+    moved = body.vertices + body.vertex_normals * (height / math.sqrt(24) * rms)[:, None]
+    return trimesh.Trimesh(moved, body.faces, process=False)
+
+
 def river_bed(folder: Path) -> mi.Scene:
-    """Make a gravel bed that falls off to the left, with a pit."""
+    """Make a gravel bed with a pit between two banks of mud, and stones with rims and shadows."""
+
+    def outside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return beside(x - 0.05 * (y - 3), y, 0.75, 0.1, 11)
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        pit = np.hypot((x + 0.05) / 0.4, (y - 3.3) / 0.45)
+        pit = np.hypot((x + 0.05) / 0.4, (y - 3.8) / 0.6)
         rim = 0.1 * np.exp(-(((pit - 1.1) / 0.35) ** 2)) - 0.16 * np.exp(-((pit / 0.8) ** 4))
-        strip = beside(x - 0.05 * (y - 3), y, 0.9, 0.1, 11)
-        return np.asarray(0.6 * rim - 4.0 / (1 + np.exp(-strip * 9)) - 0.02 * (y - 3))
+        return np.asarray(0.6 * rim - 0.5 / (1 + np.exp(-outside(x, y) * 9)) - 0.02 * (y - 3))
 
-    parts = {
-        "bed": (ground((6, 12), 0.015, 0.012, 0.4, 3, shape), 0.03),
-        "stones": (stones(220, 3, (1.5, 10), (0.03, 0.14), 4, shape), 0.06),
+    bed, bank = parted(ground((6, 12), 0.012, 0.012, 0.25, 3, shape), outside, 0.08)
+    parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
+        "bed": (bed, patches(0.0005, 0.03, 0.8, 31)),
+        "bank": (bank, patches(0.0, 3e-4, 0.4, 32)),
+        "stones": (stones(900, 1.7, (1.8, 11), (0.02, 0.12), 4, shape), 0.03),
+        "scattered": (stones(150, 5, (2, 11), (0.03, 0.2), 5, shape), 6e-4),
     }
     return loaded(parts, folder / "river")
 
 
 def far_bed(folder: Path) -> mi.Scene:
-    """Make a bed of bars across the flow, lit in a strip."""
+    """Make a bed of bars across the flow between two banks of mud, with stones."""
+
+    def outside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return beside(x - 0.35, y, 0.9, 0.15, 12)
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        bars = 0.006 * np.sin(2 * math.pi * (y + 0.6 * x + 0.5 * np.sin(1.7 * x) + 0.3 * np.sin(2.3 * y)) / 0.45)
-        strip = beside(x - 0.35, y, 0.9, 0.15, 12)
-        return np.asarray(bars - 4.0 / (1 + np.exp(-strip * 9)))
+        bars = 0.004 * np.sin(2 * math.pi * (y + 0.6 * x + 0.5 * np.sin(1.7 * x) + 0.3 * np.sin(2.3 * y)) / 0.45)
+        return np.asarray(bars - 0.5 / (1 + np.exp(-outside(x, y) * 9)))
 
-    parts = {
-        "bed": (ground((10, 17), 0.02, 0.012, 0.4, 6, shape), 0.05),
-        "stones": (stones(160, 3, (5, 15), (0.04, 0.15), 7, shape), 0.05),
+    bed, bank = parted(ground((10, 17), 0.02, 0.015, 0.3, 6, shape), outside, 0.08)
+    parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
+        "bed": (bed, patches(0.0005, 0.05, 1.2, 61)),
+        "bank": (bank, patches(0.0, 2e-4, 0.6, 62)),
+        "stones": (stones(500, 2.0, (5, 16), (0.03, 0.14), 7, shape), 0.04),
     }
     return loaded(parts, folder / "far")
 
 
 def sparse_bottom(folder: Path) -> mi.Scene:
-    """Make a flat bottom with low ridges."""
+    """Make a flat bottom of mud with low ridges of rubble."""
 
     def shape(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         one = np.exp(-(((y - 13.5 + 1.2 * x) / 0.12) ** 2)) * (x < 0.6)
         other = np.exp(-(((y - 16.0 - 0.9 * x) / 0.12) ** 2)) * (x > -1.0)
         return np.asarray(0.1 * (one + other))
 
-    return loaded({"bottom": (ground((8, 26), 0.03, 0.004, 1.0, 8, shape), 0.2)}, folder / "sparse")
+    def low(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(0.02 - shape(x, y))
+
+    ridges, mud = parted(ground((8, 26), 0.03, 0.004, 1.0, 8, shape), low)
+    return loaded(
+        {"mud": (mud, patches(0.0, 5e-4, 2.0, 81)), "ridges": (ridges, patches(0.0, 0.03, 0.5, 82))}, folder / "sparse"
+    )
 
 
 def placed(body: trimesh.Trimesh, at: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -173,19 +239,20 @@ def merged(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([body.vertices for body in bodies]), np.concatenate(faces), process=False)
 
 
-def mesh(body: trimesh.Trimesh, path: Path, reflectivity: float) -> dict[str, Any]:
+def mesh(body: trimesh.Trimesh, path: Path, reflectivity: Paint) -> dict[str, Any]:
     """Write a mesh and return it as Mitsuba's dictionary."""
     path.parent.mkdir(parents=True, exist_ok=True)
     body.export(path)
     return {"type": "ply", "filename": str(path), "face_normals": True, "bsdf": paint(reflectivity)}
 
 
-def paint(reflectivity: float) -> dict[str, Any]:
+def paint(reflectivity: Paint) -> dict[str, Any]:
     """Return a diffuse surface."""
-    return {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectivity}}
+    even = {"type": "uniform", "value": reflectivity}
+    return {"type": "diffuse", "reflectance": reflectivity if isinstance(reflectivity, dict) else even}
 
 
-def floor(reflectivity: float, half: float = 6.0) -> dict[str, Any]:
+def floor(reflectivity: Paint, half: float = 6.0) -> dict[str, Any]:
     """Return level ground."""
     import mitsuba as mi
 
@@ -198,55 +265,80 @@ def flat(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def tank_with_tyre(folder: Path) -> mi.Scene:
-    """Make a dark smooth floor, a tyre on its side, a box and a wall's corner."""
+    """Make a dark floor of patches, a tyre with tread on its side, a box and a wall's corner, all smooth with relief."""
     tyre = placed(trimesh.creation.torus(0.11, 0.04, major_sections=96, minor_sections=32), (0.12, 2.4, 0.05), (12, 0, 25))
     box = placed(trimesh.creation.box((0.05, 0.3, 0.12)), (-0.3, 3.1, 0.06), (0, 0, 35))
     lid = placed(trimesh.creation.box((0.25, 0.04, 0.1)), (-0.28, 2.95, 0.05), (0, 0, -25))
     wall = placed(trimesh.creation.box((1.5, 0.05, 0.8)), (1.2, 3.75, 0.4), (0, 0, -40))
-    parts = {"tyre": (tyre, 0.03), "box": (box, 0.3), "lid": (lid, 0.2), "wall": (wall, 0.1)}
-    return loaded(parts, folder / "tyre", floor=floor(1e-4))
+    parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
+        "tyre": (rough(tyre, 1e-3, 0.06, 0.005, 41), 5e-4),
+        "box": (rough(box, 2e-3, 0.08, 0.006, 42), 0.005),
+        "lid": (rough(lid, 2e-3, 0.08, 0.006, 43), 0.008),
+        "wall": (rough(wall, 3e-3, 0.15, 0.01, 44), 0.02),
+    }
+    return loaded(parts, folder / "tyre", floor=floor(patches(0.0, 2e-6, 0.4, 45)))
 
 
 def tank_with_chain(folder: Path) -> mi.Scene:
-    """Make a dark smooth floor, a chain that lies in two bows, and beams of wood."""
+    """Make a dark floor of patches, beams of wood, and a chain in two bows that sinks into the floor here and there.
+
+    Chain and beams are smooth, with relief.
+    """
     links = []
     for k, along in enumerate(np.linspace(0, 1, 96)):
         x = -0.3 + 0.5 * math.sin(2.2 * along) ** 2 + 0.35 * along
         y = 2.75 + 0.22 * math.sin(7.5 * along + 0.9) - 0.25 * along
         turn = (90.0 * (k % 2) + 20 * math.sin(5.0 * k), 20 * math.cos(3.0 * k), 137.0 * k)
-        links.append(placed(trimesh.creation.torus(0.028, 0.009, major_sections=32, minor_sections=12), (x, y, 0.03), turn))
+        links.append(
+            placed(
+                trimesh.creation.torus(0.028, 0.009, major_sections=32, minor_sections=12),
+                (x, y, 0.04 * math.sin(37.0 * along)),
+                turn,
+            )
+        )
     beams = [placed(trimesh.creation.box((0.08, 0.9, 0.1)), (0.2 + 0.4 * k, 3.6, 0.05), (0, 0, 12 - 80 * k)) for k in (0, 1)]
-    parts = {"chain": (merged(links), 0.6), "beams": (merged(beams), 0.15)}
-    return loaded(parts, folder / "chain", floor=floor(1e-4))
+    parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
+        "chain": (rough(merged(links), 5e-4, 0.02, 0.004, 51), 0.02),
+        "beams": (rough(merged(beams), 3e-3, 0.1, 0.008, 52), 0.03),
+    }
+    return loaded(parts, folder / "chain", floor=floor(patches(0.0, 5e-5, 0.4, 53)))
 
 
 def small_tank(folder: Path) -> mi.Scene:
-    """Make a rough floor, a low body with a shadow, and a seam."""
+    """Make a rough strip of floor that ends in smooth floor, a low body with a shadow, and a seam."""
+
+    def outside(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.abs(y - 0.9 + 0.05 * np.sin(5 * x)) - 0.22 - 0.03 * np.sin(9 * x + 1))
+
     body = placed(trimesh.creation.capsule(0.1, 0.012, count=[24, 24]), (0.05, 0.95, 0.01), (90, 0, 60))
     seam = placed(trimesh.creation.box((1.2, 0.01, 0.012)), (0.2, 1.45, 0.0), (0, 0, -20))
-    parts = {
-        "floor": (ground((3, 2.4), 0.006, 0.004, 0.3, 9, flat), 0.2),
+    strip, smooth = parted(ground((3, 2.4), 0.006, 0.004, 0.3, 9, flat), outside, 0.04)
+    parts: dict[str, tuple[trimesh.Trimesh, Paint]] = {
+        "strip": (strip, patches(0.02, 0.3, 0.3, 91)),
+        "smooth": (smooth, patches(0.0, 0.004, 0.3, 92)),
         "body": (body, 0.1),
-        "seam": (seam, 0.4),
+        "seam": (seam, 0.1),
     }
     return loaded(parts, folder / "small")
 
 
 STAGES = {
     "DIDSON lamprey2": Stage(
-        river_bed, pose(0.9, 10), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey2", video=True, patchy=True
+        river_bed, pose(0.9, 10), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey2", video=True, sway_m=RIVER_SWAY_M
     ),
     "DIDSON lamprey4": Stage(
-        far_bed, pose(1.9, 11.5), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey4", video=True, patchy=True
+        far_bed, pose(1.9, 11.5), STILL, {"absorption_db_per_m": 0.84}, pictures="lamprey4", video=True, sway_m=RIVER_SWAY_M
     ),
-    "ARIS 1200": Stage(sparse_bottom, pose(1.3, 7), STILL, {"elevation_fov_deg": 14.0, "absorption_db_per_m": 0.37}),
+    "ARIS 1200": Stage(
+        sparse_bottom, pose(1.3, 7), STILL, {"elevation_fov_deg": 14.0, "absorption_db_per_m": 0.37}, volume_db=-45.0
+    ),
     "ARIS 3000 tyre": Stage(
         tank_with_tyre,
         pose(1.3, 29),
         np.array([0.0, 0.0055, 0.0, 0.0, 0.0, math.radians(0.16)]),
         {"absorption_db_per_m": 2.34},
         pictures="translate_tyre",
-        mirrors={"tyre": (0.5, 5e-5), "box": (0.5, 5e-5), "lid": (0.5, 5e-5), "wall": (0.5, 8e-5)},
+        mirrors={"tyre": (0.15, 3e-6), "box": (0.2, 3e-6), "lid": (0.2, 3e-6), "wall": (0.7, 3e-6)},
     ),
     "ARIS 3000 chain": Stage(
         tank_with_chain,
@@ -254,8 +346,8 @@ STAGES = {
         np.array([0.0, 0.0068, 0.0, 0.0, 0.0, math.radians(0.09)]),
         {"absorption_db_per_m": 2.34},
         pictures="forward_chain",
-        mirrors={"chain": (0.9, 3e-5), "beams": (0.5, 8e-5)},
+        mirrors={"chain": (0.94, 3e-6), "beams": (0.2, 1e-5)},
     ),
-    "Oculus 2.1 MHz": Stage(small_tank, pose(0.27, 21), STILL, {"absorption_db_per_m": 1.14}),
+    "Oculus 2.1 MHz": Stage(small_tank, pose(0.27, 18), STILL, {"absorption_db_per_m": 1.14}),
 }
 """By the name of the recording."""

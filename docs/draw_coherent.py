@@ -67,7 +67,7 @@ def draw(out: Path, coarse: Mapping[str, object]) -> None:
         coarse: changes of the sonars.
     """
     warnings.simplefilter("ignore", mitsonar.MitsonarWarning)
-    figure, axes = plt.subplots(2, len(SHOWN), figsize=(10, 8.6), layout="constrained", width_ratios=[1.5, 1])
+    figure, axes = plt.subplots(2, len(SHOWN), figsize=(10.6, 8.6), layout="constrained", width_ratios=[1.5, 1])
     for column, shown in zip(axes.T, SHOWN, strict=True):
         scene = mitsonar.load_scene(shown.scene, **shown.parameters)
         found = sonar_in(scene)
@@ -82,8 +82,10 @@ def draw(out: Path, coarse: Mapping[str, object]) -> None:
             frames = mitsonar.Simulator(scene, sonar.replace(**{**changes, **model})).render([pose])
             fan = to_cartesian(decibels(frames), frames.range_m, frames.bearing_rad)
             ax.set_facecolor("black")
-            ax.imshow(np.where(fan.image == 0, np.nan, fan.image), extent=fan.extent, cmap="copper", vmin=-SPAN_DB, vmax=0)
+            shown_db = np.where(fan.image == 0, np.nan, fan.image)
+            drawn = ax.imshow(shown_db, extent=fan.extent, cmap="copper", vmin=-SPAN_DB, vmax=0)
             ax.set(title=f"{shown.scene}, {name}", xlabel="starboard (m)", ylabel="forward (m)")
+    figure.colorbar(drawn, ax=axes, label="level (dB below full scale)", fraction=0.03, pad=0.01)
     picture = io.BytesIO()
     figure.savefig(picture, dpi=85)
     Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(out, optimize=True)

@@ -7,6 +7,7 @@ python docs/draw_worlds.py --quick    # coarse, into a folder that is removed: d
 from __future__ import annotations
 
 import argparse
+import io
 import tempfile
 import warnings
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
 import mitsonar
 from mitsonar.geometry.scan_conversion import to_cartesian
@@ -32,6 +34,9 @@ SHOWN: dict[str, tuple[dict[str, object], float]] = {
     "flat-objects": ({}, 4.0),
 }
 """Options of each family, and half the edge of what is drawn from above [m]."""
+
+SPAN_DB = 60.0
+"""What values 0..1 of the sonar images, and so the colours, span [dB]."""
 
 
 def from_above(scene: mi.Scene, middle: tuple[float, float], half_m: float, pixels: int, spp: int) -> np.ndarray:
@@ -100,7 +105,7 @@ def draw(out: Path, pixels: int, spp: int) -> None:
         found = sonar_in(scene)
         assert found is not None
         sonar, pose = found
-        frames = mitsonar.Simulator(scene, sonar).render([pose])
+        frames = mitsonar.Simulator(scene, sonar.replace(coding_db=SPAN_DB)).render([pose])
         x, y = footprint_outline(sonar, pose)
         middle = (float(x.mean()), float(y.mean())) if half_m < 6 else (0.0, 0.0)
         extent = (middle[0] - half_m, middle[0] + half_m, middle[1] - half_m, middle[1] + half_m)
@@ -112,9 +117,12 @@ def draw(out: Path, pixels: int, spp: int) -> None:
         above.plot(pose.x, pose.y, "o", color="tab:orange", ms=5)
         above.set(title=name, xlim=extent[:2], ylim=extent[2:], xlabel="x, m", ylabel="y, m")
         fan = to_cartesian(frames.image[0], frames.range_m, frames.bearing_rad)
-        below.imshow(fan.image, extent=fan.extent, cmap="copper", vmin=0, vmax=1)
+        shown = below.imshow((fan.image - 1) * SPAN_DB, extent=fan.extent, cmap="copper", vmin=-SPAN_DB, vmax=0)
         below.set(facecolor="black", xlabel="starboard, m", ylabel="ahead, m")
-    figure.savefig(out, dpi=70)
+    figure.colorbar(shown, ax=axes[1], label="level (dB below full scale)", pad=0.01)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=70)
+    Image.open(picture).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(out, optimize=True)
     print(f"{out}: {len(SHOWN)} worlds")
 
 

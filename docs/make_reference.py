@@ -27,7 +27,7 @@ GROUPS = {
     "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar"),
     "Poses and paths": ("Pose", "Motion", "Trajectory"),
     "Simulation": ("Simulator", "ChannelSimulator", "load_noise", "NoiseModel"),
-    "Records": ("SonarFrames", "ImpulseResponses", "load_frames"),
+    "Records": ("SonarFrames", "ImpulseResponses", "load_frames", "open_recording", "write_mcap"),
     "Estimation and mapping": (
         "create_estimator",
         "Estimate",

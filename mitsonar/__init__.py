@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.composition import Motion
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.recordings.mcap_writer import write_mcap
     from mitsonar.recordings.open_recording import open_recording
     from mitsonar.records.impulse_responses import ImpulseResponses
     from mitsonar.records.sonar_frames import SonarFrames
@@ -74,6 +75,7 @@ __all__ = [
     "make_dataset",
     "odometry",
     "open_recording",
+    "write_mcap",
 ]
 
 _MODULES = {
@@ -105,6 +107,7 @@ _MODULES = {
     "make_dataset": "datasets.generation",
     "odometry": "mapping.odometry",
     "open_recording": "recordings.open_recording",
+    "write_mcap": "recordings.mcap_writer",
 }
 
 plugins.install()

@@ -65,11 +65,12 @@ class ImagingSonar(mi.Sensor):
     ``physical`` with a pattern: ``frequency_hz`` [Hz], ``bandwidth_hz`` [Hz] or ``pulse_m`` [m, one bin], ``focus_m`` [m],
     ``pattern``, ``shading`` [hann], ``elevation_pattern``, ``scatterers_per_cell`` [6], ``scatterer_spacing_m`` [m],
     ``speckle_nu``, ``speckle_patch_m`` [m, 0.1], ``source_level_db`` [0], ``noise_level_db``, ``near_glow_db`` [0],
-    ``near_glow_m`` [m, 0.5], ``volume_db``, ``absorption_db_per_m``, ``temperature_c`` [10], ``salinity_psu`` [35],
-    ``water_depth_m`` [m, 10], ``ph`` [8], ``gain_absorption`` [false], ``crosstalk_db``, ``stripes_db`` [0], ``coding``,
-    ``coding_db`` [80], ``coding_gamma`` [0.5] (docs/guides/coherent.md); ``preset``: a name; the others change its
-    numbers; ``ping`` [0]: number of the jitter's draw; ``to_world``. A film is not needed. One that is given must have the
-    size that follows from beams and rays.
+    ``near_glow_m`` [m, 0.5], ``near_glow_edge_db`` [0], ``near_glow_spread_db`` [0], ``near_glow_still`` [0],
+    ``volume_db``, ``absorption_db_per_m``, ``temperature_c`` [10], ``salinity_psu`` [35], ``water_depth_m`` [m, 10],
+    ``ph`` [8], ``gain_absorption`` [false], ``crosstalk_db``, ``stripes_db`` [0], ``coding``, ``coding_db`` [80],
+    ``coding_gamma`` [0.5] (docs/guides/coherent.md); ``preset``: a name; the others change its numbers; ``ping`` [0]: number
+    of the jitter's draw; ``to_world``. A film is not needed. One that is given must have the size that follows from beams
+    and rays.
 
     Its rays are those of the models ``physical`` and ``thesis``. The model ``coherent`` traces a fan of its own, with beam
     patterns and side lobes. No model has a sonar that moves during a ping.

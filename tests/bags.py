@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import defaultdict
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -154,3 +155,15 @@ def write_bag(path: Path, maker: Maker, sent: list[Sent]) -> Path:
             serialize = maker.types.serialize_ros1 if maker.ros1 else maker.types.serialize_cdr
             writer.write(connections[topic], round(time_s * 1e9), serialize(message, kind))
     return path
+
+
+def decoded(path: Path) -> dict[str, list[RosObject]]:
+    """The messages of an MCAP file by topic, as ``mcap-ros2-support`` decodes them."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    found = defaultdict(list)
+    with path.open("rb") as file:
+        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            found[channel.topic].append(message)
+    return dict(found)

@@ -258,6 +258,8 @@ TALLY: dict[str, Any] = {
     "worst": [1, 2],
     "empty": 1,
     "first_empty": [4, 0, 0, 0, 2],
+    "cut": 0,
+    "enough_m": 0.0,
 }
 STATE = {"frames_done": 10, "warnings": ["a"], "gain": 2.0, "tally": TALLY}
 

@@ -309,7 +309,7 @@ def test_package_data_names_every_shipped_file() -> None:
     shipped = {path for path in scenes.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
     assert shipped == named
     recipes = set((ROOT / "mitsonar" / "config").glob(SETUPTOOLS["package-data"]["mitsonar.config"][0]))
-    assert len(recipes) == 31
+    assert len(recipes) == 32
     training = ROOT / "benchmarks" / "recipes"
     named = {path for pattern in SETUPTOOLS["package-data"]["mitsonar.recipes"] for path in training.glob(pattern)}
     assert {path for path in training.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")} == named

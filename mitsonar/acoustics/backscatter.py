@@ -27,6 +27,7 @@ from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from mitsonar.acoustics.grain_size import sediment_of
 from mitsonar.acoustics.rough_fluid import Sediment, rough_fluid_sigma
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, complaint, nearest_names, shortened
@@ -297,7 +298,8 @@ def material(name_or_file: str | Path) -> Material:
     """Load a material by its name, or from a YAML file (keys: the fields of :class:`Material`, and ``material``).
 
     The key ``material`` (optional) names a material whose numbers the others replace. Where they give another ``law``, only
-    name, description and band are taken over.
+    name, description and band are taken over. The key ``grain_size_phi`` gives the numbers of a sediment of that mean grain
+    size (:mod:`mitsonar.acoustics.grain_size`), which the others replace too.
 
     Raises:
         MitsonarError: unknown name (with the nearest ones), unreadable file, unknown key, value out of limits.
@@ -310,6 +312,7 @@ def material(name_or_file: str | Path) -> Material:
     fields = read_yaml(text, "material file", " or a material's name")
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MitsonarError(f"{text} must hold `key: value` lines of a material")
+    fields = _by_grain_size(fields, text)
     base = fields.pop("material", None)
     if not isinstance(base, str | None):
         raise MitsonarError(f"material in {text} must name a material: got {shortened(base)}")
@@ -318,6 +321,20 @@ def material(name_or_file: str | Path) -> Material:
         numbers = {key for keys in (*LAWS.values(), MIRROR) for key in keys}
         kept = {key: value for key, value in kept.items() if key not in numbers}
     return Material.create(**{**kept, "name": Path(text).stem, **fields})
+
+
+def _by_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainValue]:
+    """Return the fields of a file with the numbers of its grain size, where it gives one; its own numbers win."""
+    if "grain_size_phi" not in fields:
+        return fields
+    phi = fields.pop("grain_size_phi")
+    if isinstance(phi, bool) or not isinstance(phi, int | float):
+        raise MitsonarError(f"grain_size_phi in {text} must be a number: got {shortened(phi)}")
+    if "material" in fields:
+        raise MitsonarError(f"grain_size_phi and material say the same: {text} gives both; leave one of them out")
+    band = {"frequency_min_hz": 10e3, "frequency_max_hz": 100e3}
+    source = f"grain size of {phi:g} phi: regressions of APL-UW TR 9407 (1994), section IV (not seen)"
+    return {"law": "rough-fluid", "source": source, **band, **sediment_of(float(phi))._asdict(), **fields}
 
 
 def _named(name: str) -> dict[str, PlainValue]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
 
-__all__ = ["coded", "decoded"]
+__all__ = ["coded", "coding_slope", "decoded"]
 
 
 def coded(level: NDArray[np.float32], sonar: Sonar) -> NDArray[np.float32]:
@@ -27,6 +27,23 @@ def coded(level: NDArray[np.float32], sonar: Sonar) -> NDArray[np.float32]:
     smallest = np.float32(10 ** (-sonar.coding_db / 10))
     value = 1 + np.log10(np.clip(level, smallest, 1)) * np.float32(10 / sonar.coding_db)
     return np.asarray(np.maximum(value, np.float32(0)), dtype=np.float32)
+
+
+def coding_slope(level: NDArray[np.float64], sonar: Sonar) -> NDArray[np.float64]:
+    """Return the derivative of values 0..1 by the level relative to full scale, of the same shape; 0 beyond full scale.
+
+    Args:
+        level: above 0.
+        sonar: its coding.
+    """
+    match sonar.value_coding:
+        case "linear":
+            slope = np.ones_like(level)
+        case "gamma":
+            slope = sonar.coding_gamma / 2 * level ** (sonar.coding_gamma / 2 - 1)
+        case _:
+            slope = 10 / (np.log(10) * sonar.coding_db * np.maximum(level, 10 ** (-sonar.coding_db / 10)))
+    return np.asarray(np.where(level < 1, slope, 0.0), dtype=np.float64)
 
 
 def decoded(value: ArrayLike, sonar: Sonar, coding: str | None = None) -> NDArray[np.float64]:

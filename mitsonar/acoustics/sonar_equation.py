@@ -31,6 +31,7 @@ __all__ = [
     "level_of_pressure",
     "line_directivity_db",
     "noise_level_db",
+    "noise_warning",
     "power_sum_db",
     "pressure_of_level",
     "rectangle_directivity_db",
@@ -276,6 +277,27 @@ def noise_level_db(
         band = {"bandwidth_hz": bandwidth_hz, "directivity_index_db": directivity_index_db}
         noise = ambient_noise_db(frequency_hz, wind_m_s=wind_m_s, shipping=shipping, **band)
     return noise if receiver_db is None else power_sum_db(noise, receiver_db)
+
+
+def noise_warning(frequency_hz: float, *, wind_m_s: float | None = None) -> str | None:
+    """Say in one sentence where noise lies outside the band of its formula; None where it holds.
+
+    Thermal noise alone stands for all noise from 100 kHz on. The lines through Wenz's curves hold from 1 Hz to 100 kHz;
+    above them thermal noise, which is added, takes over.
+
+    Args:
+        frequency_hz: of the receiver.
+        wind_m_s: as of :func:`noise_level_db`; None for thermal noise alone.
+
+    Raises:
+        MitsonarError: a frequency that is not above 0.
+    """
+    khz = _length(frequency_hz, "frequency_hz") / 1000
+    if wind_m_s is None and khz < 100:
+        return f"thermal noise alone at {khz:,.4g} kHz is too low for the sea: it rules from 100 kHz on; give wind_m_s"
+    if wind_m_s is not None and khz < 1e-3:
+        return f"noise of the sea at {khz * 1000:,.4g} Hz is extrapolated: Wenz's curves begin at 1 Hz"
+    return None
 
 
 # ---------------------------------------------------------------- directivity

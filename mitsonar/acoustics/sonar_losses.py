@@ -8,7 +8,11 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.sea_water import Water, absorption_db_per_m, absorption_warning
 from mitsonar.instruments.imaging_sonar import Sonar
 
-__all__ = ["gain_of", "loss_notes", "loss_of", "sonar_absorption", "undone_absorption", "water_of"]
+__all__ = ["absorption_line", "gain_of", "loss_notes", "loss_of", "sonar_absorption", "undone_absorption", "water_of"]
+
+
+EXTRAPOLATED_HZ = 1e6
+"""Carrier above which the formula extrapolates by the viscosity of pure water."""
 
 
 def water_of(sonar: Sonar) -> Water:
@@ -35,14 +39,18 @@ def loss_notes(sonar: Sonar) -> list[str]:
     """Return a sentence where carrier or water lie outside the band of the absorption's formula."""
     if sonar.absorption_db_per_m is not None or sonar.beam_pattern == "box" or sonar.frequency_hz is None:
         return []
-    if sonar.frequency_hz > EXTRAPOLATED_HZ:  # of every imaging sonar above 1 MHz: in the docs, not in each run
+    if sonar.frequency_hz > EXTRAPOLATED_HZ:  # so is that of every imaging sonar above 1 MHz: no warning, but a line
         return []
     note = absorption_warning(sonar.frequency_hz, water_of(sonar))
     return [] if note is None else [f"{note}; or give absorption_db_per_m"]
 
 
-EXTRAPOLATED_HZ = 1e6
-"""Carrier above which the formula extrapolates by the viscosity of pure water."""
+def absorption_line(sonar: Sonar) -> str | None:
+    """Return a line on the absorption that follows from carrier and water; None where it is given or absent."""
+    if sonar.absorption_db_per_m is not None or sonar.beam_pattern == "box" or sonar.frequency_hz is None:
+        return None
+    beyond = ", extrapolated: Francois and Garrison hold to 1 MHz" if sonar.frequency_hz > EXTRAPOLATED_HZ else ""
+    return f"absorption at {sonar.frequency_hz / 1000:,.4g} kHz: {sonar_absorption(sonar):.3g} dB/m one way{beyond}"
 
 
 def loss_of(sonar: Sonar) -> NDArray[np.float64]:

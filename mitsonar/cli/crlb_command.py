@@ -35,7 +35,9 @@ def crlb(
     source: Annotated[
         str, typer.Argument(metavar="SCENE|DATA.zarr", help="Mitsuba XML file, a shipped scene's name, or a data set.")
     ],
-    noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "high",
+    noise: Annotated[
+        str | None, typer.Option(help=f"{NOISE} (default: high; the model coherent has noise of its own).")
+    ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"Pose: {SIX}.")] = None,
     end: Annotated[
         str | None, typer.Option("--to", help="Last pose. The --poses are evenly spaced from --from to this one.")
@@ -44,7 +46,7 @@ def crlb(
     trajectory: Annotated[Path | None, typer.Option(help="Poses of a TUM or CSV file, or `shipped`.")] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
-    model: Annotated[str | None, typer.Option(help="Model of the echo level: physical or thesis.")] = None,
+    model: Annotated[str | None, typer.Option(help="Model of the echo level: coherent, physical or thesis.")] = None,
     segments: Annotated[
         str | None, typer.Option(help="Portions of the view of a sonar that looks down: q1,q2,q3,q4.")
     ] = None,
@@ -73,17 +75,18 @@ def crlb(
 
     One frame: scene and first pose are known. Two frames: both are noisy, and the relief is known. Distributions: `pixel`,
     the exact one of clipped, rounded pixels; `gaussian`, with the same mean and variance; `rays`, with the noise of the
-    rays of a ping.
+    rays of a ping. In the model coherent: `grain`, scatterers known, in the receiver's noise; `ground`, expected level
+    known, with speckle of its own in each frame.
 
     With --vary the gain is computed for each value. If height, pitch or a field of view varies, both ends of the range
     window follow the nearest and farthest range of the floor. The number of bins stays.
     """
-    from mitsonar.acoustics.noise import load_noise
+    from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.estimation.crlb.crlb_report import bounds_of_subject, report_lines, report_of
     from mitsonar.estimation.crlb.crlb_subject import subject_of_data
     from mitsonar.motion.conventions import convention_named
 
-    added, name, values = load_noise(noise), *_variable(vary)
+    given, (name, values) = None if noise is None else load_noise(noise), _variable(vary)
     if height is not None and not height > 0:
         raise MitsonarError(f"--height must be above 0: got {height:g} m")
     asked_poses: _PosesAsked = {"start": start, "end": end, "count": poses, "file": trajectory, "frame": frame}
@@ -95,6 +98,10 @@ def crlb(
         subject = subject_of_data(source, pairs, part=part, gain=gain, seed=seed)
     else:
         subject = _of_scene(source, sonar, model, seed, segments, gain, scene_parameters(parameter or []), asked_poses)
+    refuse_noise(given, subject.sonar)
+    speckle = subject.sonar.model == "coherent"
+    noise = noise or ("none" if speckle else "high")
+    added = given or load_noise(noise)
     if name is not None and gain is None:
         subject = replace(subject, gain=None)
     rows: list[tuple[Value | None, Table]] = []
@@ -103,7 +110,7 @@ def crlb(
         for value in asked:
             changes = [(key, v) for key, v in (("height_m", height), (name, value)) if v is not None and key is not None]
             rows.append((value, bounds_of_subject(subject, added, changes, pings, progress)))
-    report = report_of(source, noise, name, rows)
+    report = report_of(source, subject.sonar, "of the receiver" if speckle else noise, name, rows)
     if plot is not None:
         from mitsonar.io.whole_files import write_whole
         from mitsonar.plotting.crlb_figure import crlb_png
@@ -114,7 +121,7 @@ def crlb(
         return
     for line in report_lines(report):
         say(line)
-    if added.scale == 0:
+    if added.scale == 0 and not speckle:
         warn(
             "without noise the echoes determine the motion without limit (`pixel`: -); `gaussian` counts rounding as "
             "variance 1 / (12 255^2), `rays` adds the noise of the rays of a ping"

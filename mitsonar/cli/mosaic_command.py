@@ -53,7 +53,9 @@ def mosaic(
     height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
-    view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
+    view: Annotated[
+        str | None, typer.Option(help="View of a data set, or topic of a ROS bag (default: the first, or the only one).")
+    ] = None,
     geometry: Geometry = None,
     noise: Annotated[str, typer.Option(help=f"{NOISE}.")] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of that noise.")] = 0,

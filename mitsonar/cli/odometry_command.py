@@ -77,7 +77,9 @@ def odometry(
     sequence: Annotated[
         int | None, typer.Option(help="Sequence of a data set, or part of a recording (default: the longest).")
     ] = None,
-    view: Annotated[str | None, typer.Option(help="View of a data set (default: the first).")] = None,
+    view: Annotated[
+        str | None, typer.Option(help="View of a data set, or topic of a ROS bag (default: the first, or the only one).")
+    ] = None,
     geometry: Geometry = None,
     noise: Annotated[
         str,

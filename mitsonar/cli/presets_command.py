@@ -17,6 +17,7 @@ def presets(
     name: Annotated[str | None, typer.Argument(help="One preset: every number with its source.")] = None,
 ) -> None:
     """Print the sonars that can be named, or one of them with the document behind each number."""
+    from mitsonar.acoustics.sonar_losses import absorption_line
     from mitsonar.instruments.imaging_sonar import RAYS
     from mitsonar.instruments.named_sonars import named_sonars, preset
 
@@ -27,6 +28,8 @@ def presets(
             shown = f"{value:g}" if isinstance(value, float) else "-" if value is None else str(value)
             source = sources.get(key, "from quality" if key in RAYS else "default")
             say(f"  {key:18} {shown:10} {source}")
+        if line := absorption_line(sonar):
+            say(f"  {line}")
         for line in _accuracy([name]):
             say(line)
         return

@@ -33,7 +33,7 @@ Span = Annotated[float, typer.Option("--span-db", help="Levels from full scale d
 def recordings() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Look at recordings of real sonars and at runs, and convert them.", no_args_is_help=True)
-    for command in (info, show, video, convert):
+    for command in (info, show, video, answered(convert, {"beams": "--beams"})):
         app.command()(command)
     return app
 
@@ -100,12 +100,11 @@ def video(
     if rate is not None and not 0 < rate <= 1000:
         raise MitsonarError(f"--rate must lie in 0..1000 a second: got {rate:g}")
     with progress_bar("drawing", len(chosen), "frames") as progress:
-        options = {"span_db": span_db, "overwrite": overwrite}
-        count = write_fan_video(chosen.chunks(), out, rate or min(1000.0, found), **options, progress=progress)
-    say(f"{count:,} frames at {rate or found:.4g} a second in {out}")
+        speed = rate or min(1000.0, found)
+        count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
+    say(f"{count:,} frames at {speed:.4g} a second in {out}")
 
 
-@answered
 def convert(
     file: File,
     out: Annotated[Path, typer.Option("-o", "--out", help="FOLDER of a run, FILE.mcap or FILE.aris to make.")],

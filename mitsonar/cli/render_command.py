@@ -65,6 +65,7 @@ def render(
 ) -> None:
     """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
+    from mitsonar.acoustics.sonar_losses import absorption_line
     from mitsonar.io.provenance import file_digest
     from mitsonar.motion.conventions import convention_named
     from mitsonar.simulation.imaging import Simulator
@@ -96,6 +97,8 @@ def render(
     for sentence in report.warnings:
         warn(sentence)
     say(f"{report.frames} frames ({instrument.model} model, {instrument.name}) in {folder}")
+    if line := absorption_line(instrument):
+        say(line)
     if report.pictures:
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
 

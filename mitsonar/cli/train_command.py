@@ -30,7 +30,10 @@ def train(
         str, typer.Argument(metavar="RECIPE.yaml", help="A training recipe: a YAML file, or the name of a shipped one.")
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the run: network, log, learning curve, state.")],
-    data: Annotated[str | None, typer.Option(help="Path or URL of a data set; with --render for validation only.")] = None,
+    data: Annotated[
+        list[str] | None,
+        typer.Option(help="Path or URL of a data set; again: others join it. With --render one, for validation only."),
+    ] = None,
     render: Annotated[bool, typer.Option("--render", help="Render training samples during training.")] = False,
     minutes: Annotated[
         float | None, typer.Option(help="Duration after which training stops [min], of all resumed runs together.")

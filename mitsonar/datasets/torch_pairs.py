@@ -133,6 +133,7 @@ class Samples(Batches):
             poses=poses,
             height_m=height_m,
             time_s=time_s,
+            level=view.sonar.value_coding,
             level_scale=level_scale,
         )
 

@@ -18,7 +18,8 @@ from mitsonar.datasets.response_samples import ImpulseSamples
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.image_crlb import bounds_at, overall
+from mitsonar.estimation.crlb.fisher_bound import overall
+from mitsonar.estimation.crlb.image_crlb import bounds_at
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
 from mitsonar.records.impulse_responses import ImpulseResponses
@@ -237,7 +238,7 @@ def with_prior(answers: Answers, largest: Array) -> Answers:
 def bounds_of_pairs(
     pairs: SonarPairs, numbers: Sequence[int], noise: NoiseModel, progress: Callable[[int], object] | None = None
 ) -> dict[str, Array]:
-    """Return the two-frame bound ``(3,)`` [m, m, rad] by each model of :data:`mitsonar.estimation.crlb.image_crlb.LAWS`.
+    """Return the two-frame bound ``(3,)`` [m, m, rad] by law, see :func:`mitsonar.estimation.crlb.image_crlb.laws_of`.
 
     It is the root of the mean variance over the first poses of these samples; 0 where there is no bound without noise.
     """

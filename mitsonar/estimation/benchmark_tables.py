@@ -14,7 +14,9 @@ FEWEST_SCENES = 10
 
 def table_lines(table: PlainTable) -> list[str]:
     """Return a table of the report as lines of Markdown."""
-    lines = ["", f"noise {table['noise']}, {table['variation']}", "", *markdown(table["rows"], COLUMNS)]
+    shown = markdown(table["rows"], COLUMNS)
+    shown[0] = shown[0].replace("/ limit (rays)", f"/ limit ({table.get('limit_law', 'rays')})")
+    lines = ["", f"noise {table['noise']}, {table['variation']}", "", *shown]
     if table["limits"]:
         known = {law: std for law, std in table["limits"].items() if any(value != 0 for value in std)}
         lines += ["", "limit of two frames: " + "; ".join(f"{law} {_three(std)}" for law, std in known.items())]

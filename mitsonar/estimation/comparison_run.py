@@ -211,10 +211,9 @@ def _key(level: str, model: NoiseModel | None) -> str:
 
 
 def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
-    """Return the bound by model of the noise, over some pairs; empty if not asked for, for responses, and for speckle."""
+    """Return the bound by model of the noise, over some pairs; empty if not asked for, and for responses."""
     model, samples = bench.levels[level], bench.samples[level]
-    speckle = modality_of(bench.first.recipe).sonar.model == "coherent"
-    if not limit or model is None or isinstance(samples, ImpulseSamples) or speckle:
+    if not limit or model is None or isinstance(samples, ImpulseSamples):
         return {}
     found = kept.load_bounds(_key(level, model), limit)
     if found is None:
@@ -239,11 +238,13 @@ def _table(
     inputs = {name: f"{text}, prior" if name.endswith(PRIOR) else text for name, text in inputs.items()}
     reference = asked.reference or list(bench.methods)[-1]
     resamples = cluster_resamples(bench.scenes, seed=asked.seed)
-    rows = rows_of(found, inputs, bench.truth, resamples, limit=bounds.get("rays"), reference=reference)
+    law = list(bounds)[-1] if bounds else "rays"
+    rows = rows_of(found, inputs, bench.truth, resamples, limit=bounds.get(law), reference=reference)
     return {
         "noise": level,
         "variation": variation,
         "limits": {law: _finite(in_units(std)) for law, std in bounds.items()},
+        "limit_law": law,
         "reference": reference,
         "rows": [row.plain() for row in rows],
     }

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark import Answers
 from mitsonar.estimation.benchmark_tables import table_lines
-from mitsonar.estimation.crlb.image_crlb import LAWS
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_json, read_npz, write_json, write_whole
@@ -104,10 +103,10 @@ class AnswersOnDisk(AnswerFolder):
             return None
         found = read_json(path)
         try:
-            bounds = {law: np.array(found[law], dtype=float) for law in LAWS}
-            if any(std.shape != (3,) for std in bounds.values()):
+            bounds = {law: np.array(std, dtype=float) for law, std in found.items()}
+            if not bounds or any(std.shape != (3,) for std in bounds.values()):
                 raise ValueError("a bound is three numbers")
-        except (KeyError, ValueError, TypeError) as error:
+        except (AttributeError, ValueError, TypeError) as error:
             raise MitsonarError(f"{path} is damaged ({error}): remove it, it is made again") from None
         return bounds
 

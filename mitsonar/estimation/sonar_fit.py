@@ -15,7 +15,7 @@ from mitsonar.acoustics import image_statistics as statistics
 from mitsonar.acoustics.coding import decoded
 from mitsonar.acoustics.sonar_losses import gain_of, loss_of
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.water_fit import near_glow, volume
+from mitsonar.estimation.water_fit import glow_by_beam, near_glow, volume
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -97,7 +97,11 @@ class SonarFit:
         law = "none: exponential intensities" if sonar.speckle_nu is None else f"{sonar.speckle_nu:.2g}"
         glow = "none seen"
         if sonar.near_glow_db > 0:
-            glow = f"{sonar.near_glow_db:.1f} dB at range 0, gone at {sonar.near_glow_m:.3g} m"
+            glow = (
+                f"{sonar.near_glow_db:.1f} dB at range 0, gone at {sonar.near_glow_m:.3g} m; outermost beams "
+                f"{sonar.near_glow_edge_db:.1f} dB below the middle one, spread {sonar.near_glow_spread_db:.1f} dB; "
+                f"{100 * sonar.near_glow_still:.0f} % stay from ping to ping"
+            )
         drifting = "none seen" if sonar.volume_db is None else f"{sonar.volume_db:.1f} dB re 1/m"
         return [
             f"noise over full scale   {noise} (noise_level_db: {level})",
@@ -153,7 +157,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         notes.append(f"a speckle_nu of {nu:g} is more than a bottom's texture: objects and edges of the scene count in it")
     leak = statistics.leak_power(intensity[:, statistics.GLOW_BINS :], limit=float(decoded(FULL, sonar))) / _lobe_sum(sonar)
     fitted: dict[str, Any] = {
-        "near_glow_db": 0.0,
+        **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},
         "volume_db": None,
         "stripes_db": round(statistics.beam_stripes_db(level), 2),
         "crosstalk_db": round(float(np.clip(10 * math.log10(leak), -120, 0)), 1) if leak > 0 else None,
@@ -182,7 +186,10 @@ def _water(flat: Array, level: Array, noise: float, sonar: Sonar, full_scale_db:
     found: dict[str, Any] = {"noise_level_db": round(float(statistics.decibels(noise)) + full_scale_db, 1)}
     glow = near_glow(flat, noise, sonar.range_m)
     if glow is not None:
+        edge, spread, still = glow_by_beam(flat, noise, sonar.range_m, sonar.bearing_rad, glow)
         found |= {"near_glow_db": round(glow[0], 1), "near_glow_m": round(glow[1], 4)}
+        found |= {"near_glow_edge_db": round(float(np.clip(edge, -60, 60)), 1), "near_glow_still": round(still, 2)}
+        found["near_glow_spread_db"] = round(min(spread, 20.0), 1)
     drifting = volume(flat, level, noise, sonar, notes)
     if drifting is not None:
         found["volume_db"] = round(float(np.clip(drifting + full_scale_db - sonar.source_level_db, -200, 0)), 1)

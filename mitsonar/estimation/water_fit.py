@@ -7,12 +7,13 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize, special
 
 from mitsonar.acoustics import image_statistics as statistics
 from mitsonar.acoustics.sonar_losses import loss_of
 from mitsonar.instruments.imaging_sonar import Sonar
 
-__all__ = ["moved_correlation", "near_glow", "volume"]
+__all__ = ["glow_by_beam", "moved_correlation", "near_glow", "volume"]
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,12 @@ LEAST_FALL_DB, STEEPER = 10.0, 4.0
 
 MOST_GLOW_DB = 120.0
 """Largest ``near_glow_db``."""
+
+GLOWING_DB, FEWEST_GLOWING = 10.0, 8
+"""Least glow of the bins that tell how beams differ [dB], and the fewest bins."""
+
+CLEAR_DB, FEWEST_CELLS = 15.0, 64
+"""Least glow of the cells that tell what stays, so that noise takes 3 % at most, and the fewest cells."""
 
 NEW = 0.3
 """Correlation of bright grain from frame to frame below which it is new."""
@@ -47,7 +54,7 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
         range_m: of the bins.
     """
     excess = statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise)
-    first = int(np.argmax(excess[: statistics.GLOW_BINS]))
+    first = _first(excess)
     last = max(2 * FEWEST, round(len(excess) * WITHIN))
     at, excess = range_m[first : first + last], excess[first : first + last]
     best: tuple[float, int, Array, Array] | None = None
@@ -67,6 +74,61 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
     middle = float(at[:end].mean())  # the line of 120 dB at range 0 through the middle of the glow
     height = min(start + slope * middle, 0.95 * MOST_GLOW_DB)
     return MOST_GLOW_DB, middle / (1 - height / MOST_GLOW_DB)
+
+
+def _first(excess_db: Array) -> int:
+    """Return the bin from which a glow falls: windows may begin with darker bins."""
+    return int(np.argmax(excess_db[: statistics.GLOW_BINS]))
+
+
+def glow_by_beam(
+    flat: Array, noise: float, range_m: Array, bearing_rad: Array, glow: tuple[float, float]
+) -> tuple[float, ...]:
+    """Return how the near glow differs from beam to beam, and how much of it stays from ping to ping.
+
+    A beam's own glow is the median level of its bins over the line of all beams. Over the square of the bearing a straight
+    line is fitted to it. What is left, without the grain of so many bins, is the spread. The part that stays follows from
+    the correlation of consecutive frames' levels, which is Li2(c^2) / (pi^2 / 6) of complex Gaussian fields of coherence c.
+
+    Args:
+        flat: intensities before the gain ``(frames, bins, beams)``.
+        noise: their mean where there is noise alone.
+        range_m: of the bins.
+        bearing_rad: of the beams.
+        glow: of :func:`near_glow`.
+
+    Returns:
+        ``near_glow_edge_db``, ``near_glow_spread_db``, ``near_glow_still``; zeros where too few bins glow.
+    """
+    line = glow[0] * (1 - range_m / glow[1])
+    first = _first(statistics.decibels(np.median(flat, axis=(0, 2)) / math.log(2) / noise))
+    at = np.arange(len(range_m))
+    kept = (at >= first) & (line > GLOWING_DB)
+    if kept.sum() < FEWEST_GLOWING:
+        return 0.0, 0.0, 0.0
+    least = noise * 1e-3
+    rest = statistics.decibels(np.maximum(flat[:, kept], least) / noise) - line[kept][None, :, None]
+    own = np.median(rest, axis=(0, 1))
+    square = (np.sin(bearing_rad) / np.sin(np.abs(bearing_rad).max())) ** 2
+    found = optimize.least_squares(
+        lambda x: x[0] - x[1] * square - own, (0.0, 0.0), loss="soft_l1", f_scale=statistics.RAYLEIGH_DB
+    )
+    miss = own - found.x[0] + found.x[1] * square
+    spread = 1.4826 * float(np.median(np.abs(miss - np.median(miss))))
+    still = _stays(rest - own, line[kept][:, None] + own > CLEAR_DB)
+    frames = 1 + (len(flat) - 1) * (1 - still)  # what stays is one draw
+    grain = 1.57 * statistics.RAYLEIGH_DB**2 / (frames * kept.sum() / 2)  # of a median; neighbouring bins share grain
+    return float(found.x[1]), math.sqrt(max(spread**2 - grain, 0.0)), still
+
+
+def _stays(grain_db: Array, clear: NDArray[np.bool_]) -> float:
+    """Return the coherence of consecutive frames by the correlation of their levels in the clear cells."""
+    if len(grain_db) < 2 or clear.sum() < FEWEST_CELLS:
+        return 0.0
+    grain = grain_db[:, clear]
+    rho = float(np.mean([np.corrcoef(one, other)[0, 1] for one, other in pairwise(grain)]))
+    top = math.pi**2 / 6
+    return math.sqrt(optimize.brentq(lambda x: special.spence(1 - x) / top - min(max(rho, 0.0), 1.0), 0.0, 1.0))
 
 
 def moved_correlation(level_db: Array) -> float:

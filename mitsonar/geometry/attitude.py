@@ -42,6 +42,9 @@ EVEN = 0.005
 
 FEWEST_BEAMS = 8
 
+FAINTEST = 1e-9
+"""Level, as part of full scale, below which nothing is an echo."""
+
 
 @dataclass(frozen=True)
 class Attitude:
@@ -136,16 +139,19 @@ class _FirstEchoes(NamedTuple):
 
 
 def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _FirstEchoes | None:
-    """Measure how far below the sonar the steepest ray of each beam ends; None where too few beams have a first echo."""
+    """Measure how far below the sonar the steepest ray of each beam ends; None where too few beams have a first echo.
+
+    It is measured on levels: codings such as ``dB`` and ``gamma`` lift the skirt of the light to a height like the ground's.
+    """
     if frames.level == "contrast":
         return None  # its dark parts are no water without echoes
-    image = frames.image.mean(axis=0, dtype=np.float32)
+    image = frames.linear_values().mean(axis=0, dtype=np.float32)
     smooth = cv2.GaussianBlur(image, (3, 13), sigmaX=0.5, sigmaY=2.0, borderType=cv2.BORDER_REPLICATE)
     start, bins = smooth[:15], len(smooth)
     dark = float(np.percentile(start, 25))
     spread = (dark - float(np.percentile(start, 5))) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
     bright = float(smooth[bins // 4 : 3 * bins // 4].mean())
-    over = smooth > dark + max(5 * spread, 0.15 * (bright - dark), 1e-6)
+    over = smooth > dark + max(5 * spread, 0.15 * (bright - dark), FAINTEST)
     first = over.argmax(axis=0)
     received = over.any(axis=0)
     if (received & (first > 2)).sum() < max(FEWEST_BEAMS, over.shape[1] // 4):

@@ -182,6 +182,10 @@ class ChannelSonar(Instrument):
     scatterer_spacing_m: float | None = Field(
         None, gt=0, le=10, description="pitch of the points on all surfaces [m], as of an imaging sonar; default: cells"
     )
+    speckle_nu: float | None = Field(
+        None, gt=0.05, le=100, description="shape of the K law of surfaces without cells, as of an imaging sonar"
+    )
+    speckle_patch_m: float = Field(0.1, gt=0, le=100, description="side of the patches that speckle_nu varies over [m]")
     rays: int = Field(50_000, ge=1, le=10**8, description="rays within each receiver's field of view, model rays")
     seed: int = Field(0, ge=0, lt=2**31, description="of the places and weights of scatterers without cells")
     transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="its field of view")

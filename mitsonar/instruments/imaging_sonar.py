@@ -27,7 +27,7 @@ RAYS = ("rays_per_beam", "rays_across")
 """Fields that follow from ``quality`` where they are not given."""
 
 LEAST_APERTURE = 0.5
-"""Shortest aperture of the model coherent [wavelengths]."""
+"""Shortest aperture of a pattern of beams [wavelengths]."""
 
 MOST_COHERENT_DEG = 170
 """Largest field of view of the model coherent: its fan is even in the sine and the tangent of angles [deg]."""
@@ -182,6 +182,19 @@ class Sonar(Instrument):
     )
     near_glow_db: float = Field(0.0, ge=0, le=120, description="noise near the sonar above noise_level_db [dB] (coherent)")
     near_glow_m: float = Field(0.5, gt=0, le=100, description="range over which near_glow_db falls to 0, evenly in dB [m]")
+    near_glow_edge_db: float = Field(
+        0.0,
+        ge=-60,
+        le=60,
+        description="what the outermost beams glow less than the middle one, as the square of the bearing [dB]",
+    )
+    near_glow_spread_db: float = Field(0.0, ge=0, le=20, description="spread of the beams' near glow, by the seed [dB]")
+    near_glow_still: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="part of the near glow's power that is the same in every ping, as the housing's ringing is",
+    )
     absorption_db_per_m: float | None = Field(
         None, ge=0, le=1e3, description="one way [dB/m]; default: coherent by frequency and water, else 0"
     )
@@ -228,6 +241,8 @@ class Sonar(Instrument):
             raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
         if self.model == "coherent":
             self._check_coherent()
+        if self.beam_pattern != "box":
+            self._check_aperture()
         rays = self.beams * (1 if self.model == "thesis" else self.rays_across) * self.rays_per_beam
         if rays > 2**28:
             raise ValueError(f"a ping has at most {2**28:,} rays: got {rays:,}; lower quality, beams or numbers of rays")
@@ -252,11 +267,14 @@ class Sonar(Instrument):
                 f"carrier: got frequency_hz {self.frequency_hz:g}; give it in Hz, at least {band / 2:.3g}, or a larger "
                 "pulse_m"
             )
-        if self.aperture.length < LEAST_APERTURE:
+
+    def _check_aperture(self) -> None:
+        length = self.aperture.length
+        if length < LEAST_APERTURE:
+            widest = math.degrees(length * self.beam_width_rad / LEAST_APERTURE)
             raise ValueError(
                 f"an aperture is at least half a wavelength: a beam of {math.degrees(self.beam_width_rad):.3g} deg takes "
-                f"{self.aperture.length:.2g}; give beam_width_deg below "
-                f"{math.degrees(self.aperture.length * self.beam_width_rad / LEAST_APERTURE):.3g}"
+                f"{length:.2g}; give beam_width_deg below {math.floor(widest * 10) / 10:g}"
             )
 
     def replace(self, **fields: FieldValue) -> Self:

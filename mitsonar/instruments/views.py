@@ -18,7 +18,7 @@ from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
 
-__all__ = ["SEGMENTS", "Receiver", "Segment", "View", "Whole"]
+__all__ = ["CONES", "SEGMENTS", "Receiver", "Segment", "View", "Whole"]
 
 SEGMENTS = {
     "whole": (None, None),
@@ -34,6 +34,9 @@ SEGMENTS = {
     "c4": (+1, +1),
 }
 """Signs of bearing and elevation. Quadrants run from fore-starboard clockwise; c1 to c4 are the cones inscribed in them."""
+
+CONES = ("c1", "c2", "c3", "c4")
+"""The segments whose border is a circle."""
 
 FEWEST_ACROSS = 8
 """Jittered rays of the transmitter across a receiver's beam; with fewer, images have stripes."""
@@ -113,7 +116,7 @@ class Segment:
             member &= (beam >= sonar.beams // 2) == (self.fore > 0)
         if self.up is not None:
             member &= (row < sonar.rays_per_beam // 2) == (self.up > 0)
-        if self.fore is not None and self.up is not None and self.name.startswith("c"):
+        if self.fore is not None and self.up is not None and self.name in CONES:
             member &= self._inside_cone(self.fore, self.up)
         return member.ravel()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,9 @@ __all__ = ["LabelledPart", "recording_at"]
 
 Index = NDArray[np.intp]
 
+Labels: TypeAlias = dict[str, Any]
+"""Arrays of per-pixel truth by the names of :data:`~mitsonar.records.sonar_frames.LABELS`."""
+
 
 @dataclass(frozen=True)
 class LabelledPart(Part):
@@ -30,7 +33,7 @@ class LabelledPart(Part):
         labels: reads the labels of frames of given numbers ``(n,)`` by name: ``(n, bins, beams)``.
     """
 
-    labels: Callable[[Index], dict[str, NDArray[Any]]] = lambda index: {}
+    labels: Callable[[Index], Labels] = lambda index: {}
 
     def read(self, index: ArrayLike) -> SonarFrames:
         """Read frames of these numbers ``(n,)``, with labels.
@@ -73,7 +76,7 @@ def recording_at(
     return Recording(str(where), words, (part,), {}, (source.note,) if source.note else ())
 
 
-def _labels_at(path: Path) -> Callable[[Index], dict[str, NDArray[Any]]] | None:
+def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
     """Return what reads the labels of a run; None where it has none."""
     if path.is_dir() and path.suffix != ".zarr":
         path = next(one for one in (path / "frames.npz", path / "frames.zarr") if one.exists())
@@ -86,7 +89,7 @@ def _labels_at(path: Path) -> Callable[[Index], dict[str, NDArray[Any]]] | None:
     except Exception as error:  # a damaged Zarr raises errors of many kinds
         raise MitsonarError(f"cannot read the labels of {path}: {' '.join(str(error).split())[:160]}") from None
 
-    def stored(index: Index) -> dict[str, NDArray[Any]]:
+    def stored(index: Index) -> Labels:
         return {
             name: np.stack([np.asarray(one[int(number)]) for number in index]) if len(index) else np.asarray(one[:0])
             for name, one in arrays.items()

@@ -57,10 +57,10 @@ class Checkpoint:
         labels: of its output: kind, low, high, names; see :attr:`coder`.
         sonar: fields of the sonar of each view, by name; empty where the network works with any sonar.
         trained_at: geometry of the sonar in training: ``height_m`` [low, high] over z = 0, ``pitch_deg``, ``roll_deg``.
-        model: ``thesis`` or ``physical``.
+        model: ``thesis``, ``physical`` or ``coherent``; of several data sets all of them: ``coherent and physical``.
         noise: of training, as text.
-        data: name of the recipe of the data set.
-        data_recipe: that recipe.
+        data: name of the recipe of the data set, or of all of them.
+        data_recipe: that recipe, or the first.
         recipe: of the training.
         metrics: of validation by noise level: ``{"none": {"rmse": [sideways mm, forward mm, yaw deg], "pairs": 500}}``;
             for heights rmse is ``[mm]``.
@@ -106,13 +106,13 @@ class Checkpoint:
             )
         recipe, coder, described = samples.recipe, samples.labels, samples.described()
         table: Fields = {
+            "data": recipe.name,
             **described,
             "network": names[0],
             "options": network.options,
             "weights": {name: values.detach().cpu().clone() for name, values in network.state_dict().items()},
             "labels": {"kind": coder.kind, "low": coder.low, "high": coder.high, "names": coder.names},
             "sonar": {} if NETWORKS[names[0]].any_sonar else described["sonar"],
-            "data": recipe.name,
             "data_recipe": recipe.model_dump(mode="json"),
             **about,
         }

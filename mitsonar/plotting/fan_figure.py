@@ -35,6 +35,7 @@ def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figur
         low, high = frames.decibels_of(0.0), frames.decibels_of(1.0)
         values, norm = low + values * (high - low), Normalize(low, high)
         label = "level (dB re 1 uPa)" if frames.sonar.source_level_db else "level (dB re the source at 1 m)"
+        label = "level (dB re full scale)" if (low, high) == (-frames.sonar.coding_db, 0.0) else label
         label += " with gain" if frames.sonar.gain_exponent or frames.sonar.gain_absorption else ""
     else:
         norm, label = PowerNorm(GAMMA, vmin=0, vmax=1), f"level (1 = full scale; shown with gamma {GAMMA:g})"

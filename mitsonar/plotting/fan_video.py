@@ -32,7 +32,9 @@ def write_fan_video(
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Write frames of one geometry as a video: forward up, starboard right, with number and time; whole or absent.
+    """Write frames of one geometry as a video: forward up, starboard right, with number and time since the first.
+
+    The file is whole or absent.
 
     Args:
         chunks: the frames, some at a time.
@@ -73,7 +75,7 @@ def _write(
     except ModuleNotFoundError as error:
         raise explain_missing(error) from None
     colours = _colours()
-    writer, fan, count = None, None, 0
+    writer, fan, count, begin = None, None, 0, 0.0
     try:
         for frames in chunks:
             if fan is None:
@@ -82,7 +84,8 @@ def _write(
             for image, time in zip(shown, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
                 values = np.asarray(fan.apply(np.asarray(image, np.float32)))
                 picture = _even(colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)])
-                text = f"{count}   {time:.2f} s"
+                begin = begin if count else float(time)
+                text = f"{count}   {time - begin:.2f} s"
                 cv2.putText(picture, text, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
                 if writer is None:
                     codec = cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()])

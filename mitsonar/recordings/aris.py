@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.recordings.beam_table import aris_bearings
+from mitsonar.recordings.beam_table import TABLES, aris_bearings
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
 from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, mapped
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
@@ -74,7 +74,8 @@ CODING_DB = 80.0
 
 MOST_SAMPLES = 65_536
 LEAST_SPEED, MOST_SPEED = 1000.0, 2000.0
-"""What a header may say: samples of a beam, sound speed [m/s]."""
+LONGEST_M = 1e4
+"""What a header may say: samples of a beam, sound speed [m/s], end of the window [m]."""
 
 SAME_SPEED = 0.002
 """Relative change of the sound speed up to which a window counts as the same."""
@@ -141,26 +142,31 @@ def _frames_of(data: Bytes, name: str) -> tuple[EqualFrames, int]:
 
 def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
     """Return which frames have a header that can be, and sentences on the others."""
-    first = headers[0]
-    speed = headers["sound_speed"]
+    first, told = headers[0], headers["sound_speed"].astype(float)
+    speed = np.where((told > LEAST_SPEED) & (told < MOST_SPEED), told, np.nan)
     whole = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
+    whole &= headers["samples"] == first["samples"]
+    end_us = headers["start_delay_us"] + headers["sample_period_us"] * headers["samples"].astype(float)
     whole &= (
-        (headers["samples"] == first["samples"])
-        & (headers["sample_period_us"] > 0)
-        & np.isin(headers["system"], list(KINDS))
+        (headers["sample_period_us"] > 0) & (end_us * 1e-6 * speed / 2 < LONGEST_M) & np.isin(headers["system"], list(KINDS))
     )
-    whole &= (
-        (speed > LEAST_SPEED)
-        & (speed < MOST_SPEED)
-        & (headers["sample_period_us"] < 1e6)
-        & (headers["start_delay_us"] < 1e8)
-    )
+    tabled = whole & _tabled(headers)
+    whole = tabled if tabled.any() else whole  # where all frames lack a table, the error says which
     notes = []
     if not whole.all():
         notes.append(f"{(~whole).sum():,} frames have a damaged header and are left out")
     if frames.left_over:
         notes.append(f"the last {frames.left_over:,} bytes are no whole frame and are left out")
     return whole, notes
+
+
+def _tabled(headers: Header) -> NDArray[np.bool_]:
+    """Return which frames ``(frames,)`` have a table of beam angles."""
+    beams, lens = BEAMS[int(headers["ping_mode"][0])], headers["large_lens"] != 0
+    known = lens & (("telephoto", beams) in TABLES)
+    for system, kind in KINDS.items():
+        known |= ~lens & (headers["system"] == system) & ((kind.name, beams) in TABLES)
+    return np.asarray(known, dtype=bool)
 
 
 def windows_of(headers: Header) -> list[tuple[float, ...]]:

@@ -1,7 +1,9 @@
 """DIDSON files (``.ddf``, DDF 3 and 4) of Sound Metrics: frames, range axis by timing, beams of the lens.
 
-Source: public readers of such files, and Sound Metrics' MATLAB reader as they quote it. No real file was at hand: the reader
-was tested on files that its tests write by this description, not on a recording.
+Source: public readers of such files, Sound Metrics' MATLAB reader as they quote it, and what Echoview says of the format.
+No real file was at hand: the reader was tested on files that its tests write by this description, not on a recording. The
+authors of hydroformats (Apache-2.0) report that ten recordings of version 3 have headers of these sizes, this clock, and a
+sound speed at this place.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ FILE = layout(
     },
     512,
 )  # fmt: skip
-"""Fields of the file's header: offset [bytes] and type. The sound speed is of version 4."""
+"""Fields of the file's header: offset [bytes] and type."""
 
 COMMON = MOTION | {
     "index": (0, "<u4"), "time_s": (4, "<u4"), "signature": (12, "S4"), "year": (20, "<u4"), "month": (24, "<u4"),
@@ -82,6 +84,9 @@ FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), LONG_RANGE: (0.7e6, 1.2e6)}
 NOMINAL_SPEED = 1500.0
 """Sound speed where the file tells none [m/s]."""
 
+LEAST_SPEED, MOST_SPEED = 1300, 1700
+"""What is believed of a sound speed [m/s]."""
+
 CODING_DB = 90.0
 """Span of the values 0..255 [dB]."""
 
@@ -93,6 +98,9 @@ CLOCK = {
     "hundredth": (0, 99),
 }  # fmt: skip
 """Fields of the sonar's clock, and what is believed of them."""
+
+LONGEST_TIE = 3.0
+"""Frames of one time are spread over the time to the next, at most so many times that of the frame rate."""
 
 MOST_SAMPLES = 65_536
 
@@ -106,10 +114,11 @@ def read_didson(path: str | Path) -> Recording:
     The window of each frame follows from its own codes and from the timing: it begins at ``code * delay * c / 2``, and
     sample n lies at (n + 1/2) ``c / (2 sample rate)`` from there. The file's sample rate belongs to the window's length in
     its header; in frames of another length it changes in proportion. Without a sample rate the nominal lengths stand in.
-    A note says where timing and nominal window differ. The sound speed is that of the file (version 4), or 1500 m/s.
+    A note says where timing and nominal window differ. The sound speed is that of the file, or 1500 m/s.
 
     Values 0..255 stand for 0..90 dB. Beam 0 is the one most to starboard, where ``reverse`` is not 0 the one most to port.
-    Attitude is that of the sonar's compass. Times are the sonar's clock, to 0.01 s.
+    Attitude is that of the sonar's compass. Times are the sonar's clock, local time to 0.01 s; frames that share one are
+    spread evenly up to the next.
 
     Raises:
         MitsonarError: no such file, another format, or no frame that can be read.
@@ -129,7 +138,7 @@ def read_didson(path: str | Path) -> Recording:
     notes += [f"the last {frames.left_over:,} bytes are no whole frame and are left out"] if frames.left_over else []
     time_s, timing = _times(headers, head)
     kept, sorting = in_time_order(np.where(whole, time_s, np.nan), headers["index"])
-    windows = _Windows(head, version)
+    windows = _Windows(head)
     parts = tuple(
         _part(frames, headers[kept[run]], kept[run], time_s[kept[run]], windows)
         for _, run in runs_of([windows.key(one) for one in headers[kept]])
@@ -158,22 +167,36 @@ def _frames_of(data: Bytes, head: np.void, version: int, name: str) -> EqualFram
 
 def _times(headers: Header, head: np.void) -> tuple[Array, list[str]]:
     """Return the times of the frames ``(frames,)`` [s] by the sonar's clock; by the frame rate where that never ran."""
-    parts = {
-        name: headers[name].astype(np.int64) for name in ("year", "month", "day", "hour", "minute", "second", "hundredth")
-    }
-    limits = {"year": (1970, 2200), "month": (1, 12), "day": (1, 31), "hour": (0, 23), "minute": (0, 59), "second": (0, 60)}
-    known = parts["hundredth"] < 100
-    for name, (least, most) in limits.items():
+    stated = int(head["frame_rate_hz"])
+    rate = float(stated) if 0 < stated <= 100 else 10.0
+    parts = {name: headers[name].astype(np.int64) for name in CLOCK}
+    known = np.ones(len(headers), dtype=bool)
+    for name, (least, most) in CLOCK.items():
         known &= (parts[name] >= least) & (parts[name] <= most)
     if known.any():
         months = np.where(known, (parts["year"] - 1970) * 12 + parts["month"] - 1, 0)
         days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + parts["day"] - 1
         seconds = ((days * 24 + parts["hour"]) * 60 + parts["minute"]) * 60 + parts["second"]
-        return np.where(known, seconds + parts["hundredth"] / 100, np.nan), []
-    stated = int(head["frame_rate_hz"])
-    rate = float(stated) if 0 < stated <= 100 else 10.0
+        time_s = np.where(known, seconds + parts["hundredth"] / 100, np.nan)
+        return _spread(time_s, headers["index"], 1 / rate)
     note = f"the sonar's clock tells no times: frames follow each other at {rate:g} Hz, by their numbers"
     return headers["index"].astype(float) / rate, [note]
+
+
+def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[str]]:
+    """Return times ``(frames,)`` [s] with frames of one time, but of rising numbers, spread up to the time of the next."""
+    new = np.ones(len(time_s), dtype=bool)
+    new[1:] = (np.diff(time_s) != 0) | (np.diff(number.astype(np.int64)) <= 0)
+    if new.all():
+        return time_s, []
+    begin = np.flatnonzero(new)
+    count = np.diff(begin, append=len(time_s))
+    gap = np.append(np.diff(time_s[begin]), np.nan)
+    gap = np.where((gap > 0) & (gap < LONGEST_TIE * period_s * count), gap, period_s * count)
+    group = np.cumsum(new) - 1
+    part = (np.arange(len(time_s)) - begin[group]) / count[group]
+    note = f"{(~new).sum():,} frames have the clock of the one before: they were spread evenly up to the next"
+    return time_s + part * gap[group], [note]
 
 
 @dataclass(frozen=True)
@@ -181,7 +204,6 @@ class _Windows:
     """How the windows of a file's frames follow from their codes."""
 
     head: np.void
-    version: int
 
     @property
     def high(self) -> bool:
@@ -193,8 +215,8 @@ class _Windows:
 
     @property
     def sound_speed(self) -> float:
-        stated = int(self.head["sound_speed"]) if self.version >= 4 else 0
-        return float(stated) if 1300 <= stated <= 1700 else NOMINAL_SPEED
+        stated = int(self.head["sound_speed"])
+        return float(stated) if LEAST_SPEED <= stated <= MOST_SPEED else NOMINAL_SPEED
 
     def config(self, header: np.void) -> int:
         """Return the configuration of a frame, which old sonars do not tell."""
@@ -225,7 +247,7 @@ class _Windows:
     def notes(self, headers: Header) -> list[str]:
         """Return sentences on what is assumed, and on windows whose timing and tables differ."""
         notes = []
-        if not 1300 <= (int(self.head["sound_speed"]) if self.version >= 4 else 0) <= 1700:
+        if not LEAST_SPEED <= int(self.head["sound_speed"]) <= MOST_SPEED:
             notes.append(f"the file tells no sound speed: {NOMINAL_SPEED:g} m/s is taken")
         rate = float(self.head["sample_rate_hz"])
         if not (math.isfinite(rate) and 1e2 < rate < 1e8):

@@ -1,7 +1,8 @@
 """Oculus recordings of Blueprint Subsea: dumps of messages (``.raw``) and logs (``.oculus``), message versions 0, 1 and 2.
 
-Source of the layout: the public headers of Blueprint Subsea's SDK, as liboculus (BSD-3-Clause) quotes them. Version 0 and 8
-bits were checked on real pings. Version 2, other widths, gains of rows and logs were not: no such file was at hand.
+Source of the layout: liboculus (BSD-3-Clause). Version 0 and 8 bits were checked on real pings. Version 2, other widths,
+gains of rows and logs were not: no such file was at hand. The authors of hydroformats (Apache-2.0) report a real log of
+version 2 whose start times are seconds, and whose bearings are negative to port.
 """
 
 from __future__ import annotations
@@ -72,8 +73,11 @@ MOST_CELLS = 2**28
 LONGEST_M = 1e4
 """What is believed of an image: cells, and its far end [m]."""
 
-LONGEST_S = 1e4
-"""What is believed of the time between two pings [s]."""
+LONGEST_S, LATEST_S = 1e4, 1e11
+"""What is believed of the time between two pings, and of a time [s]."""
+
+SAME_CLOCK_S = 1.0
+"""Difference between the clocks of sonar and log, beyond their shift, up to which they count as one [s]."""
 
 BANDS = {
     "oculus-m750d-750khz": (6e5, 9e5),
@@ -94,8 +98,10 @@ def read_oculus(path: str | Path) -> Recording:
     byte 127, 1 for 0 and 255. Where rows begin with a gain, counts are divided by its root, as two public readers do.
     Where a frame has 8 bits and no gains its image is uint8, else float32.
 
-    Times are those of a log, or the start times of version 2 [s]. The counter of older versions has no known unit: frames
-    of a dump then follow each other at the ping rate, or at 10 Hz where that has no known code, by their numbers.
+    Times are those of a log, or the start times of version 2 [s]. A log of version 2 has both: then times are those of the
+    sonar, which do not jitter, shifted to the log's clock. The counter of older versions has no known unit: it rises by 62.5
+    million a ping in the real ones, and one public driver calls it microseconds. Frames of such a dump follow each other by
+    their numbers, at the ping rate, or at 10 Hz where that has no known code.
     Attitude is that of version 2 [deg], its pitch taken as upward positive.
 
     Raises:
@@ -178,15 +184,14 @@ def _whole(head: Header, size: NDArray[np.int64]) -> NDArray[np.bool_]:
     ranges, beams, image = (head[name].astype(np.int64) for name in ("ranges", "beams", "image"))
     rows = ranges * beams * (np.minimum(head["width"], 3) + 1)
     start = np.where(head["version"] >= 2, LATER.itemsize, OLDER.itemsize)
-    far = head["resolution"] * ranges
+    step = np.where((head["resolution"] > 1e-6) & (head["resolution"] < LONGEST_M), head["resolution"], np.nan)
     return np.asarray(
         (head["version"] <= 2)
         & (head["width"] <= 3)
         & (ranges > 0)
         & (beams > 1)
         & (ranges * beams <= MOST_CELLS)
-        & (head["resolution"] > 1e-6)
-        & (far < LONGEST_M)
+        & (step * ranges < LONGEST_M)
         & (image >= start + 2 * beams)
         & (head["image_size"] >= rows)
         & (image + head["image_size"] <= size)
@@ -208,11 +213,12 @@ def _gained(head: Header) -> NDArray[np.bool_]:
 
 def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     """Return the times of the pings ``(n,)`` [s], and a sentence where they are assumed."""
-    if np.isfinite(logged_s).any():
-        return logged_s, []
     head = pings.head
     start: Array = head["start"].astype(np.float64)
-    if (head["version"] >= 2).all() and len(head) > 1 and _rise(start):
+    steady = (head["version"] >= 2).all() and len(head) > 1 and _rise(start)
+    if np.isfinite(logged_s).any():
+        return (_shifted(start, logged_s) if steady else logged_s), []
+    if steady:
         return start, []
     number = np.diff(head["number"].astype(np.int64))
     number = np.where((number > 0) & (number < 1_000_000), number, 1)
@@ -223,8 +229,17 @@ def _times(pings: _Pings, logged_s: Array) -> tuple[Array, list[str]]:
     return np.concatenate([[0.0], np.cumsum(number)]) / rate, [note]
 
 
+def _shifted(start_s: Array, logged_s: Array) -> Array:
+    """Return the sonar's times on the clock of the log ``(n,)`` [s]; those of the log where the clocks part."""
+    late = logged_s - start_s
+    shift = np.nanmedian(late)
+    return start_s + shift if bool((np.abs(late - shift) < SAME_CLOCK_S).all()) else logged_s
+
+
 def _rise(time_s: Array) -> bool:
     """Return whether each time comes after the one before, and not long after."""
+    if not (np.abs(time_s) < LATEST_S).all():
+        return False
     steps = time_s[1:] - time_s[:-1]
     return bool(((steps > 0) & (steps < LONGEST_S)).all())
 
@@ -263,7 +278,7 @@ def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) ->
     bins, beams = images.shape
     step = float(np.median(head["resolution"]))
     frequency = float(first["frequency"])
-    known = next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
+    known = _known(frequency)
     named = preset(known) if known else None
     layout_name, fan_deg = _layout(bearings)
     sonar = Sonar.create(
@@ -291,6 +306,11 @@ def _like(head: Header, bearings: Array, time_s: Array, images: OculusImages) ->
         sonar=sonar,
         level="gamma",
     )
+
+
+def _known(frequency: float) -> str | None:
+    """Return the preset of a carrier [Hz]; None where there is none."""
+    return next((name for name, (low, high) in BANDS.items() if low < frequency < high), None)
 
 
 def _layout(bearings: Array) -> tuple[str, float]:
@@ -356,4 +376,6 @@ def _notes(head: Header) -> list[str]:
         )
     if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
         notes.append("the sound speed of the messages cannot be: 1500 m/s is taken; ranges do not depend on it")
+    if not _known(float(head["frequency"][0])):
+        notes.append(f"no preset has this carrier: an opening over elevation of {ELEVATION_DEG:g} deg is taken")
     return notes

@@ -1,8 +1,8 @@
 """Where the messages of an Oculus lie in a file: back to back in a dump (``.raw``), or in the items of a log (``.oculus``).
 
-Only headers are read to find them, so that a file of any size is opened at once. Source of both layouts: the public headers
-of Blueprint Subsea's SDK, as liboculus (BSD-3-Clause) quotes them. That of a log was inferred from a public reader; no log
-was at hand.
+Only headers are read to find them, so that a file of any size is opened at once. Source of both layouts: public readers,
+liboculus (BSD-3-Clause) for messages and oculus_driver (its files under BSD-3-Clause) for logs. No log was at hand; the
+authors of hydroformats (Apache-2.0) report that real ones have these headers.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import struct
 import zlib
 from array import array
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,9 @@ __all__ = ["DUMP", "HEADER", "LOG", "PING", "Messages", "find_messages", "is_ocu
 
 DUMP, LOG = b"SO", struct.pack("<I", 0x11223344)
 """First bytes of a message, and so of a dump; first bytes of a log."""
+
+DATABASE = b"SQLite format 3\0"
+"""First bytes of a log of ViewPoint 2, which is not read."""
 
 ITEM = struct.pack("<I", 0xAABBCCDD)
 """First bytes of an item of a log."""
@@ -130,9 +134,9 @@ class Messages:
         return np.frombuffer(made, np.uint8)
 
 
-def is_oculus(first: bytes) -> bool:
+def is_oculus(path: Path, first: bytes) -> bool:
     """Return whether the first bytes of a file, 16 or more, are those of a dump or of a log."""
-    if first.startswith(LOG):
+    if first.startswith(LOG) or (first.startswith(DATABASE) and path.suffix.lower() == ".oculus"):
         return True
     if not first.startswith(DUMP) or len(first) < HEADER.size:
         return False
@@ -152,12 +156,15 @@ def find_messages(data: Bytes, name: str) -> Messages:
     Raises:
         MitsonarError: neither of them, or an encrypted log.
     """
-    first = data[:4].tobytes()
-    if first == LOG:
+    first = data[:16].tobytes()
+    if first.startswith(DATABASE):
+        raise MitsonarError(f"{name} is a log of ViewPoint 2, a database: export it in the format of ViewPoint 1")
+    if first.startswith(LOG):
         return _in_log(data, name)
-    if first[:2] != DUMP:
+    if not first.startswith(DUMP):
         raise MitsonarError(
-            f"{name} is no recording of an Oculus: it begins with {first!r}, not with {DUMP!r} (.raw) or {LOG!r} (.oculus)"
+            f"{name} is no recording of an Oculus: it begins with {first[:4]!r}, not with {DUMP!r} (.raw) or {LOG!r} "
+            "(.oculus)"
         )
     return _in_dump(data, name)
 

@@ -63,7 +63,7 @@ def _says_it_itself(read: Callable[[Path], Recording]) -> Callable[[Path, Path |
 FORMATS: tuple[Format, ...] = (
     Format("ARIS (.aris)", lambda path, first: first.startswith(SIGNATURE), _says_it_itself(read_aris)),
     Format("DIDSON (.ddf)", lambda path, first: first[:4] in SIGNATURES, _says_it_itself(read_didson)),
-    Format("Oculus (.raw, .oculus)", lambda path, first: is_oculus(first), _says_it_itself(read_oculus)),
+    Format("Oculus (.raw, .oculus)", is_oculus, _says_it_itself(read_oculus)),
     Format("ROS bags (.bag, .mcap, .db3, folders)", is_ros_bag, read_ros_bag),
     Format("folders of UXO (DFKI)", is_uxo, _says_it_itself(read_uxo)),
     Format("folders of CANOE", is_canoe, _says_it_itself(read_canoe)),

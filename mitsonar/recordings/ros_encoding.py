@@ -300,7 +300,7 @@ class FrameEncoder:
 
 
 def nanoseconds(time_s: Array) -> list[int]:
-    """Return times as whole nanoseconds ``(n,)``, from which dividing by 10^9 gives back the same float.
+    """Return times as whole nanoseconds ``(n,)``. Those that are whole, or dates since 1970, come back to the bit.
 
     Raises:
         MitsonarError: times that ROS cannot hold.

@@ -137,6 +137,8 @@ class TopicScan:
     def frames(self, places: Index) -> Iterator[tuple[int, Message]]:
         """Read and decode the messages at these places, in rising order; yield place and message."""
         wanted = np.unique(places)
+        if not len(wanted):
+            return
         for run in np.split(wanted, np.flatnonzero(np.diff(wanted) > NEAR) + 1):
             at = {(self.received[place], self.nth[place]): int(place) for place in run}
             times = [time for time, _ in at]

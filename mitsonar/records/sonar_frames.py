@@ -132,17 +132,28 @@ class SonarFrames:
         Raises:
             MitsonarError: images of contrast, of which levels cannot be had back.
         """
+        return replace(self, image=self.linear_values(), level="linear")
+
+    def linear_values(self) -> NDArray[np.float32]:
+        """Return the levels of the images as float32, as parts of full scale, like ``image``.
+
+        Raises:
+            MitsonarError: images of contrast, of which levels cannot be had back.
+        """
         if self.level == "contrast":
             raise MitsonarError("images of contrast hold no levels: take the frames before their contrast")
-        return replace(self, image=decoded(self._values(), self.sonar, self.level).astype(np.float32), level="linear")
+        values = self._values()
+        if self.level == "linear":
+            return values
+        return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level), dtype=np.float32)
 
     def in_decibels(self) -> NDArray[np.float32]:
         """Return levels relative to full scale, like ``image`` [dB], -100 at least.
 
         Raises:
-            MitsonarError: as :meth:`to_linear`.
+            MitsonarError: as :meth:`linear_values`.
         """
-        level = np.maximum(self.to_linear().image, np.float32(10 ** (FLOOR_DB / 10)))
+        level = np.maximum(self.linear_values(), np.float32(10 ** (FLOOR_DB / 10)))
         return np.asarray(10 * np.log10(level), dtype=np.float32)
 
     def _values(self) -> NDArray[np.float32]:
@@ -156,10 +167,9 @@ class SonarFrames:
         amplitude is returned: of level, amplitude, its root and dB it made the smallest errors on speckle, with all
         estimators.
         """
-        values = self._values()
-        if self.level in ("linear", "contrast"):
-            return values
-        return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level) ** 0.25, dtype=np.float32)
+        if self.level == "contrast":
+            return self._values()
+        return self.linear_values() if self.level == "linear" else self.linear_values() ** np.float32(0.25)
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
         """Return some of the frames."""

@@ -273,7 +273,7 @@ class _WorldScatterers:
 
 def _points_of(sonar: ChannelSonar) -> tuple[float | None, ...]:
     """Return what the points of a scene follow from."""
-    return sonar.points_per_m2, sonar.scatterer_spacing_m, sonar.seed
+    return sonar.points_per_m2, sonar.scatterer_spacing_m, sonar.speckle_nu, sonar.speckle_patch_m, sonar.seed
 
 
 class _VehicleRays:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -16,12 +17,15 @@ from mitsonar.acoustics.sonar_losses import gain_of, loss_notes, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.aperture import series, shaded_sinc
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.views import View, Whole
+from mitsonar.instruments.quality import Quality
+from mitsonar.instruments.views import CONES, Segment, View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.hashed_points import MOST_CANDIDATES
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
 from mitsonar.simulation.mirror_tracing import MirrorTracer
+from mitsonar.simulation.rendered_pings import CutRays, RenderedPings
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -31,8 +35,17 @@ __all__ = ["CoherentImager", "coherent_imager"]
 FEWEST_A_CELL = 4.0
 """Points in a resolution cell below which the speckle's contrast exceeds theory by 3 % and more (measured)."""
 
-STRIPES, NOISE, VOLUME = 0x57121, 0x6E6F6973, 0x766F6C75
-"""Keep the draws of stripes, noise and volume apart."""
+MOST_CUT = 1e-3
+"""Part of the rays that may miss points: those that graze the sides of bodies do, and carry little."""
+
+STRIPES, NOISE, VOLUME, GLOW = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77
+"""Keep the draws of stripes, noise, volume and glow apart."""
+
+MEDIAN_SQUARE = 0.25
+"""Median over even beams of the square of the bearing, relative to the outermost."""
+
+SIDE_SALT = {0: 0, 1: 0x7570 << 32, -1: 0x646F << 32}
+"""Keep the noise of both sides of the elevation apart."""
 
 
 class CoherentImager:
@@ -42,46 +55,91 @@ class CoherentImager:
         scene: any Mitsuba scene.
         sonar: of the model ``coherent``.
         mirrors: parts of shapes that reflect as mirrors, by the shapes' ids; default: none.
+        views: the whole, or portions of the field of view.
 
     Attributes:
+        sides: of the elevation, each rendered by itself: of the whole view 0, of portions +1 and -1.
         notes: what a user should know about scene and sonar.
+
+    Raises:
+        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None) -> None:
+    def __init__(
+        self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None, views: Sequence[View] | None = None
+    ) -> None:
+        self.views = check_views(views or [Whole(sonar)], mirrors)
+        self.sides = tuple(dict.fromkeys(side_of(view) for view in self.views))
         self.sonar, self.former = sonar, BeamFormer(sonar)
+        self._given = scene, mirrors
         self._kept_waves: dict[int, NDArray[np.float32]] = {}
         parts = mirror_of(scene, mirrors)
-        self.tracer = CoherentTracer(scene, sonar, self.former, parts)
+        self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side) for side in self.sides}
+        self.tracer = self.tracers[self.sides[0]]
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
     def image(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the complex image of one ping ``(bins, beams)`` with its noise, and the counts of its rays.
+        """Return the complex image of one ping ``(bins, sides * beams)`` with its noise, and the counts of its rays.
 
         Args:
             pose: of the sonar ``(6,)`` [m, rad].
             ping: its number, of which the noise is a function.
         """
-        field, counts = self.tracer.field(pose)
+        images, counts = zip(*(self._of_side(pose, ping, side) for side in self.sides), strict=True)
+        return np.concatenate(images, axis=1) if len(images) > 1 else images[0], FieldCounts.joined(counts)
+
+    def _of_side(self, pose: NDArray[np.float64], ping: int, side: int) -> tuple[NDArray[np.complex64], FieldCounts]:
+        """Return what one side of the elevation, or both, give ``(bins, beams)``, and the counts of its rays."""
+        image, counts = self.echoes(pose, side)
+        if self.sonar.volume_db is not None:
+            image = image + self.volume(ping, side)
+        if self.sonar.noise_level_db is not None:
+            image = image + self.noise(ping, side)
+        if self.sonar.stripes_db > 0:
+            image = image * self._stripes
+        return np.asarray(image, dtype=np.complex64), counts
+
+    def echoes(self, pose: NDArray[np.float64], side: int | None = None) -> tuple[NDArray[np.complex64], FieldCounts]:
+        """Return the complex image of the scene alone ``(bins, beams)``, without noise, volume and stripes, and the counts.
+
+        Args:
+            pose: of the sonar ``(6,)`` [m, rad].
+            side: of the elevation, one of :attr:`sides`; default: the first.
+        """
+        field, counts = (self.tracer if side is None else self.tracers[side]).field(pose)
         if self.glints is not None:
             self.glints.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
-        if self.sonar.volume_db is not None:
-            image = image + self.volume(ping)
-        if self.sonar.noise_level_db is not None:
-            image = image + self.noise(ping)
-        if self.sonar.stripes_db > 0:
-            image = image * self._stripes
         return np.asarray(image, dtype=np.complex64), counts
 
-    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts]:
-        """Return the levels of one ping after the gain ``(bins, beams)`` float32, and the counts of its rays."""
+    def of_quality(self, quality: Quality) -> CoherentImager:
+        """Return what renders the same scatterers with more or fewer rays."""
+        return CoherentImager(self._given[0], self.sonar.replace(quality=quality), self._given[1])
+
+    def in_views(self, pings: RenderedPings) -> list[RenderedPings]:
+        """Return pings of :attr:`sides` ``(pings, bins, sides * beams)`` as one part for each view."""
+        found = []
+        for view in self.views:
+            first = self.sides.index(side_of(view)) * self.sonar.beams
+            own = view.beams if isinstance(view, Segment) else slice(0, self.sonar.beams)
+            found.append(replace(pings, levels=pings.levels[:, :, first + own.start : first + own.stop]))
+        return found
+
+    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts, CutRays]:
+        """Return the levels of one ping after the gain ``(bins, sides * beams)`` float32, counts of rays, and cut ones."""
         image, found = self.image(pose, ping)
         power = image.real * image.real + image.imag * image.imag
         rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
-        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays)
+        return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(found)
+
+    def _cut_rays(self, found: FieldCounts) -> CutRays:
+        """Return the rays that missed points, where they are so many that a picture may show it."""
+        if found.cut <= MOST_CUT * found.inside:
+            return CutRays()
+        return CutRays(found.cut, self.tracer.pitch * math.sqrt(1.1 * found.widest / MOST_CANDIDATES))
 
     @cached_property
     def gain(self) -> NDArray[np.float32]:
@@ -101,31 +159,85 @@ class CoherentImager:
 
     # ---------------------------------------------------------------- noise and volume
 
-    def noise(self, ping: int) -> NDArray[np.complex64]:
+    def noise(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
         """Return the receiver's noise of one ping ``(bins, beams)``: complex Gaussian, filtered as echoes are.
 
         White noise of the water and of the elements passes the array, so neighbouring beams share part of it, and the
-        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell).
+        matched filter. Near the sonar it may glow. Each number is a function of (seed, ping, cell), those of the part of the
+        glow that stays of (seed, cell).
         """
+        sonar, power, salt = self.sonar, self._noise_power, SIDE_SALT[side]
+        if sonar.near_glow_still == 0 or sonar.near_glow_db == 0:
+            return self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power), np.float32)
+        still = sonar.near_glow_still * power * (1 - 10 ** (-self._glow / 10))
+        new = self._white(ping, NOISE ^ salt, 1) * np.asarray(np.sqrt(power - still), np.float32)
+        stays = self._white(0, GLOW ^ salt, 1) * np.asarray(np.sqrt(still), np.float32)
+        return np.asarray(new + stays, dtype=np.complex64)
+
+    @cached_property
+    def _glow(self) -> NDArray[np.float64]:
+        """Return what the noise near the sonar exceeds that behind by ``(bins, 1)`` or ``(bins, beams)`` [dB]."""
+        sonar = self.sonar
+        fall = (sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))[:, None]
+        if sonar.near_glow_db == 0 or (sonar.near_glow_edge_db == 0 and sonar.near_glow_spread_db == 0):
+            return np.asarray(np.maximum(0, fall), dtype=np.float64)
+        bearing = np.sin(sonar.bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max())
+        drawn = np.random.default_rng([abs(sonar.seed), GLOW]).normal(0, sonar.near_glow_spread_db, sonar.beams)
+        return np.asarray(np.maximum(0, fall - sonar.near_glow_edge_db * (bearing**2 - MEDIAN_SQUARE) + drawn))
+
+    def volume(self, ping: int, side: int = 0) -> NDArray[np.complex64]:
+        """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4.
+
+        One side of the elevation holds half of the volume.
+        """
+        amplitude = np.asarray(self._volume_amplitude * (math.sqrt(0.5) if side else 1), np.float32)
+        return self._white(ping, VOLUME ^ SIDE_SALT[side], 2) * amplitude[:, None]
+
+    def noise_powers(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the mean power of noise and of volume in each bin, two arrays ``(bins,)``; 0 where there is none.
+
+        Glow that differs from beam to beam counts by its mean.
+        """
+        sonar, none = self.sonar, np.zeros(self.sonar.range_bins)
+        noise = none if sonar.noise_level_db is None else self._noise_power.mean(axis=1)
+        return noise, none if sonar.volume_db is None else np.square(self._volume_amplitude)
+
+    def beam_correlations(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the correlation of the beams ``(beams, beams)`` of noise, of volume, and of speckle on even ground."""
+        noise, volume = (self._plane_waves(ways).astype(float) for ways in (1, 2))
+        lines = self.former.over_sine.T.astype(float)
+        return noise.T @ noise, volume.T @ volume, _correlation(lines.T @ lines)
+
+    def bin_correlation(self) -> csr_array[Any, Any]:
+        """Return the correlation of the bins ``(bins, bins)``, by the pulse, of noise, volume and speckle alike."""
+        rows = self._noise_ranges.astype(float)
+        return csr_array(rows @ rows.T)
+
+    @cached_property
+    def _noise_power(self) -> NDArray[np.float64]:
+        """Return the power of the receiver's noise with its glow ``(bins, 1)`` or ``(bins, beams)``."""
         sonar = self.sonar
         assert sonar.noise_level_db is not None
-        glow = sonar.near_glow_db * np.maximum(0, 1 - sonar.range_m / sonar.near_glow_m)
-        amplitude = 10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 20)
-        return self._white(ping, NOISE, 1) * np.asarray(amplitude, np.float32)[:, None]
+        return np.asarray(10 ** ((sonar.noise_level_db - sonar.source_level_db + self._glow) / 10), dtype=np.float64)
 
-    def volume(self, ping: int) -> NDArray[np.complex64]:
-        """Return the echo of what drifts in the water ``(bins, beams)``, new in each ping: Sv times the volume over R^4."""
+    @cached_property
+    def _volume_amplitude(self) -> NDArray[np.float64]:
+        """Return the amplitude of the volume's echo ``(bins,)``."""
         sonar = self.sonar
         assert sonar.volume_db is not None
         volume = sonar.range_m**2 * sonar.beam_width_rad * math.radians(sonar.elevation_fov_deg) * sonar.bin_m
         power = 10 ** (sonar.volume_db / 10) * volume / sonar.range_m**4 * loss_of(sonar)
-        return self._white(ping, VOLUME, 2) * np.asarray(np.sqrt(power), np.float32)[:, None]
+        return np.asarray(np.sqrt(power), dtype=np.float64)
+
+    def _plane_waves(self, ways: int) -> NDArray[np.float32]:
+        """Return :meth:`_waves`, computed once."""
+        if ways not in self._kept_waves:
+            self._kept_waves[ways] = self._waves(ways)
+        return self._kept_waves[ways]
 
     def _white(self, ping: int, salt: int, ways: int) -> NDArray[np.complex64]:
         """Return complex Gaussian noise of unit power ``(bins, beams)`` that has passed array and matched filter."""
-        if ways not in self._kept_waves:
-            self._kept_waves[ways] = self._waves(ways)
-        waves = self._kept_waves[ways]
+        waves = self._plane_waves(ways)
         shape = 1, self.former.ranges, len(waves)
         first, second = uniform(shape, seed=self.sonar.seed ^ salt, frames=np.array([ping]), like=np.empty(0))
         radius = np.sqrt(-np.log(first[0]))
@@ -155,6 +267,12 @@ class CoherentImager:
         return csr_array(rows.multiply(1 / np.sqrt(power)[:, None]), dtype=np.float32)
 
 
+def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the correlation that belongs to a covariance ``(n, n)``."""
+    std = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(std, std), dtype=np.float64)
+
+
 def point_notes(sonar: Sonar) -> list[str]:
     """Return a sentence where points are too few for speckle: a resolution cell should hold four."""
     pitch = point_pitch(sonar)
@@ -176,15 +294,32 @@ def coherent_imager(
     """Return what renders pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: portions of the field of view, or receivers elsewhere; mirrors in other models.
+        MitsonarError: receivers elsewhere, cones, or portions with mirrors; mirrors in other models.
     """
     if sonar.model != "coherent":
         if mirrors:
             raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
         return None
-    if views is not None and any(not isinstance(view, Whole) for view in views):
-        raise MitsonarError(
-            "the model coherent has no portions of the field of view and no receivers elsewhere: render the whole view, "
-            "or use the model physical"
-        )
-    return CoherentImager(scene, sonar, mirrors)
+    return CoherentImager(scene, sonar, mirrors, views)
+
+
+def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:
+    """Return the views, which are the whole field of view or portions whose borders are beams and the horizon.
+
+    Raises:
+        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
+    """
+    for view in views:
+        if not isinstance(view, Whole | Segment) or view.name in CONES:
+            raise MitsonarError(
+                f"the model coherent has no receivers elsewhere and no cones: got {view.name}; render the whole view, a "
+                "side or quadrants, or use the model physical"
+            )
+        if mirrors and side_of(view):
+            raise MitsonarError(f"mirrors are of whole views: got {view.name}; leave mirrors out, or render the whole view")
+    return views
+
+
+def side_of(view: View) -> int:
+    """Return the side of the elevation that a view shows: +1 up, -1 down, 0 both."""
+    return (view.up or 0) if isinstance(view, Segment) else 0

@@ -8,8 +8,8 @@ Its echo is zeta sqrt(C cos^2 dA) / R^2 times the elevation's pattern and exp(-2
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -42,12 +42,19 @@ MOST_IN_A_CELL = 2.0**16
 LARGEST_WEIGHT = 4.2
 """Largest amplitude of a weight: the root of -log 2^-25."""
 
-COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points")
+COUNTED = ("inside", "nearer", "farther", "missed", "cut", "points", "widest")
 
 
 @dataclass(frozen=True)
 class FieldCounts:
-    """Numbers of rays inside the window, nearer, farther, missed, cut short, and of points summed."""
+    """Numbers of rays of a ping, and of points.
+
+    Attributes:
+        inside, nearer, farther, missed: rays whose hit lies inside the window, nearer, farther; rays that hit nothing.
+        cut: rays whose cell of the surface holds more points than are looked through.
+        points: that were summed.
+        widest: lattice cells around the largest cell of a ray.
+    """
 
     inside: int
     nearer: int
@@ -55,6 +62,15 @@ class FieldCounts:
     missed: int
     cut: int
     points: int
+    widest: int
+
+    @staticmethod
+    def joined(counts: Sequence[FieldCounts]) -> FieldCounts:
+        """Return the counts of several parts together: their sums, and the widest cell of all."""
+        if len(counts) == 1:
+            return counts[0]
+        sums = FieldCounts(*(sum(numbers) for numbers in zip(*map(astuple, counts), strict=True)))
+        return replace(sums, widest=max(one.widest for one in counts))
 
 
 class CoherentTracer:
@@ -65,13 +81,17 @@ class CoherentTracer:
         sonar: of the model ``coherent``.
         former: gives the grid.
         mirrors: what shapes reflect as mirrors, and do not scatter; default: nothing.
+        side: of the elevation whose points are summed: +1 up, -1 down, 0 both.
 
     Attributes:
         pitch: of the lattice [m].
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors | None = None) -> None:
+    def __init__(
+        self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors | None = None, side: int = 0
+    ) -> None:
         assert sonar.frequency_hz is not None
+        self.side = side
         self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.of(sonar)
         self.surfaces = Surfaces.of(scene).heard_by(sonar)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
@@ -103,7 +123,7 @@ class CoherentTracer:
         @dr.freeze
         def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
-            rays = FanRays(self.fan, self.sonar, index, lines)
+            rays = FanRays(self.fan, self.sonar, index, lines, self.side)
             hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
@@ -116,8 +136,9 @@ class CoherentTracer:
         former = self.former
         place: DeviceArray = rays.origin + rays.d * hit.t
         last = former.first_range + (former.ranges - 1) * former.range_step
+        reached = rays.on_side & hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)
         points = HashedPoints(
-            replace(hit, valid=hit.valid & (hit.reflectivity > 0) & rays.may_reach(hit, former.first_range, last)),
+            replace(hit, valid=reached),
             place,
             *rays.steps_on(hit),
             pitch=self.pitch,
@@ -143,6 +164,8 @@ class CoherentTracer:
         for place, found in enumerate((hit.valid & ~near & ~far, near, far, ~hit.valid, points.cut)):
             kept = found & rays.inside
             dr.scatter_reduce(dr.ReduceOp.Add, counts, mi.UInt32(1), mi.UInt32(place), kept, mode=ADD)
+        widest = mi.UInt32(COUNTED.index("widest"))
+        dr.scatter_reduce(dr.ReduceOp.Max, counts, mi.UInt32(points.wanted), widest, points.cut & rays.inside, mode=ADD)
 
     def _deposit(
         self,
@@ -217,9 +240,14 @@ class FanRays:
         sonar: tells the bearing.
         index: number of each ray.
         lines: first three rows of ``to_world`` in double precision.
+        side: of the elevation: +1 up, -1 down, 0 both.
+
+    Attributes:
+        on_side: rays of that side; a point's side is that of its ray.
+        inside: those of them in the field of view.
     """
 
-    def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]]) -> None:
+    def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]], side: int = 0) -> None:
         self.fan, self.cone, self.lines = fan, sonar.bearing == "cone", lines
         strip, place = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
         self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
@@ -227,7 +255,8 @@ class FanRays:
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
         t = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
         sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
-        self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1])
+        self.on_side = mi.Bool(True) if side == 0 else (t > 0) == (side > 0)
+        self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1]) & self.on_side
         self._aim(u, t)
 
     def _aim(self, u: DeviceArray, t: DeviceArray) -> None:

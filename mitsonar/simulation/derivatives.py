@@ -25,7 +25,7 @@ from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.imaging import Simulator
 
-__all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "jittered", "step_for"]
+__all__ = ["FIRST_PING", "PINGS", "Derivative", "differentiate", "evenly", "jittered", "step_for"]
 
 FIRST_PING = 2**40
 """First ping of derivatives. No run or data set counts so far, so its frames are independent of derivatives."""
@@ -114,20 +114,21 @@ def step_for(sonar: Sonar, part: float = STEP) -> Motion:
 
 def _at(source: Simulator, pose: Pose, gain: float, pings: int, step: Motion, first: int) -> list[Derivative]:
     """Render both sides of each step, in two halves, and return one derivative for each view."""
-    sums = [_Sums.empty(len(view.bearing_rad), view.sonar.range_bins) for view in source.views]
-    within = _evenly(2 * pings) * np.array(step)
+    sums: list[_Sums] = []
+    within = evenly(2 * pings) * np.array(step)
     for axis in range(3):
         for side in (0, 1):
             motions = within.copy()
             motions[:, axis] = (2 * side - 1) * step[axis]
             moved = np.array([compose(pose, Motion(*motion)) for motion in motions])
             for views in source.render_views(moved, first=first):
+                sums = sums or [_Sums.empty(*seen.levels.shape[1:]) for seen in views]
                 for own, seen in zip(sums, views, strict=True):
                     own.add(seen.levels, np.arange(len(seen)) + seen.first - first >= pings, gain, axis, side)
     return [own.derivative(pings, step) for own in sums]
 
 
-def _evenly(count: int) -> NDArray[np.float64]:
+def evenly(count: int) -> NDArray[np.float64]:
     """Return points ``(count, 3)`` that fill the cube -1..1 evenly, as does every run of them (M. Roberts' recurrence)."""
     ratio = 1.2207440846057596  # the root of x^4 = x + 1
     return np.asarray((np.arange(1, count + 1)[:, None] / ratio ** np.arange(1, 4)) % 1 * 2 - 1)
@@ -146,7 +147,7 @@ class _Sums:
     squares: NDArray[np.float64]
 
     @classmethod
-    def empty(cls, beams: int, bins: int) -> _Sums:
+    def empty(cls, bins: int, beams: int) -> _Sums:
         return cls(np.zeros((2, 3, 2, 2, bins, beams)), np.zeros((bins, beams)))
 
     def add(self, levels: NDArray[np.float32], second: NDArray[np.bool_], gain: float, axis: int, side: int) -> None:

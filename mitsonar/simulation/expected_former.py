@@ -97,11 +97,15 @@ class ExpectedFormer:
 
     @cached_property
     def over_bins(self) -> NDArray[np.float32]:
-        """Return the part of each traced bin in each bin, after losses and gain ``(bins, traced bins)``."""
-        sonar, traced, pulse = self.sonar, self.traced, Pulse(self.sonar.resolution_m)
-        share = ((np.arange(PARTS) + 0.5) / PARTS - 0.5) * sonar.bin_m
-        away = sonar.range_m[:, None, None] - traced.range_m[None, :, None] - share
-        power = (pulse.shape(away) ** 2).mean(axis=2) * sonar.bin_m / pulse.equivalent_m
+        """Return the part of each traced bin in each bin, after losses and gain ``(bins, traced bins)``.
+
+        The pulse is the same everywhere: a row of numbers by the distance in bins, from the farthest traced bin on.
+        """
+        sonar, bins, pulse = self.sonar, self.traced.range_bins, Pulse(self.sonar.resolution_m)
+        share = (np.arange(PARTS) + 0.5) / PARTS - 0.5
+        apart = np.arange(sonar.range_bins + bins - 1) - (bins - 1) + self.bins_beside[0]
+        row = (pulse.shape((apart[:, None] - share) * sonar.bin_m) ** 2).mean(axis=1) * sonar.bin_m / pulse.equivalent_m
+        power = row[np.arange(sonar.range_bins)[:, None] + np.arange(bins)[::-1]]
         kept = loss_of(sonar) * undone_absorption(sonar)
         return np.asarray(power * kept[:, None], dtype=np.float32)
 

@@ -16,13 +16,26 @@ import mitsuba as mi
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.device_arrays import DeviceArray
 
-__all__ = ["HashedPoints", "Point", "lattice_key", "nearest_axis", "pick", "place_in_cell", "weight_of"]
+__all__ = [
+    "MOST_CANDIDATES",
+    "HashedPoints",
+    "Point",
+    "lattice_key",
+    "nearest_axis",
+    "patch_weight",
+    "pick",
+    "place_in_cell",
+    "weight_of",
+]
 
 LEAST_COSINE = 4e-3
 """Grazing cosine below which a ray's cell is no longer stretched along the surface."""
 
 MOST_CANDIDATES = 4096
 """Lattice cells that one ray may look through."""
+
+LARGEST_COUNT = 2.0**30
+"""Largest number of lattice cells that is told."""
 
 
 @dataclass
@@ -65,7 +78,8 @@ class HashedPoints:
     Attributes:
         axis: the axis of the world nearest to each normal, 0 to 2.
         count: lattice cells that may hold a point of the ray.
-        cut: rays with more cells than are looked through.
+        wanted: lattice cells around each ray's cell, 2^30 at most.
+        cut: rays with more than :data:`MOST_CANDIDATES` of them.
         strength: root of reflectivity times the area of a lattice cell [m].
     """
 
@@ -93,6 +107,7 @@ class HashedPoints:
         self.low = low
         self.wide = high[0] - low[0] + 1
         wanted = mi.Float(self.wide) * mi.Float(high[1] - low[1] + 1)
+        self.wanted: DeviceArray = dr.select(wanted < LARGEST_COUNT, wanted, LARGEST_COUNT)
         self.cut = hit.valid & (wanted > MOST_CANDIDATES)
         self.count = dr.select(hit.valid, mi.Int32(dr.select(self.cut, MOST_CANDIDATES, wanted)), 0)
         side = dr.select(self.normal[2] > 0, mi.UInt32(1), mi.UInt32(0))
@@ -113,19 +128,8 @@ class HashedPoints:
         a = self.middle[2] - slope * (self.normal[0] * (p - self.middle[0]) + self.normal[1] * (q - self.middle[1]))
         amplitude, turn, bits = weight_of(bits)
         if many > 1:
-            patch_i, patch_j = self._soft_patch(p, q, _mixed(bits ^ mi.UInt32(0x1B56C4E9)))
-            patch = _hash(patch_i, patch_j, self.key + 17)
-            amplitude = amplitude * dr.gather(mi.Float, patches, patch >> (32 - int(math.log2(many))))
+            amplitude = amplitude * patch_weight((p, q), bits, self.key, patches, many, self.patch)
         return Point(p, q, a, amplitude, turn)
-
-    def _soft_patch(self, p: DeviceArray, q: DeviceArray, bits: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
-        """Return the patch of a point: of the four whose middles are nearest, each by its bilinear weight.
-
-        The points of a cell are so many that their mean power goes evenly from patch to patch: no edge shows.
-        """
-        moved = (mi.Float(bits & 0xFFFF) * 2.0**-16 - 0.5, mi.Float(bits >> 16) * 2.0**-16 - 0.5)
-        one, other = (mi.Int32(dr.floor(v * (1 / self.patch) + by)) for v, by in zip((p, q), moved, strict=True))
-        return one, other
 
 
 def nearest_axis(normal: DeviceArray) -> DeviceArray:
@@ -168,6 +172,27 @@ def weight_of(place: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray
     """Return amplitude and phase (turns 0..1) of a point's complex Gaussian weight, and bits for what else is drawn."""
     bits = _mixed(place ^ mi.UInt32(0x68BC21EB))
     return dr.sqrt(-dr.log(_unit(bits))), _unit(_mixed(bits + mi.UInt32(0x2545F491))), bits
+
+
+def patch_weight(
+    place: tuple[DeviceArray, DeviceArray], bits: DeviceArray, key: DeviceArray, patches: mi.Float, many: int, side: float
+) -> DeviceArray:
+    """Return the amplitude of a point's patch: of the four whose middles are nearest, each by its bilinear weight.
+
+    The points of a resolution cell are so many that their mean power goes evenly from patch to patch: no edge shows.
+
+    Args:
+        place: of the point along both axes [m].
+        bits: of :func:`weight_of`.
+        key: of :func:`lattice_key`.
+        patches: amplitudes of patches by equal probabilities, of :func:`mitsonar.acoustics.speckle.patch_amplitudes`.
+        many: entries of that table, a power of 2.
+        side: of a patch [m].
+    """
+    drawn = _mixed(bits ^ mi.UInt32(0x1B56C4E9))
+    moved = (mi.Float(drawn & 0xFFFF) * 2.0**-16 - 0.5, mi.Float(drawn >> 16) * 2.0**-16 - 0.5)
+    i, j = (mi.Int32(dr.floor(v * (1 / side) + by)) for v, by in zip(place, moved, strict=True))
+    return dr.gather(mi.Float, patches, _hash(i, j, key + 17) >> (32 - int(math.log2(many))))
 
 
 def _hash(i: DeviceArray, j: DeviceArray, key: DeviceArray) -> DeviceArray:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
+from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
@@ -80,7 +81,7 @@ class Simulator:
         self.former = expected_former(sonar, views)
         traced = sonar if self.former is None else self.former.traced
         self.tracer = Tracer(scene, traced)
-        self.notes = self.tracer.notes if self.coherent is None else self.coherent.notes
+        self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
@@ -108,8 +109,10 @@ class Simulator:
         if table.ndim != 2 or table.shape[1] != 6 or not len(table) or not np.isfinite(table).all():
             raise MitsonarError(f"poses must be finite numbers (frames, 6): got {table.shape}; give m and rad")
         if self.coherent is not None:
+            if labels and self.coherent.sides != (0,):
+                raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
             for place, pose in enumerate(table):
-                yield [self._coherent_ping(pose, first + place, labels)]
+                yield self.coherent.in_views(self._coherent_ping(pose, first + place, labels))
             return
         for start in range(0, len(table), self.pings_per_launch):
             yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
@@ -117,13 +120,13 @@ class Simulator:
     def _coherent_ping(self, pose: NDArray[np.float64], number: int, labels: bool) -> RenderedPings:
         """Render one coherent ping. Labels are those of the expected levels, from the same surfaces."""
         assert self.coherent is not None
-        levels, counts = self.coherent.levels(pose, number)
+        levels, counts, cut = self.coherent.levels(pose, number)
         if labels:
             pings = self._launch(pose[None], number, True)[0]
-            pings.levels, pings.expected = levels[None], pings.levels
+            pings.levels, pings.expected, pings.cut = levels[None], pings.levels, cut
             return pings
         height_m = self.tracer.height_m(self.tracer.scene, self.tracer.inputs(pose[None], number)[0])
-        return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float))
+        return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
 
     def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[RenderedPings]:
         from mitsonar.simulation import binning

@@ -15,11 +15,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.simulation.device_arrays import DeviceArray
-from mitsonar.simulation.hashed_points import lattice_key, nearest_axis, pick, place_in_cell, weight_of
+from mitsonar.simulation.hashed_points import lattice_key, nearest_axis, patch_weight, pick, place_in_cell, weight_of
 
-__all__ = ["SurfacePoints", "lattice_points", "lattice_size"]
+__all__ = ["Patches", "SurfacePoints", "lattice_points", "lattice_size"]
 
 AT_A_TIME = 2**22
 """Rays of a launch."""
@@ -44,6 +45,13 @@ class SurfacePoints(NamedTuple):
     phase: NDArray[np.float32]
 
 
+class Patches(NamedTuple):
+    """Patches whose mean power varies by a Gamma law: its shape, and their side [m]."""
+
+    nu: float
+    side_m: float
+
+
 class _Cells(NamedTuple):
     """The lattice cells under a shape, seen along one axis: of the first, how many each way, and the shape's ends [m]."""
 
@@ -59,7 +67,7 @@ def lattice_size(shape: mi.Shape, pitch: float) -> float:
     return sum(2.0 * cells.wide * cells.tall for cells in _cells_of(shape, pitch))
 
 
-def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int) -> SurfacePoints:
+def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int, patches: Patches | None = None) -> SurfacePoints:
     """Find the points of one shape.
 
     Args:
@@ -67,8 +75,9 @@ def lattice_points(shape: mi.Shape, number: int, pitch: float, seed: int) -> Sur
         number: of the shape in its scene.
         pitch: of the lattice [m].
         seed: of the hash.
+        patches: of unequal strength; default: none.
     """
-    search = _Search(shape, pitch)
+    search = _Search(shape, pitch, patches)
     found = []
     for cells in _cells_of(shape, pitch):
         for side in (1, 0):
@@ -101,10 +110,11 @@ def _reach(shape: mi.Shape) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 class _Search:
     """Follows rays through one shape."""
 
-    def __init__(self, shape: mi.Shape, pitch: float) -> None:
+    def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None) -> None:
         self.scene: mi.Scene = mi.load_dict({"type": "scene", "shape": shape})
         self.surfaces = Surfaces.of(self.scene)
-        self.pitch = pitch
+        self.pitch, self.patches = pitch, patches
+        self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED * patches.nu))
 
     def on_rays(self, cells: _Cells, side: int, key: DeviceArray, numbers: NDArray[np.uint32]) -> list[SurfacePoints]:
         """Return the points on the rays through some cells: those of first hits, of second ones, and so on."""
@@ -112,7 +122,9 @@ class _Search:
         i = mi.Int32(cell % cells.wide) + cells.low[0]
         j = mi.Int32(cell // cells.wide) + cells.low[1]
         p, q, bits = place_in_cell(i, j, key, self.pitch)
-        amplitude, turn, _ = weight_of(bits)
+        amplitude, turn, bits = weight_of(bits)
+        if self.patches is not None and self.table is not None:
+            amplitude *= patch_weight((p, q), bits, key, self.table, dr.width(self.table), self.patches.side_m)
         begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)  # from where the surface faces
         a, skip = dr.full(mi.Float, begin, len(numbers)), way * BEYOND * (cells.ends[1] - cells.ends[0])
         u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,25 @@ if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.simulation.binning import Counts
 
-__all__ = ["RenderedPings", "constant_gain", "to_image"]
+__all__ = ["CutRays", "RenderedPings", "constant_gain", "to_image"]
 
 CALIBRATION_FRAMES = 20
 """Frames whose brightest pixels set the gain of a run."""
+
+
+class CutRays(NamedTuple):
+    """Rays of the model ``coherent`` whose cells of a surface hold more points than are looked through.
+
+    Attributes:
+        rays: how many.
+        enough_m: pitch of the points with which none would be cut [m].
+    """
+
+    rays: int = 0
+    enough_m: float = 0.0
+
+
+NONE_CUT = CutRays()
 
 
 @dataclass
@@ -34,6 +49,7 @@ class RenderedPings:
         labels: ``elevation_rad``, ``shape_id``, ``object_id``, ``shadow``, like ``levels``, where asked for.
         expected: levels without speckle, noise and patterns, like ``levels``, that labels of the model ``coherent`` go by;
             None: the levels themselves.
+        cut: rays that missed points, in the model ``coherent``.
     """
 
     first: int
@@ -42,6 +58,7 @@ class RenderedPings:
     height_m: NDArray[np.float64]
     labels: dict[str, Any] = field(default_factory=dict)
     expected: NDArray[np.float32] | None = None
+    cut: CutRays = NONE_CUT
 
     def __len__(self) -> int:
         return len(self.levels)

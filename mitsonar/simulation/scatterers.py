@@ -29,7 +29,7 @@ from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.surfaces import reflectances_of, reflectivity_at
 from mitsonar.simulation.device_arrays import DeviceArray
-from mitsonar.simulation.lattice_points import SurfacePoints, lattice_points, lattice_size
+from mitsonar.simulation.lattice_points import Patches, SurfacePoints, lattice_points, lattice_size
 
 __all__ = ["Scatterers"]
 
@@ -241,7 +241,8 @@ def _on_lattice(shape: mi.Shape, sonar: ChannelSonar, number: int) -> SurfacePoi
     enough = pitch * math.sqrt(cells / MOST) * 1.1
     mend = "lower points_per_m2" if sonar.scatterer_spacing_m is None else "raise scatterer_spacing_m"
     _check_count(shape, cells, f"{mend}; a spacing of {enough:.2g} m would do")
-    return lattice_points(shape, number, pitch, sonar.seed)
+    patches = None if sonar.speckle_nu is None else Patches(sonar.speckle_nu, sonar.speckle_patch_m)
+    return lattice_points(shape, number, pitch, sonar.seed, patches)
 
 
 def _kept(shape: mi.Shape, si: mi.SurfaceInteraction3f, area: DeviceArray, zeta: _Zeta, valid: DeviceArray) -> SurfacePoints:

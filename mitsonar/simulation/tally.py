@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.plain_data import whole_number
+from mitsonar.io.plain_data import finite_number, whole_number
 from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames
 from mitsonar.simulation.rendered_pings import RenderedPings
 
@@ -32,6 +33,9 @@ class Tally:
     empty: int = 0
     first_empty: tuple[int, ...] = ()
     """Number of the first empty frame, then of its rays those inside the window, nearer, farther, missed."""
+    cut: int = 0
+    """Rays that missed points, and the pitch of points that would do [m]."""
+    enough_m: float = 0.0
 
     def add(self, pings: RenderedPings, image: NDArray[np.float32]) -> None:
         """Count a batch; ``image`` before noise."""
@@ -46,6 +50,8 @@ class Tally:
         self.empty += len(empty)
         for name in self.rays:
             self.rays[name] += int(getattr(pings.counts, name).sum())
+        self.cut += pings.cut.rays
+        self.enough_m = max(self.enough_m, pings.cut.enough_m)
         self.pixels += image.size
         self.filled += int(filled.sum())
         self.saturated += int(np.count_nonzero(image >= 1))
@@ -88,6 +94,12 @@ class Tally:
                 f"{_percent(self.saturated / self.pixels)} % of pixels are at the maximum (more than 1 %): the gain, "
                 f"{self.gain_from}, is too high for the rest"
             )
+        if self.cut:
+            found["cut"] = (
+                f"{self.cut:,} rays met surfaces so flatly, or points so dense, that they looked through a part of their "
+                f"points only: these surfaces are too dark; a scatterer_spacing_m of {_up(self.enough_m)} m would do, or a "
+                "higher quality"
+            )
         reach = rounding_reach_m(sonar)
         if reach is not None and np.abs(poses[:, :3]).max() > reach:
             found["far"] = (
@@ -104,7 +116,7 @@ class Tally:
 
     def state(self) -> dict[str, Any]:
         """As JSON can hold it; :meth:`restore` reads it back."""
-        names = ("frames", "rays", "pixels", "filled", "saturated", "worst", "empty", "first_empty")
+        names = ("frames", "rays", "pixels", "filled", "saturated", "worst", "empty", "first_empty", "cut", "enough_m")
         return {name: getattr(self, name) for name in names}
 
     @classmethod
@@ -129,6 +141,8 @@ class Tally:
         whole_number(state["empty"], "empty of the tally", 0, frames if empty else 0)
         for number in (worst[1], *empty[:1]):
             whole_number(number, "a frame of the tally", 0, max(0, frames - 1))
+        whole_number(state["cut"], "cut of the tally")
+        finite_number(state["enough_m"], "enough_m of the tally", above=1e-9 if state["cut"] else -math.inf)
         tuples = {name: tuple(state[name]) for name in ("worst", "first_empty")}
         return cls(sonar, **{**state, "rays": dict(state["rays"]), **tuples})
 
@@ -138,6 +152,12 @@ def rounding_reach_m(sonar: Sonar) -> float | None:
     if sonar.model != "coherent" or sonar.frequency_hz is None:
         return None
     return sonar.sound_speed / sonar.frequency_hz / 8 * 2.0**24
+
+
+def _up(length_m: float) -> str:
+    """Return a length to two digits, rounded up."""
+    step = 10.0 ** (math.floor(math.log10(length_m)) - 1)
+    return f"{math.ceil(length_m / step) * step:.2g}"
 
 
 def _percent(share: float) -> str:

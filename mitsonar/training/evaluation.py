@@ -345,7 +345,7 @@ def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str
     if same and part in ("train", "all"):
         found.append(f"part {part} of this data set holds pairs that training has seen")
     model = modality_of(recipe).sonar.model
-    if model != checkpoint.model:
+    if model not in checkpoint.model.split(" and "):
         found.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")
     if not checkpoint.arrangement["ground"]:
         low, high = (height + recipe.mount.up_m for height in recipe.flight.heights)

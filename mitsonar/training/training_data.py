@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,11 +15,13 @@ from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
 from mitsonar.config.data_recipe import Recipe, load_recipe
 from mitsonar.config.training_recipe import TrainingRecipe
+from mitsonar.datasets.joined_pairs import JoinedPairs
 from mitsonar.datasets.rendered_pairs import RawStream, RenderedPairs
 from mitsonar.datasets.response_pairs import ImpulsePairs
 from mitsonar.datasets.scene_rendering import calibrate
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.errors import MitsonarError
+from mitsonar.io.provenance import digest
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.training.training_types import Array, Batch, JsonObject, RawSample
 
@@ -42,7 +44,10 @@ def seed_of(*numbers: int) -> int:
     return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0] >> 1)
 
 
-Kind = SonarPairs | RenderedPairs | ImpulsePairs
+Stored = SonarPairs | JoinedPairs | ImpulsePairs
+"""Samples of data sets."""
+
+Kind = Stored | RenderedPairs
 """Samples that a network can learn from."""
 
 
@@ -94,26 +99,33 @@ class Validation:
                 yield level, inputs, truth.cpu().numpy().astype(np.float64)
 
 
-def material_of(recipe: TrainingRecipe, data: str | Path | None, *, render: bool, gain: float | None = None) -> Material:
+def material_of(
+    recipe: TrainingRecipe, data: str | Path | Sequence[str | Path] | None, *, render: bool, gain: float | None = None
+) -> Material:
     """Open the data of a recipe: parts of a data set, or frames that are rendered during training.
 
     Args:
         recipe: of the training.
-        data: path or URL of a data set. With ``render`` it is used for validation only.
+        data: path or URL of a data set, or of several, which are joined. With ``render`` one, for validation only.
         render: render training samples, by the recipe of ``data`` or the one that the recipe names.
         gain: of rendered pixels, if it is known.
 
     Raises:
-        MitsonarError: neither ``data`` nor ``render``, no such data set, missing views or kinds, or too few samples.
+        MitsonarError: neither ``data`` nor ``render``, no such data set, missing views or kinds, too few samples, or
+            several data sets that cannot be joined.
     """
-    if data is None and not render:
+    sets = [] if data is None else [data] if isinstance(data, str | Path) else list(data)
+    if not sets and not render:
         raise MitsonarError("a training needs samples: give --data DATA.zarr, or --render to have them rendered")
     if not render:
-        assert data is not None
-        return _stored(recipe, data)
+        return _stored(recipe, sets)
+    if len(sets) > 1:
+        raise MitsonarError(
+            f"with --render one data set is for validation: got {len(sets)}; leave out --render, or all but one"
+        )
     if recipe.input.kind == "response":
         raise MitsonarError("impulse responses are not rendered in training: make a data set, and leave out --render")
-    stored = None if data is None else _part(recipe, data, "validation", labels="raw")
+    stored = _part(recipe, sets[0], "validation", labels="raw") if sets else None
     assert not isinstance(stored, ImpulsePairs)
     world = load_recipe(recipe.data, recipe.data_changes) if stored is None else stored.recipe
     if gain is None:
@@ -127,18 +139,40 @@ def material_of(recipe: TrainingRecipe, data: str | Path | None, *, render: bool
     return Material(samples, None, max(1, round(world.sequences * share * recipe.part_of_data)) * each, validation, about)
 
 
-def _stored(recipe: TrainingRecipe, data: str | Path) -> Material:
-    pairs = _part(recipe, data, "train")
+def _stored(recipe: TrainingRecipe, sets: list[str | Path]) -> Material:
+    pairs = _joined(recipe, sets, "train")
     numbers = np.flatnonzero(_within(recipe, pairs))
     if len(numbers) < recipe.batch:
         raise MitsonarError(
-            f"{data} has {len(numbers)} samples for training, fewer than a batch of {recipe.batch}: make more, or "
-            "lower batch"
+            f"{' and '.join(map(str, sets))}: {len(numbers)} samples for training, fewer than a batch of {recipe.batch}: "
+            "make more, or lower batch"
         )
-    validation = _validation(recipe, _part(recipe, data, "validation", labels="raw"))
-    digest, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
-    about = {"name": pairs.recipe.name, "digest": digest, "gain": gain}
-    return Material(pairs, numbers, len(numbers), validation, about)
+    validation = _validation(recipe, _joined(recipe, sets, "validation", labels="raw"))
+    return Material(pairs, numbers, len(numbers), validation, _about(pairs))
+
+
+def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **words: str) -> Stored:
+    """Open a part of one data set, or of several as one.
+
+    Raises:
+        MitsonarError: impulse responses of several data sets; data sets that do not fit each other.
+    """
+    if len(sets) == 1:
+        return _part(recipe, sets[0], part, **words)
+    opened = [_part(recipe, one, part, **words) for one in sets]
+    pairs = [one for one in opened if isinstance(one, SonarPairs)]
+    if len(pairs) < len(opened):
+        raise MitsonarError(f"impulse responses are learnt from one data set: got {len(sets)}; give --data once")
+    return JoinedPairs(pairs)
+
+
+def _about(pairs: Stored) -> JsonObject:
+    """Return name, digest and gain of the data, which a resumed run must repeat; of several data sets no gain."""
+    if not isinstance(pairs, JoinedPairs):
+        own, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
+        return {"name": pairs.recipe.name, "digest": own, "gain": gain}
+    digests = [part.recipe.digest(len(part.store)) for part in pairs.parts]
+    return {"name": pairs.described()["data"], "digest": digest(" ".join(digests))[:16], "gain": None}
 
 
 def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: str) -> SonarPairs | ImpulsePairs:
@@ -146,12 +180,14 @@ def _part(recipe: TrainingRecipe, data: str | Path, part: str, **words: str) -> 
     return kind(data, part=part, split=recipe.split_of, **{**recipe.arrangement(), **words})
 
 
-def _within(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> NDArray[np.bool_]:
-    """Return which samples are in the part of the data that is used ``(samples,)``."""
+def _within(recipe: TrainingRecipe, pairs: Stored) -> NDArray[np.bool_]:
+    """Return which samples are in the part of the data that is used ``(samples,)``; of each data set its first frames."""
+    if isinstance(pairs, JoinedPairs):
+        return np.concatenate([_within(recipe, part) for part in pairs.parts])
     return np.asarray(pairs.first + pairs.frames <= recipe.part_of_data * len(pairs.store))
 
 
-def _validation(recipe: TrainingRecipe, pairs: SonarPairs | ImpulsePairs) -> Validation:
+def _validation(recipe: TrainingRecipe, pairs: Stored) -> Validation:
     """Choose stored samples, from as many sequences as possible."""
     wanted = recipe.validation
     numbers = np.flatnonzero(_within(recipe, pairs))
@@ -248,7 +284,7 @@ class Order(Sampler[list[tuple[int, int]]]):
 class _Stored(Dataset[RawSample]):
     """Raw samples with their epoch, for workers that only read."""
 
-    pairs: SonarPairs | ImpulsePairs
+    pairs: Stored
 
     def __getitem__(self, key: tuple[int, int]) -> RawSample:
         epoch, number = key

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ MOST_AT_ONCE = 1024
 
 def train(
     recipe: TrainingRecipe | str | Path,
-    data: str | Path | None,
+    data: str | Path | Sequence[str | Path] | None,
     out: str | Path,
     *,
     render: bool = False,
@@ -59,7 +59,7 @@ def train(
 
     Args:
         recipe: of the training; its name, or a YAML file.
-        data: path or URL of a data set.
+        data: path or URL of a data set; or of several of one sonar, such as one in each model, which are joined.
         out: folder of the run.
         render: render training samples meanwhile, by the recipe of ``data``, else by the one that the recipe names.
         minutes: duration after which training stops [min], of all resumed runs together, with validation.
@@ -102,7 +102,7 @@ class _Run:
     """What is trained and where it is kept: see :func:`train`."""
 
     recipe: TrainingRecipe
-    data: str | Path | None
+    data: str | Path | Sequence[str | Path] | None
     folder: RunFolder
     render: bool
     resume: bool

@@ -20,6 +20,7 @@ from mitsonar.acoustics.sonar_equation import (
     level_of_pressure,
     line_directivity_db,
     noise_level_db,
+    noise_warning,
     power_sum_db,
     pressure_of_level,
     rectangle_directivity_db,
@@ -207,3 +208,13 @@ def test_the_factor_in_dr_jit(variant: str) -> None:
 def test_a_mistake_is_one_sentence(ask: Callable[[], object], message: str) -> None:
     with pytest.raises(MitsonarError, match=message):
         ask()
+
+
+def test_noise_outside_its_band_is_told() -> None:
+    assert noise_warning(1e5) is None
+    assert noise_warning(30e3, wind_m_s=5.0) is None
+    assert noise_warning(3e5, wind_m_s=5.0) is None  # thermal noise is among the powers
+    assert "at 30 kHz is too low for the sea" in str(noise_warning(30e3))
+    assert "at 0.5 Hz is extrapolated" in str(noise_warning(0.5, wind_m_s=5.0))
+    with pytest.raises(MitsonarError, match="must be a finite number above 0"):
+        noise_warning(0.0)

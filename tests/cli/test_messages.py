@@ -34,7 +34,11 @@ SLIPS = [
     ("impulse hydrophones --trajectory squar", "did you mean square?"),
     ("impulse hydrophones --model scaterers", "--model: input should be", "did you mean scatterers?"),
     ("impulse hydrophones --set receivers=forwrd", "chooses of the receivers"),
-    ("crlb flat_floor --sonar didson300", "knows noise of pixels, not speckle", "give --model physical"),
+    (
+        "crlb flat_floor --sonar didson300 --noise low",
+        "the model coherent has noise of its own",
+        "give the sonar noise_level_db",
+    ),
     ("render flat_floor --mirrors", "--mirrors needs the model coherent"),
     ("render flat_floor --model coherent --noise low", "give the sonar noise_level_db"),
     ("crlb flat_floor --segments stabord", "did you mean starboard?"),

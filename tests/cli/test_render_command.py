@@ -278,6 +278,8 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     one = mitsonar("presets", "gemini-720is")
     assert "0703-SOM-00002" in one.stdout
     assert re.search(r"rays_across +4 +from quality", one.stdout)
+    assert re.search(r"absorption at 720 kHz: 0\.2\d+ dB/m one way$", one.stdout, re.MULTILINE)
+    assert re.search(r"1,800 kHz: 1\.05 dB/m one way, extrapolated: ", mitsonar("presets", "didson300").stdout)
     errors = r"^gemini-720is +58 x 1 .*% / .*172 x 4 .*% / .*686 x 8 .*% / \d+ %  0\.\d\d$"
     for printed in (listed.stdout, one.stdout):  # rays and errors of each quality
         assert re.search(errors, printed, re.MULTILINE)

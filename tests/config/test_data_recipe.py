@@ -27,6 +27,7 @@ IMAGES = {
     "rocky-field-physical": 200_000,
     "ship-hull-physical": 100_000,
     "rocky-field-coherent": 50_000,
+    "looking-down-coherent": 1_200,
 }
 """Pings of the whole set, from Almanza-Medina: 3.2, 3.4.5, 3.6 and 4.2 (pairs times 5/4), 4.4.4, 4.5, 2.3."""
 

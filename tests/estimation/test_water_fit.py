@@ -49,6 +49,31 @@ def test_a_glow_comes_back(deep: mi.Scene, glow: float, gone: float) -> None:
     assert sonar.noise_level_db == pytest.approx(-95, abs=1)
 
 
+def test_what_beams_glow_and_what_stays_comes_back(deep: mi.Scene) -> None:
+    fields: dict[str, Any] = {"near_glow_db": 60.0, "near_glow_m": 1.8, "near_glow_edge_db": 15.0}
+    made = recorded(deep, 3.0, **fields, near_glow_spread_db=4.0, near_glow_still=0.8)
+    found = fit_sonar(made).sonar
+    assert found.near_glow_db == pytest.approx(60, rel=0.1)
+    assert found.near_glow_edge_db == pytest.approx(15, abs=3)
+    assert found.near_glow_spread_db == pytest.approx(4, abs=1.2)
+    assert found.near_glow_still == pytest.approx(0.8, abs=0.05)
+
+
+def test_an_even_new_glow_has_no_structure(deep: mi.Scene) -> None:
+    found = fit_sonar(recorded(deep, 3.0, near_glow_db=60.0, near_glow_m=1.8)).sonar
+    assert abs(found.near_glow_edge_db) < 1
+    assert found.near_glow_spread_db < 0.8
+    assert found.near_glow_still < 0.15
+
+
+def test_a_glow_of_few_bins_tells_no_beams() -> None:
+    from mitsonar.estimation.water_fit import glow_by_beam
+
+    at: Array = np.linspace(1, 4.99, 400)
+    flat = np.ones((2, 400, 8))
+    assert glow_by_beam(flat, 1.0, at, np.linspace(-0.2, 0.2, 8), (60.0, 1.05)) == (0.0, 0.0, 0.0)
+
+
 def test_a_glow_far_out_keeps_its_height_where_it_is_seen() -> None:
     """A line of more than 120 dB at range 0 is laid through the middle of what is seen."""
     from mitsonar.estimation.water_fit import near_glow

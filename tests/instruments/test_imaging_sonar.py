@@ -48,6 +48,9 @@ DEFAULTS = {
     "volume_db": None,
     "near_glow_db": 0.0,
     "near_glow_m": 0.5,
+    "near_glow_edge_db": 0.0,
+    "near_glow_spread_db": 0.0,
+    "near_glow_still": 0.0,
     "absorption_db_per_m": None,
     "temperature_c": 10.0,
     "salinity_psu": 35.0,
@@ -182,3 +185,15 @@ def test_patterns_and_coding_follow_from_the_model() -> None:
 def test_a_coherent_sonar_that_cannot_be_is_refused(fields: dict[str, Any], words: str) -> None:
     with pytest.raises(MitsonarError, match=words):
         Sonar.create(model="coherent", **fields)
+
+
+@pytest.mark.parametrize("shading", ["uniform", "hann", "taylor"])
+@pytest.mark.parametrize("model", ["coherent", "physical"])
+def test_the_widest_beam_that_is_told_would_do(model: str, shading: str) -> None:
+    """An aperture below half a wavelength is refused with the beam width that just needs one."""
+    fields: dict[str, Any] = {"model": model, "frequency_hz": 1e6, "pattern": "two_way", "shading": shading, "beams": 1}
+    with pytest.raises(MitsonarError, match=r"takes 0\.\d+; give beam_width_deg below ([\d.]+)") as caught:
+        Sonar.create(**fields, azimuth_fov_deg=160.0, beam_width_deg=160.0)
+    told = float(str(caught.value).split("below ")[1].split()[0].rstrip("."))
+    assert Sonar.create(**fields, azimuth_fov_deg=100.0, beam_width_deg=told).aperture.length == pytest.approx(0.5, rel=0.01)
+    assert Sonar.create(**{**fields, "model": "thesis"}, azimuth_fov_deg=160.0).beam_pattern == "box"

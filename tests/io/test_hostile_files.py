@@ -791,6 +791,8 @@ BAD_STATES: dict[str, dict[str, Any]] = {
     "worst frame": {"tally": {**TALLY, "worst": [1, 99]}},
     "an empty frame that is not told": {"tally": {**TALLY, "first_empty": []}},
     "an empty frame beyond": {"tally": {**TALLY, "first_empty": [10, 0, 0, 0, 2]}},
+    "cut rays without a pitch": {"tally": {**TALLY, "cut": 3}},
+    "a pitch that is no number": {"tally": {**TALLY, "enough_m": "0.1"}},
     "more saturated pixels than pixels": {"tally": {**TALLY, "pixels": 0, "filled": 0, "saturated": 1}},
     "warnings": {"warnings": "none"},
     "finished": {"finished": "no"},

@@ -79,6 +79,7 @@ def test_properties_are_those_of_a_sonar() -> None:
         **{"speckle_patch_m": 0.2, "source_level_db": 210.0, "noise_level_db": 60.0, "absorption_db_per_m": 0.3},
         **{"temperature_c": 4.0, "salinity_psu": 0.5, "water_depth_m": 3.0, "ph": 7.0, "gain_absorption": True},
         **{"volume_db": -70.0, "near_glow_db": 30.0, "near_glow_m": 0.4},
+        **{"near_glow_edge_db": 12.0, "near_glow_spread_db": 2.0, "near_glow_still": 0.9},
         **{"crosstalk_db": -49.0, "stripes_db": 0.5, "coding": "gamma", "coding_db": 90.0, "coding_gamma": 0.6},
     }
     assert set(fields) == set(Sonar.model_fields) - {"name", "pulse_m"}  # the band says it

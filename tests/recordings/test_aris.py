@@ -110,6 +110,22 @@ def test_damaged_headers_are_left_out_and_a_cut_file_keeps_its_whole_frames(tmp_
     assert any("no whole frame" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize(
+    ("field", "values"),
+    [("large_lens", [0, 0, 1, 0, 0]), ("system", [1, 1, 2, 1, 1]), ("sample_period_us", [10, 10, 900_000, 10, 10])],
+)
+def test_one_frame_that_cannot_be_is_left_out(tmp_path: Path, field: str, values: list[int]) -> None:
+    """No lens, no other ARIS has 64 beams, and no window ends 27 km away."""
+    recording = open_recording(written(tmp_path / "a.aris", **{field: values}))
+    assert [len(part) for part in recording.parts] == [4]
+    assert any("1 frames have a damaged header" in note for note in recording.notes)
+
+
+def test_a_file_without_a_table_of_its_beams_says_which(tmp_path: Path) -> None:
+    with pytest.raises(MitsonarError, match="no beam angles are known for an ARIS 1200 with 64 beams"):
+        open_recording(written(tmp_path / "a.aris", system=2))
+
+
 def test_positions_become_metres_east_and_north(tmp_path: Path) -> None:
     latitude, longitude = -32 + np.arange(5) * 1e-5, -52 + np.arange(5) * 2e-5
     part = open_recording(

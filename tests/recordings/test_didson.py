@@ -94,13 +94,14 @@ def test_windows_that_change_inside_the_file_make_parts(tmp_path: Path) -> None:
     assert (recording.parts[2].read([1]).image[0] == IMAGES[4, :, ::-1]).all()
 
 
-def test_the_sound_speed_of_version_4_scales_the_window(tmp_path: Path) -> None:
-    four = opened(tmp_path, version=4)
-    assert any("no sound speed" in note for note in four.notes)
-    (tmp_path / "b.ddf").write_bytes(didson_file(IMAGES, version=4, file={"sound_speed": 1450}))
+@pytest.mark.parametrize("version", [3, 4])
+def test_the_sound_speed_of_the_file_scales_the_window(tmp_path: Path, version: int) -> None:
+    untold = opened(tmp_path, version=version)
+    assert any("no sound speed" in note for note in untold.notes)
+    (tmp_path / "b.ddf").write_bytes(didson_file(IMAGES, version=version, file={"sound_speed": 1450}))
     slower = open_recording(tmp_path / "b.ddf")
     assert not slower.notes
-    assert slower.part().like.range_m == pytest.approx(four.part().like.range_m * 1450 / 1500)
+    assert slower.part().like.range_m == pytest.approx(untold.part().like.range_m * 1450 / 1500)
 
 
 def test_a_sample_rate_that_is_missing_or_strange_is_said(tmp_path: Path) -> None:
@@ -128,6 +129,14 @@ def test_frames_without_a_clock_follow_the_frame_rate(tmp_path: Path) -> None:
     recording = opened(tmp_path, year=0)
     assert recording.part().time_s == pytest.approx(np.arange(6) / 8)
     assert any("8 Hz" in note for note in recording.notes)
+
+
+def test_frames_of_one_time_are_spread_up_to_the_next(tmp_path: Path) -> None:
+    """A clock of whole seconds, 3 frames a second, the last second cut off: 8 frames a second are stated."""
+    recording = opened(tmp_path, second=np.array([5, 5, 5, 6, 6, 9]), hundredth=0)
+    time_s = recording.part().time_s
+    assert time_s - time_s[0] == pytest.approx([0, 1 / 3, 2 / 3, 1, 1 + 1 / 8, 4])
+    assert any("3 frames have the clock of the one before" in note for note in recording.notes)
 
 
 def test_attitude_and_height(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -47,6 +48,9 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "oculus log": lambda folder: (folder / "a.oculus").write_bytes(oculus_log(some_pings(3), [1, 2, 3], packed=False)),
     "oculus log, packed": lambda folder: (folder / "a.oculus").write_bytes(
         oculus_log(some_pings(3), [1, 2, 3], packed=True)
+    ),
+    "oculus log, version 2": lambda folder: (folder / "a.oculus").write_bytes(
+        oculus_log(some_pings(4, version=2), [5.0, 5.26, 5.5, 5.75], packed=False)
     ),
     "didson 3": lambda folder: (folder / "a.ddf").write_bytes(didson_file(IMAGES)),
     "didson 4": lambda folder: (folder / "a.ddf").write_bytes(didson_file(IMAGES, version=4)),
@@ -96,12 +100,14 @@ def changed_numbers(rng: Rng, content: bytes) -> bytes:
 
 
 def read(folder: Path) -> None:
-    """Read all frames of the recording in a folder, and check that they can be."""
+    """Read all frames of the recording in a folder, and check that they can be. Warnings of NumPy are failures."""
     path = next(iter(sorted(folder.iterdir())))
     size = sum(one.stat().st_size for one in [path, *path.rglob("*")] if one.is_file())
     tracemalloc.start()
     try:
-        _read(path)
+        with np.errstate(over="warn", divide="warn", invalid="warn"), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            _read(path)
     except MitsonarError as error:
         said = str(error)
         assert "\n" not in said, f"a refusal is not one line: {said[:300]}"

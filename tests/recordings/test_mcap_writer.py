@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bags import decoded
 from drawn_frames import over_ground, sway
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -53,17 +54,6 @@ def by_rosbags(path: Path) -> dict[str, list[Any]]:
     return dict(found)
 
 
-def by_mcap(path: Path) -> dict[str, list[Any]]:
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    found = defaultdict(list)
-    with path.open("rb") as file:
-        for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
-            found[channel.topic].append(message)
-    return dict(found)
-
-
 def plain(message: Any) -> Any:
     """A message of either reader as lists and tables, without its constants."""
     if isinstance(message, np.ndarray | bytes | memoryview):
@@ -78,7 +68,7 @@ def plain(message: Any) -> Any:
 
 def test_two_readers_agree_on_every_message(rendered: SonarFrames, tmp_path: Path) -> None:
     path = written(rendered, tmp_path)
-    first, second = by_rosbags(path), by_mcap(path)
+    first, second = by_rosbags(path), decoded(path)
     assert set(first) == set(second)
     assert set(first) == {"/sonar/image", "/sonar/fan/compressed", "/sonar/points", "/sonar/odometry"} | {
         "/sonar/altitude",
@@ -118,7 +108,7 @@ def test_without_its_record_the_messages_alone_tell_ranges_and_bearings(rendered
 
 def test_beams_are_where_the_driver_of_the_oculus_puts_them(rendered: SonarFrames, tmp_path: Path) -> None:
     """Forward is z, port is y; samples of one range follow each other."""
-    message = by_mcap(written(rendered, tmp_path))["/sonar/image"][1]
+    message = decoded(written(rendered, tmp_path))["/sonar/image"][1]
     axes = np.array([(one.x, one.y, one.z) for one in message.beam_directions])
     assert np.arctan2(-axes[:, 1], axes[:, 2]) == pytest.approx(rendered.bearing_rad, abs=1e-15)
     assert (message.image.dtype, message.image.beam_count, message.header.frame_id) == (8, 24, "sonar")
@@ -130,7 +120,7 @@ def test_beams_are_where_the_driver_of_the_oculus_puts_them(rendered: SonarFrame
 
 def test_points_lie_on_the_floor_of_the_world(rendered: SonarFrames, tmp_path: Path) -> None:
     """Points turned by the transform of their frame have the height 0: labels, axes and poses fit together."""
-    found = by_mcap(written(rendered, tmp_path))
+    found = decoded(written(rendered, tmp_path))
     for cloud, tree in zip(found["/sonar/points"], found["/tf"], strict=True):
         where = tree.transforms[0]
         assert (where.header.frame_id, where.child_frame_id, cloud.header.frame_id) == ("map", "sonar_link", "sonar_link")
@@ -147,7 +137,7 @@ def test_points_lie_on_the_floor_of_the_world(rendered: SonarFrames, tmp_path: P
 def test_a_fan_is_a_picture_with_forward_up(rendered: SonarFrames, tmp_path: Path) -> None:
     shown = {}
     for picture, first in (("png", b"\x89PNG"), ("jpeg", b"\xff\xd8")):
-        message = by_mcap(written(rendered, tmp_path, picture=picture, overwrite=True))["/sonar/fan/compressed"][0]
+        message = decoded(written(rendered, tmp_path, picture=picture, overwrite=True))["/sonar/fan/compressed"][0]
         content = bytes(message.data)
         assert (message.format, content[: len(first)]) == (picture, first)
         shown[picture] = np.asarray(Image.open(io.BytesIO(content))).astype(int)
@@ -210,3 +200,20 @@ def test_frames_of_other_arrays_or_times_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="no frames"):
         write_mcap([], tmp_path / "a.mcap")
     assert not list(tmp_path.iterdir())
+
+
+REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="needs the recordings of ../shared/data/real")
+@pytest.mark.parametrize("name", ["aris1200-sdk-sample/sample.aris", "oculus-m1200d-three-pings/three_pings_8bit.raw"])
+def test_real_recordings_come_back_bit_for_bit(tmp_path: Path, name: str) -> None:
+    part = open_recording(REAL / name).part()
+    write_mcap(part.chunks(), tmp_path / "a.mcap")
+    back, frames = open_recording(tmp_path / "a.mcap").part(), part.read(np.arange(len(part)))
+    read = back.read(np.arange(len(back)))
+    for column in ("image", "range_m", "bearing_rad", "time_s"):
+        assert (getattr(read, column) == getattr(frames, column)).all(), column
+    assert (read.sonar, read.level) == (frames.sonar, frames.level)
+    if frames.attitude_rad is not None:
+        assert read.attitude_rad == pytest.approx(frames.attitude_rad, abs=1e-9)

@@ -9,6 +9,9 @@ import pytest
 from recording_files import oculus_log, oculus_ping, other_message, some_pings
 
 from mitsonar import MitsonarError, open_recording
+from mitsonar.errors import MitsonarWarning
+from mitsonar.estimation.image.direct import Direct
+from mitsonar.mapping.open_frames import open_frames
 
 SAMPLE = Path(__file__).resolve().parents[2].parent / "shared/data/real/oculus-m1200d-three-pings/three_pings_8bit.raw"
 
@@ -51,6 +54,17 @@ def test_the_layout_of_the_beams_follows_the_sample() -> None:
     frames = open_recording(SAMPLE).part().like
     assert frames.sonar.beam_layout == "sine"
     assert np.degrees(frames.sonar.bearing_rad - frames.bearing_rad) == pytest.approx(0, abs=0.02)
+
+
+@with_sample
+def test_the_sonar_of_the_sample_is_estimated_to_stand_still() -> None:
+    with pytest.warns(MitsonarWarning, match="no times in a known unit"):
+        source = open_frames(SAMPLE).with_geometry(height_m=0.6, pitch_rad=np.radians(25))
+    for pair in ([0, 1], [1, 2]):
+        found = Direct().estimate(source.read(pair))
+        assert found.valid
+        assert np.abs(found.motion[:2]).max() < 1e-3
+        assert abs(found.motion[2]) < np.radians(0.05)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -123,6 +137,18 @@ def test_attitude_and_times_of_version_2(tmp_path: Path) -> None:
     assert np.degrees(part.attitude_rad[0]) == pytest.approx([-10, -3, 90])
 
 
+@pytest.mark.parametrize(("stops_s", "steady"), [(0.0, True), (5.0, False)])
+def test_a_log_of_version_2_has_the_clock_of_the_sonar(tmp_path: Path, stops_s: float, steady: bool) -> None:
+    """The log's times jitter by 20 ms, and two of them are equal. Where the clocks part they are taken as they are."""
+    start = 50 + np.arange(6) / 10
+    late = 1.6e9 + np.array([0.0, 0.02, -0.08, 0.01, 0.0, stops_s])
+    pings = [oculus_ping(np.ones((4, 3)), version=2, number=one, start=start[one]) for one in range(6)]
+    (tmp_path / "a.oculus").write_bytes(oculus_log(pings, list(start + late), packed=False))
+    time_s = open_recording(tmp_path / "a.oculus").part().time_s
+    assert time_s == pytest.approx(start + 1.6e9 if steady else np.unique(start + late), abs=0.02 if steady else 1e-6)
+    assert (np.diff(time_s) == pytest.approx(0.1, abs=1e-5)) == steady
+
+
 @pytest.mark.parametrize(("code", "gamma"), [(0, 1.0), (255, 1.0), (127, 0.5), (64, 64 / 254)])
 def test_levels_follow_the_gamma_byte(tmp_path: Path, code: int, gamma: float) -> None:
     counts = np.array([[255, 128, 64]] * 2)
@@ -131,6 +157,23 @@ def test_levels_follow_the_gamma_byte(tmp_path: Path, code: int, gamma: float) -
     level = recording.part().read([0]).to_linear().image[0, 0]
     assert level == pytest.approx((np.array([255, 128, 64]) / 255) ** (2 / gamma), rel=1e-5)
     assert any("gamma byte" in note for note in recording.notes) == (code == 64)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "name", "elevation"),
+    [(2.1e6, "oculus-m1200d-2100khz", 12), (1.2e6, "oculus-m1200d-1200khz", 20), (750e3, "oculus-m750d-750khz", 20)],
+)
+def test_the_carrier_names_the_preset(tmp_path: Path, frequency: float, name: str, elevation: float) -> None:
+    (tmp_path / "a.raw").write_bytes(oculus_ping(np.ones((4, 3)), frequency=frequency))
+    sonar = open_recording(tmp_path / "a.raw").part().like.sonar
+    assert (sonar.name, sonar.elevation_fov_deg, sonar.frequency_hz) == (name, elevation, frequency)
+
+
+def test_a_carrier_of_no_preset_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.raw").write_bytes(oculus_ping(np.ones((4, 3)), frequency=375e3))
+    recording = open_recording(tmp_path / "a.raw")
+    assert any("no preset has this carrier" in note for note in recording.notes)
+    assert recording.part().like.sonar.name == "oculus"
 
 
 def test_windows_and_beams_that_change_make_parts(tmp_path: Path) -> None:
@@ -190,6 +233,13 @@ def test_an_encrypted_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.oculus").write_bytes(log)
     with pytest.raises(MitsonarError, match="encrypted"):
         open_recording(tmp_path / "a.oculus")
+
+
+def test_a_log_of_viewpoint_2_is_refused(tmp_path: Path) -> None:
+    for name, reason in (("a.oculus", "ViewPoint 2"), ("a.db3", "is no recording")):
+        (tmp_path / name).write_bytes(b"SQLite format 3\0".ljust(4096, b"\0"))
+        with pytest.raises(MitsonarError, match=reason):
+            open_recording(tmp_path / name)
 
 
 @pytest.mark.parametrize(

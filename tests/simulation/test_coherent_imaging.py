@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pytest
-from helpers import Array, diffuse, floor, plate, scene, sphere
+from coherent_scenes import BOXES, HEIGHT, PITCH, POSE, SONAR, imager
+from helpers import Array, diffuse, floor, scene, sphere
 from scipy import stats
 
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -19,6 +21,7 @@ from mitsonar.instruments.aperture import series, shaded_sinc
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.pulse import Pulse
 from mitsonar.motion.pose import Pose, to_world_matrices
+from mitsonar.simulation import beam_former
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
 from mitsonar.worlds.rocky_field import RockyField
@@ -32,27 +35,10 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ig
 
 Shape: TypeAlias = Callable[[Array], Array]
 
-HEIGHT, PITCH = 2.5, math.radians(35)
-SONAR = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=48, azimuth_fov_deg=14.5, beam_width_deg=0.3, range_min=4.0,
-                     range_max=4.9, range_bins=192, bearing="cone", elevation_pattern="box", quality="standard",
-                     absorption_db_per_m=0.0)  # fmt: skip
-"""Half the field of view of a DIDSON, its window within the lit floor."""
-
-BOXES = SONAR.replace(model="physical", beam_width_deg=None, azimuth_fov_deg=48 * 0.3)
-"""Hard boxes as wide as the beams."""
-
-POSE = np.array([0, 0, HEIGHT, PITCH, 0, 0])
-
 
 @pytest.fixture(scope="module")
 def flat(variant: str) -> mi.Scene:
     return scene(floor=floor(diffuse(0.5)))
-
-
-def imager(loaded: mi.Scene, sonar: Sonar = SONAR) -> CoherentImager:
-    from mitsonar.simulation.coherent_imaging import CoherentImager
-
-    return CoherentImager(loaded, sonar)
 
 
 def images(source: CoherentImager, count: int, apart: float = 0.7) -> Array:
@@ -103,6 +89,24 @@ def test_patches_make_speckle_heavier(flat: mi.Scene, nu: float) -> None:
     assert made.mean() == pytest.approx(1, abs=0.12)
 
 
+def test_patches_go_softly_over_into_one_another(flat: mi.Scene) -> None:
+    """Covariance of intensities beyond the speckle: 1 / nu times that of tents of unit patches, the cubic B-spline.
+
+    At half a patch, one, one and a half and two patches, along the range over the floor: 0.72, 0.25, 0.03, 0.
+    """
+    nu, side = 1.0, 0.15
+    made = np.abs(images(imager(flat, SONAR.replace(speckle_nu=nu, speckle_patch_m=side)), 40, apart=1.3)) ** 2
+    made = made / expected(SONAR)[:, None] - 1
+    ahead = np.sqrt(SONAR.range_m**2 - HEIGHT**2)
+    found = []
+    for patches in (0.5, 1.0, 1.5, 2.0):
+        other = np.searchsorted(ahead, ahead + patches * side)
+        first = np.flatnonzero(other < len(ahead))
+        found.append((made[:, first] * made[:, other[first]]).mean() * nu)
+    spline = [2 / 3 - 0.25 + 0.0625, 1 / 6, 0.5**3 / 6, 0.0]
+    np.testing.assert_allclose(found, np.array(spline) / (2 / 3), atol=0.12)
+
+
 def test_density_changes_nothing(flat: mi.Scene) -> None:
     """Four times the points: the same energy within 0.1 dB, the same contrast."""
     made = [np.abs(images(imager(flat, SONAR.replace(scatterers_per_cell=n)), 16)) ** 2 for n in (6, 24)]
@@ -116,13 +120,17 @@ def test_rays_change_nothing_on_a_plane(flat: mi.Scene) -> None:
     assert np.corrcoef((np.abs(one) ** 2).ravel(), (np.abs(other) ** 2).ravel())[0, 1] > 0.999
 
 
-def test_rocks(tmp_path: Path) -> None:
-    """Silhouettes: eight times the rays leave intensities correlated by 0.97; energy is the physical model's in 0.2 dB."""
+def test_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Silhouettes: twice the rays leave intensities correlated by 0.98, eight times by 0.97; energy as physical, 0.2 dB."""
     loaded = load_scene(RockyField(size_m=12, a_side=(24, 24)).build(3).write(tmp_path / "world"))
     one, other = (
         np.abs(imager(loaded, SONAR.replace(quality=name)).image(POSE, 0)[0]) ** 2 for name in ("standard", "fine")
     )
     assert np.corrcoef(one.ravel(), other.ravel())[0, 1] > 0.97
+    with monkeypatch.context() as patch:
+        patch.setattr(beam_former, "COLUMNS_A_BEAM", {"standard": 8})
+        twice = np.abs(imager(loaded).image(POSE, 0)[0]) ** 2
+    assert np.corrcoef(one.ravel(), twice.ravel())[0, 1] > 0.98
     places = POSE + np.arange(8)[:, None] * np.array([0.2, 0.15, 0, 0, 0, 0])
     made = sum(
         float((np.abs(imager(loaded, SONAR.replace(seed=seed)).image(pose, 0)[0]) ** 2).sum())
@@ -145,6 +153,19 @@ def test_far_from_the_origin_is_warned_of(flat: mi.Scene) -> None:
     far = POSE + np.array([5000.0, 0, 0, 0, 0, 0])
     with pytest.warns(MitsonarWarning, match=r"within \d+ m of the origin"):
         Simulator(scene(floor=floor(diffuse(0.5), half=1e4)), SONAR).render([Pose(*far)])
+
+
+def test_rays_that_miss_points_are_told_with_the_pitch_that_would_do(flat: mi.Scene) -> None:
+    """5 cm above the floor cells of rays reach far: what they cannot look through is told once; the pitch told is enough."""
+    low = Pose(0, 0, 0.05, math.radians(0.5), 0, math.radians(45))
+    sonar = SONAR.replace(beams=8, azimuth_fov_deg=2.4, elevation_fov_deg=2.0, range_max=12.0, scatterer_spacing_m=0.004)
+    with pytest.warns(MitsonarWarning, match="scatterer_spacing_m of") as caught:
+        Simulator(flat, sonar).render([low, low], labels=True)
+    (told,) = [str(one.message) for one in caught if "scatterer_spacing_m of" in str(one.message)]
+    rays, enough = re.match(r"([\d,]+) rays .* scatterer_spacing_m of ([\d.]+) m would do", told).groups()  # type: ignore[union-attr]
+    assert int(rays.replace(",", "")) == 2 * imager(flat, sonar).image(np.array(low), 0)[1].cut > 0
+    found = imager(flat, sonar.replace(scatterer_spacing_m=float(enough))).image(np.array(low), 0)[1]
+    assert found.cut == found.widest == 0
 
 
 def test_neighbours_correlate_as_pattern_and_pulse_say(flat: mi.Scene) -> None:
@@ -230,20 +251,31 @@ MOTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", MOTIONS)
-def test_speckle_follows_a_motion_as_theory_says(flat: mi.Scene, name: str) -> None:
+ESSENCE = ("side 5 mm", "side 20 mm", "forward 2 mm", "forward 8 mm", "up 5 mm", "yaw 0.1 deg")
+SHIFTS = np.arange(14)[:, None] * np.array([0.7, 0.2, 0, 0, 0, 0])
+CELLS = np.ix_(np.arange(24, 168, 8), np.arange(4, 44, 3))
+"""Bins and beams that are compared."""
+
+
+@pytest.fixture(scope="module")
+def before(flat: mi.Scene) -> tuple[CoherentImager, Array]:
+    """The imager of all motions, and the cells of its images before the motion."""
+    source = imager(flat)
+    return source, np.stack([source.image(POSE + shift, 0)[0][CELLS] for shift in SHIFTS])
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in ESSENCE else pytest.param(name, marks=pytest.mark.thorough) for name in MOTIONS]
+)
+def test_speckle_follows_a_motion_as_theory_says(before: tuple[CoherentImager, Array], name: str) -> None:
     """Fields before and after, weighted by the predicted phase of each pixel: the coherence within 0.03 of the integral."""
-    source, motion = imager(flat), np.array(MOTIONS[name])
-    bins, beams = np.arange(24, 168, 8), np.arange(4, 44, 3)
+    source, motion = before[0], np.array(MOTIONS[name])
+    bins, beams = (axis.ravel() for axis in CELLS)
     truth = np.array([[coherence(SONAR, POSE, POSE + motion, int(beam), int(bin_)) for beam in beams] for bin_ in bins])
-    top = bottom = 0.0
-    power = [0.0, 0.0]
-    for shift in np.arange(14)[:, None] * np.array([0.7, 0.2, 0, 0, 0, 0]):
-        one, other = (source.image(POSE + shift + move, 0)[0][np.ix_(bins, beams)] for move in (0, motion))
-        phase = np.exp(-1j * np.angle(truth))
-        top += float((one * np.conj(other) * phase).sum().real)
-        power = [power[0] + float((np.abs(one) ** 2).sum()), power[1] + float((np.abs(other) ** 2).sum())]
-    bottom = math.sqrt(power[0] * power[1])
+    one = before[1]
+    other = np.stack([source.image(POSE + shift + motion, 0)[0][CELLS] for shift in SHIFTS])
+    top = float((one * np.conj(other) * np.exp(-1j * np.angle(truth))).sum().real)
+    bottom = math.sqrt(float((np.abs(one) ** 2).sum()) * float((np.abs(other) ** 2).sum()))
     assert top / bottom == pytest.approx(np.abs(truth).mean(), abs=0.03)
 
 
@@ -270,71 +302,6 @@ def test_threads_do_not_change_bits(flat: mi.Scene) -> None:
         dr.set_thread_count(before)
     np.testing.assert_array_equal(fields[0], fields[1])
     np.testing.assert_array_equal(fields[0], fields[2])
-
-
-# ---------------------------------------------------------------- one point
-
-
-def one_point(sonar: Sonar) -> tuple[CoherentImager, Array]:
-    """A small plate across the axis that carries one lattice point, and the sonar's pose.
-
-    Seeds are tried until exactly one point lies on the plate.
-    """
-    at = np.array([0, 4.4, 0])
-    loaded = scene(target=plate(at, (0, -1, 0), half=0.01, bsdf=diffuse(0.5)))
-    for seed in range(200):
-        source = imager(loaded, sonar.replace(scatterer_spacing_m=0.03, seed=seed))
-        if source.tracer.field(np.zeros(6))[1].points == 1:
-            return source, np.zeros(6)
-    raise AssertionError("no seed puts one point on the plate")
-
-
-@pytest.mark.parametrize(("shading", "pattern"), [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")])
-def test_point_spread(shading: str, pattern: str) -> None:
-    """Across beams and over range: 0.5 dB down to -35 dB, and the tops of the first two side lobes."""
-    narrow = {"beams": 256, "azimuth_fov_deg": 10.0, "beam_width_deg": 0.4, "range_min": 4.2, "range_max": 4.6}
-    sonar = SONAR.replace(shading=shading, pattern=pattern, range_bins=256, pulse_m=0.02, elevation_pattern="box", **narrow)
-    source, pose = one_point(sonar)
-    made = np.abs(source.image(pose, 0)[0]).astype(float)
-    range_m = sonar.range_m
-    bin_, beam = np.unravel_index(made.argmax(), made.shape)
-    for line, axis, shape in (
-        (made[bin_], np.sin(sonar.bearing_rad), sonar.aperture.pattern),
-        (made[:, beam], range_m, source.former.pulse.shape),
-    ):
-        truth = best_fit(line, axis, shape)
-        level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / truth.max()) for v in (line, truth))
-        main = wanted > -35 if shading != "uniform" else wanted > -25
-        inner = main & (np.abs(np.arange(len(line)) - line.argmax()) < first_null(wanted))
-        assert np.abs(level - wanted)[inner].max() < 0.5
-        tops = side_lobes(wanted)[:2]
-        assert len(tops) == (2 if pattern == "receive" or axis is range_m else 1)
-        for part in (slice(max(0, top - 2), top + 3) for top in tops):
-            assert level[part].max() == pytest.approx(wanted[part].max(), abs=1.0)
-
-
-def best_fit(line: Array, axis: Array, shape: Shape) -> Array:
-    """The shape at the place between samples where it fits best."""
-    step = axis[1] - axis[0]
-    places = axis[line.argmax()] + np.linspace(-1, 1, 401) * abs(step)
-    fits = [np.abs(shape(axis - place)) for place in places]
-    scale = [float(line @ fit / (fit @ fit)) for fit in fits]
-    errors = [float(((line - a * fit) ** 2).sum()) for a, fit in zip(scale, fits, strict=True)]
-    best = int(np.argmin(errors))
-    return np.asarray(scale[best] * fits[best])
-
-
-def first_null(level: Array) -> int:
-    """Samples from the top to the first minimum on its right."""
-    top = int(level.argmax())
-    return int(np.flatnonzero(np.diff(level[top:]) > 0)[0])
-
-
-def side_lobes(level: Array) -> list[int]:
-    """Indices of the maxima right of the main lobe."""
-    begin = int(level.argmax()) + first_null(level)
-    part = level[begin:]
-    return [begin + i for i in range(1, len(part) - 1) if part[i - 1] < part[i] >= part[i + 1] and part[i] > -75]
 
 
 # ---------------------------------------------------------------- levels
@@ -383,6 +350,45 @@ def test_near_glow_falls_evenly_in_decibels(flat: mi.Scene) -> None:
     made = 10 * np.log10((np.abs(np.stack([source.noise(ping) for ping in range(12)])) ** 2).mean(axis=(0, 2)))
     truth = -120 + 30 * np.maximum(0, 1 - sonar.range_m / 0.8)
     assert np.abs((made - truth).reshape(-1, 16).mean(axis=1)).max() < 0.3
+
+
+GLOWING: dict[str, float] = {
+    "range_min": 0.2,
+    "range_max": 1.1,
+    "noise_level_db": -120.0,
+    "near_glow_db": 60.0,
+    "near_glow_m": 0.8,
+}
+
+
+def test_near_glow_falls_from_the_middle_beam_outwards(flat: mi.Scene) -> None:
+    """As the square of the sine of the bearing; the median beam keeps the level; each beam has its own by the seed."""
+    sonar = SONAR.replace(**GLOWING, near_glow_edge_db=20.0)
+    seen = np.stack([imager(flat, sonar).noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    made = 10 * np.log10((np.abs(seen) ** 2).mean(axis=0))
+    line = -120 + 60 * (1 - sonar.range_m[sonar.range_m < 0.4] / 0.8)
+    square = (np.sin(sonar.bearing_rad) / np.sin(sonar.bearing_rad[-1])) ** 2
+    np.testing.assert_allclose((made - line[:, None]).mean(axis=0), -20 * (square - 0.25), atol=0.4)
+    spread = sonar.replace(near_glow_spread_db=5.0)
+    other = np.stack([imager(flat, spread).noise(ping) for ping in range(40)])[:, sonar.range_m < 0.4]
+    own = (10 * np.log10((np.abs(other) ** 2).mean(axis=0)) - made).mean(axis=0)
+    assert own.std() == pytest.approx(5, abs=1.2)
+    redrawn = imager(flat, spread.replace(seed=7)).noise(0)[sonar.range_m < 0.4]
+    assert np.corrcoef(np.log(np.abs(redrawn)).mean(axis=0), np.log(np.abs(other[0])).mean(axis=0))[0, 1] < 0.9
+
+
+def test_a_part_of_the_near_glow_stays_and_its_power_is_kept(flat: mi.Scene) -> None:
+    """The field of two pings has that coherence where the glow is far above the noise, and none behind it."""
+    sonar = SONAR.replace(**GLOWING)
+    power = [np.zeros(0)] * 2
+    for k, still in enumerate((0.0, 0.7)):
+        draws = np.stack([imager(flat, sonar.replace(near_glow_still=still)).noise(ping) for ping in range(24)])
+        power[k] = 10 * np.log10((np.abs(draws) ** 2).mean(axis=(0, 2)))
+        for part, wanted in ((sonar.range_m < 0.4, still), (sonar.range_m > 0.8, 0.0)):
+            grain = draws[:, part] / np.sqrt((np.abs(draws[:, part]) ** 2).mean(axis=(0, 2)))[None, :, None]
+            shared = (grain[1:] * grain[:-1].conj()).mean()
+            assert abs(shared) == pytest.approx(wanted, abs=0.05)
+    assert np.abs((power[1] - power[0]).reshape(-1, 16).mean(axis=1)).max() < 0.8
 
 
 def test_bright_speckle_stays_and_noise_changes(flat: mi.Scene) -> None:
@@ -444,11 +450,15 @@ def test_labels_come_with_speckle(flat: mi.Scene) -> None:
 
 
 def test_what_it_cannot_do_is_refused(flat: mi.Scene) -> None:
-    from mitsonar.instruments.views import Segment
-
     with pytest.raises(MitsonarError, match="give the sonar noise_level_db"):
         Simulator(flat, SONAR).render([Pose(*POSE)], noise=NOISE_MODELS["low"])
-    with pytest.raises(MitsonarError, match="no portions"):
-        Simulator(flat, SONAR, views=[Segment(SONAR, "starboard")])
-    sparse = imager(flat, SONAR.replace(scatterer_spacing_m=0.02))
-    assert "fewer" in sparse.notes[0] or "holds" in sparse.notes[0]
+
+
+def test_too_few_points_are_told_with_the_spacing_that_would_do(flat: mi.Scene) -> None:
+    """A resolution cell at 4 m is 4 m x 0.3 deg by one bin; four points in it take half the root of its area."""
+    with pytest.warns(MitsonarWarning, match=r"holds 0\.25 points at 4 m.* scatterer_spacing_m of ([\d.]+) m would do"):
+        Simulator(flat, SONAR.replace(scatterer_spacing_m=0.02)).render([Pose(*POSE)])
+    (told,) = imager(flat, SONAR.replace(scatterer_spacing_m=0.02)).notes
+    enough = float(told.split(" m would do")[0].rsplit(" ", 1)[1])
+    assert enough == pytest.approx(math.sqrt(4 * math.radians(0.3) * SONAR.bin_m) / 2, rel=0.05)
+    assert not imager(flat, SONAR.replace(scatterer_spacing_m=0.97 * enough)).notes

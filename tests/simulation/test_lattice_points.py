@@ -122,7 +122,7 @@ def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex12
     return total
 
 
-@pytest.mark.parametrize("scenery", ["floor", "corner"])
+@pytest.mark.parametrize("scenery", ["floor", "corner", "patches"])
 def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
     """The points that a channel sonar stores, summed here in NumPy, give the field that the imaging sonar's rays find."""
     from mitsonar.simulation.channel import ChannelSimulator
@@ -131,19 +131,36 @@ def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
 
     shapes = {"floor": {"floor": floor(diffuse(0.4), 8.0)}}
     shapes["corner"] = {"ground": shapes["floor"]["floor"], "wall": plate((1, 5.5, 0), (-0.2, -1, 0.1), 6.0, diffuse(0.3))}
+    shapes["patches"] = shapes["floor"]
     made = scene(**shapes[scenery])
-    channel = ChannelSonar(scatterer_spacing_m=PITCH, receivers=(received_from(),))
+    texture: dict[str, Any] = {"speckle_nu": 0.7, "speckle_patch_m": 0.3} if scenery == "patches" else {}
+    channel = ChannelSonar(scatterer_spacing_m=PITCH, receivers=(received_from(),), **texture)
     stored = scatterers_of(ChannelSimulator(made, channel))
     points = SurfacePoints(stored.place, stored.normal, stored.strength, stored.phase)
     if scenery == "corner":  # of what hides what, each point before the wall's plane and above the ground is in sight
         before = ((points.place - [1, 5.5, 0]) @ np.array([-0.2, -1, 0.1])) > -1e-4
         points = SurfacePoints(*(values[before & (points.place[:, 2] > -1e-4)] for values in points))
-    coherent = Simulator(made, SONAR).coherent
+    coherent = Simulator(made, SONAR.replace(**texture)).coherent
     assert coherent is not None
     got = coherent.tracer.field(np.array(POSE))[0].astype(complex)
     wanted = spread_over_grid(points, coherent.tracer)
     # at the seam of two surfaces a ray's cell holds points of one of them
-    assert np.linalg.norm(got - wanted) < {"floor": 1e-3, "corner": 0.02}[scenery] * np.linalg.norm(wanted)
+    assert np.linalg.norm(got - wanted) < {"floor": 1e-3, "corner": 0.02, "patches": 1e-3}[scenery] * np.linalg.norm(wanted)
+
+
+def test_patches_vary_by_a_gamma_law() -> None:
+    """The same points and phases; factors of mean 1 whose variance is that of the patches, 9 / 4 nu."""
+    plain = found(plate((0, 0, 0), (0, 0, 1), 4.0))
+    from mitsonar.simulation.lattice_points import Patches, lattice_points
+
+    nu = 2.0
+    body = scene(body=plate((0, 0, 0), (0, 0, 1), 4.0)).shapes()[0]
+    uneven = lattice_points(body, 0, PITCH, 0, Patches(nu, 0.1))
+    assert np.array_equal(uneven.place, plain.place)
+    assert np.array_equal(uneven.phase, plain.phase)
+    factor = uneven.strength.astype(float) / plain.strength  # of each point's patch
+    assert factor.mean() == pytest.approx(1, abs=0.05)
+    assert factor.var() == pytest.approx(1 / (4 / 9 * nu), rel=0.1)
 
 
 def test_a_texture_of_cells_joins_the_field() -> None:

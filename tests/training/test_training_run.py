@@ -39,11 +39,13 @@ from mitsonar.config.training_recipe import (  # noqa: E402
     training_recipe_from,
 )
 from mitsonar.datasets.arrangement import Labels  # noqa: E402
+from mitsonar.datasets.joined_pairs import JoinedPairs  # noqa: E402
 from mitsonar.datasets.rendered_pairs import RawStream, RenderedPairs  # noqa: E402
 from mitsonar.datasets.scene_rendering import SceneRenderer  # noqa: E402
 from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.gaussian_head import GaussianHead  # noqa: E402
+from mitsonar.training.evaluation import evaluate  # noqa: E402
 from mitsonar.training.loss import create_loss, squared_error  # noqa: E402
 from mitsonar.training.training_data import Order, Validation, _Together, finished, material_of  # noqa: E402
 from mitsonar.training.training_journal import TrainingReport, _score  # noqa: E402
@@ -278,6 +280,58 @@ def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest
             np.testing.assert_array_equal(one[name], other[name])
     batches = list(itertools.islice(iter(RawStream(pairs, batch_size=6, skip=6)), 10))
     assert [sample["frames"][0] for sample in batches] == [sample["frames"][0] for sample in tail]
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Other scenes in another model: 38 pairs to learn from, 2 to validate on."""
+    url = tmp_path_factory.mktemp("other") / "other.zarr"
+    changes = {"name": "other", "seed": 8, "scenes": [{"count": 2, "sequences": 5}], "sonar__model": "physical"}
+    make_dataset(tiny_recipe(**changes), str(url))
+    return url
+
+
+def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
+    """Every sample of both once an epoch, each as its own set stores it, under frame numbers of its own."""
+    told = recipe(noise="high", split={"train": 0.5, "validation": 0.5}, validate={"pairs": 15, "noise": ["none"]})
+    joined = material_of(told, [made, other], render=False)
+    alone = [material_of(told, one, render=False) for one in (made, other)]
+    assert joined.epoch == sum(one.epoch for one in alone) == 60
+    samples, sets = joined.samples, [one.samples for one in alone]
+    assert isinstance(samples, JoinedPairs)
+    assert isinstance(sets[0], SonarPairs)
+    assert isinstance(sets[1], SonarPairs)
+    for index, own, offset in ((3, sets[0].raw(3), 0), (43, sets[1].raw(3), 100)):
+        found = samples.raw(index)
+        np.testing.assert_array_equal(found["image"], own["image"])
+        np.testing.assert_array_equal(found["label"], own["label"])
+        np.testing.assert_array_equal(found["frames"], own["frames"] + offset)
+    clean, noisy = (sets[1][3][0], samples[43][0])
+    assert not torch.equal(clean, noisy)  # its own noise, not that of the frame of the same number
+    samples.arrange, sets[1].arrange = samples.at_noise("none"), sets[1].at_noise("none")
+    assert torch.equal(sets[1][3][0], samples[43][0])
+    firsts = samples.first[numbers_of(joined.validation)]
+    assert len(np.unique(samples.sequence[firsts])) == len(joined.validation) == 15  # one a sequence
+    assert (joined.about["name"], joined.about["gain"]) == ("tiny and other", None)
+    assert joined.about["digest"] != material_of(told, [other, made], render=False).about["digest"]
+
+
+def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
+    kept = train(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0)
+    assert (kept.model, kept.data) == ("thesis and physical", "tiny and other")
+    report = evaluate(kept, str(other), part="all", noise=["none"])
+    assert not [note for note in report["notes"] if "model" in note]
+    with pytest.raises(MitsonarError, match="begun with data tiny and other, not tiny"):
+        train(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0)
+
+
+def test_data_sets_that_cannot_be_joined_are_refused(made: Path, tmp_path: Path) -> None:
+    wider = tmp_path / "wider.zarr"
+    make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 5}], sonar__beams=14), str(wider))
+    with pytest.raises(MitsonarError, match=r"agree in .*made.*tiny.zarr has beams .*wider.zarr has"):
+        material_of(recipe(), [made, wider], render=False)
+    with pytest.raises(MitsonarError, match="with --render one data set"):
+        material_of(recipe(), [made, made], render=True)
 
 
 def numbers_of(validation: Validation) -> list[int]:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_subject import Subject
-from mitsonar.estimation.crlb.image_crlb import LAWS, Bound, bounds_at, overall, varied
+from mitsonar.estimation.crlb.fisher_bound import Bound, overall
+from mitsonar.estimation.crlb.image_crlb import bounds_at, laws_of, varied
 from mitsonar.estimation.estimator import PlainTable
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 
@@ -49,6 +51,8 @@ def bounds_of_subject(
     gain = subject.gain
     for place in subject.places():
         sonar, poses, heights = subject.sonar, place.poses, place.heights
+        if sonar.model == "coherent" and place.seed is not None:
+            sonar = sonar.replace(seed=place.seed)
         for name, value in changes:
             sonar, poses = varied(sonar, poses, heights, name, value)
             heights = np.full_like(heights, value) if name == "height_m" else heights
@@ -72,10 +76,17 @@ def _gain(simulator: Simulator, poses: NDArray[np.float64]) -> float:
     return constant_gain(batches)[0]
 
 
-def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
+def report_of(source: str, sonar: Sonar, noise: str, name: str | None, rows: list[tuple[Value | None, Table]]) -> PlainTable:
     """Return the bounds as JSON can hold them.
 
     Numbers are in mm and deg; they are null where there is no bound or the motion is not observable.
+
+    Args:
+        source: of scene or data.
+        sonar: tells the laws.
+        noise: of the pixels, by name.
+        name: of the variable, if any.
+        rows: value of the variable, with the bounds.
     """
     found = []
     for value, table in rows:
@@ -95,7 +106,7 @@ def report_of(source: str, noise: str, name: str | None, rows: list[tuple[Value 
         "noise": noise,
         "vary": name,
         "units": ["sideways mm", "forward mm", "yaw deg"],
-        "laws": LAWS,
+        "laws": laws_of(sonar),
         "rows": found,
     }
 
@@ -119,7 +130,7 @@ def report_lines(report: PlainTable) -> list[str]:
     widths = [max(len(line[k]) for line in cells) for k in range(len(titles))]
     lines = ["  ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)).rstrip() for line in cells]
     head = f"noise {report['noise']}: least standard deviation, sideways / forward / yaw (root of the mean variance)"
-    return [head, *lines]
+    return [head, *lines, *(f"{law}: {meaning}" for law, meaning in report["laws"].items())]
 
 
 def _text(std: list[float | None] | None) -> str:

@@ -13,7 +13,6 @@ from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.crlb.image_crlb import refuse_speckle
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.simulation.imaging import Simulator
@@ -33,11 +32,13 @@ class Place:
         scene: Mitsuba's.
         poses: of the sonar ``(n, 6)``.
         heights: over the ground ``(n,)`` [m].
+        seed: of the scatterers here; None: the sonar's.
     """
 
     scene: mi.Scene
     poses: NDArray[np.float64]
     heights: NDArray[np.float64]
+    seed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,6 @@ def subject_of_scene(
     Raises:
         MitsonarError: a pose over nothing.
     """
-    refuse_speckle(sonar)
     heights = np.concatenate([batch.height_m for batch in Simulator(scene, sonar).pings(poses)])
     if not np.isfinite(heights).all():
         raise MitsonarError("nothing is below the sonar at some pose: give a pose over the scene with --from")
@@ -101,7 +101,6 @@ def subject_of_data(
         raise MitsonarError(f"--pairs must be at least 1: got {pairs}")
     store = DataStore.open(source)
     recipe = store.recipe
-    refuse_speckle(recipe.instrument)
     scene, sequence, pose, height = (store.read(name) for name in ("scene", "sequence", "pose", "height_m"))
     part = part or recipe.split.unseen
     mine = np.flatnonzero(deal(world_of(recipe, store.scenes)[scene], sequence, recipe.split, part) & np.isfinite(height))
@@ -114,7 +113,7 @@ def subject_of_data(
         for number in np.unique(scene[chosen]):
             here = chosen[scene[chosen] == number]
             renderer = SceneRenderer(recipe, store.scenes[int(number)])
-            yield Place(renderer.simulator.tracer.scene, pose[here], height[here])
+            yield Place(renderer.simulator.tracer.scene, pose[here], height[here], renderer.simulator.sonar.seed)
             del renderer
             release_memory()
 

@@ -10,15 +10,16 @@ optimistic, since a real estimator has to find the relief and the reflectivity o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums
+from mitsonar.acoustics.noise import Information, NoiseModel, information, information_of_sums, refuse_noise
 from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.estimation.crlb.fisher_bound import Bound, fisher, together
+from mitsonar.estimation.crlb.speckle_crlb import SPECKLE_LAWS, SpeckleBounds
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment
@@ -27,8 +28,8 @@ from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, diffe
 from mitsonar.simulation.imaging import Simulator
 
 __all__ = [
-    *("ALL", "KINDS", "LAWS", "VARIABLES", "Bound", "bound", "cramer_rao_bound", "bounds_at", "bounds_of_views"),
-    *("fisher", "floor_ranges", "overall", "refuse_speckle", "together", "varied"),
+    *("ALL", "KINDS", "LAWS", "VARIABLES", "bound", "bounds_at", "bounds_of_views", "cramer_rao_bound", "floor_ranges"),
+    *("laws_of", "varied"),
 ]
 
 KINDS: dict[str, str] = {"image": "all pixels", "vector": "sums over the beams"}
@@ -53,61 +54,6 @@ VARIABLES = {
 
 MOVING = ("height_m", "pitch_deg", "azimuth_fov_deg", "elevation_fov_deg")
 """Those that move the floor out of the window."""
-
-SURE = 3.0
-"""A direction is observable in which the information exceeds so many of its standard errors."""
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Fisher information of the motion in one frame.
-
-    Attributes:
-        information: F ``(3, 3)`` of sideways, forward [1/m^2] and yaw [1/rad^2].
-        reason: covariance of the elements of F, from the noise of the rays that it was computed with ``(3, 3, 3, 3)``.
-    """
-
-    information: NDArray[np.float64]
-    reason: NDArray[np.float64]
-
-    def __add__(self, other: Bound) -> Bound:
-        """Of two independent images."""
-        return Bound(self.information + other.information, self.reason + other.reason)
-
-    def covariance(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least covariance ``(3, 3)`` [m, m, rad]: of one frame against an oracle, or of two noisy frames.
-
-        The pseudo-inverse where not all can be observed: the variance of an axis with a part in what cannot be is inf.
-        """
-        if frames not in (1, 2):
-            raise MitsonarError(f"a bound is that of 1 or 2 noisy frames: got {frames}")
-        diagonal = np.diag(self.information)
-        scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1))
-        size, axes = np.linalg.eigh(self.information * np.outer(scale, scale))
-        known = size > np.maximum(SURE * self._error(axes * scale[:, None]), 1e-9)
-        inverse = (axes[:, known] / size[known]) @ axes[:, known].T * np.outer(scale, scale)
-        lost = (axes[:, ~known] ** 2).sum(axis=1) > 1e-3
-        inverse[lost, :] = inverse[:, lost] = 0
-        inverse[lost, lost] = np.inf
-        return np.asarray(frames * inverse)
-
-    def std(self, frames: int = 1) -> NDArray[np.float64]:
-        """Return the least standard deviations ``(3,)`` [m, m, rad]; inf where an axis cannot be observed."""
-        return np.asarray(np.sqrt(np.diag(self.covariance(frames))))
-
-    @property
-    def relative_error(self) -> NDArray[np.float64]:
-        """Standard error of :meth:`std` as a part of it ``(3,)``; nan where an axis cannot be observed."""
-        covariance = self.covariance()
-        variance = np.diag(covariance)
-        finite = np.where(np.isfinite(covariance), covariance, 0)
-        return np.asarray(np.where(np.isfinite(variance), self._error(finite) / (2 * variance), np.nan))
-
-    def _error(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the standard error of v' F v for each column v ``(3, n)``."""
-        v = directions
-        variance: NDArray[np.float64] = np.einsum("ijkl,in,jn,kn,ln->n", self.reason, v, v, v, v)
-        return np.sqrt(np.maximum(variance, 0))
 
 
 class InformationTerms(NamedTuple):
@@ -157,8 +103,13 @@ def bound(
     return _terms(derivative, noise, kind, greys).bound(law)
 
 
-def _check(kind: str, law: str) -> None:
-    for what, word, known in (("kind", kind, KINDS), ("law", law, LAWS)):
+def laws_of(sonar: Sonar) -> dict[str, str]:
+    """Return the laws that a sonar's pixels may have, by name, with what they mean; the last counts in comparisons."""
+    return SPECKLE_LAWS if sonar.model == "coherent" else LAWS
+
+
+def _check(kind: str, law: str, kinds: Sequence[str] = tuple(KINDS), laws: Sequence[str] = tuple(LAWS)) -> None:
+    for what, word, known in (("kind", kind, kinds), ("law", law, laws)):
         if word not in known:
             raise MitsonarError(f"unknown {what} {word!r}: {nearest_names(word, known)}")
 
@@ -189,24 +140,6 @@ def _by_sums(derivative: Derivative, noise: NoiseModel) -> InformationTerms:
     return InformationTerms(told, jacobian[:, changing], np.maximum(rays.sum(axis=1), 0.0))
 
 
-def fisher(jacobian: NDArray[np.float64], weight: NDArray[np.float64]) -> Bound:
-    """Compute F = J1' W J2, made symmetric, and the covariance of its elements.
-
-    Args:
-        jacobian: two independent estimates of how k numbers of n independent values change with the motion ``(2, n, k, 3)``.
-        weight: information of each value about its numbers ``(n, k, k)``.
-
-    With M the mean and D half the difference of both it is M' W M - D' W D, and the noise of M is as large as D.
-    """
-    mean, half = jacobian.mean(axis=0), (jacobian[0] - jacobian[1]) / 2
-    weighted = weight @ half
-    own = mean.transpose(0, 2, 1) @ weight @ mean
-    noise = half.transpose(0, 2, 1) @ weighted
-    mixed = mean.transpose(0, 2, 1) @ weighted
-    parts = np.concatenate([mixed + mixed.transpose(0, 2, 1), np.sqrt(2) * noise]).reshape(-1, 9)
-    return Bound((own - noise).sum(axis=0), (parts.T @ parts).reshape(3, 3, 3, 3))
-
-
 def bounds_of_views(
     names: Sequence[str], views: Sequence[Derivative], noise: NoiseModel, *, apart: bool = True
 ) -> dict[tuple[str, str, str], Bound | None]:
@@ -229,12 +162,6 @@ def bounds_of_views(
     return found
 
 
-def together(parts: Sequence[Bound | None]) -> Bound | None:
-    """Add the information of several views, whose noise is independent; None where one view alone has no bound."""
-    known = [part for part in parts if part is not None]
-    return sum(known[1:], known[0]) if len(known) == len(parts) else None
-
-
 def bounds_at(
     simulator: Simulator, poses: ArrayLike, noise: NoiseModel, gain: float, *, pings: int | None = None
 ) -> Iterator[dict[tuple[str, str, str], Bound | None]]:
@@ -248,6 +175,11 @@ def bounds_at(
         pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
             an axis can be observed.
     """
+    if simulator.coherent is not None:
+        refuse_noise(noise, simulator.sonar)
+        for laws in SpeckleBounds(simulator, gain).at(poses, pings=pings):
+            yield {(simulator.views[0].name, "image", law): found for law, found in laws.items()}
+        return
     source, names = jittered(simulator), [view.name for view in simulator.views]
     portions = [view.member for view in simulator.views if isinstance(view, Segment)]
     apart = not portions or bool(np.sum(portions, axis=0).max() <= 1)
@@ -262,19 +194,6 @@ def bounds_at(
         yield found
 
 
-def refuse_speckle(sonar: Sonar) -> None:
-    """Refuse a sonar whose images are speckle: the bound is that of expected levels and noise of pixels.
-
-    Raises:
-        MitsonarError: the model ``coherent``.
-    """
-    if sonar.model == "coherent":
-        raise MitsonarError(
-            "the Cramer-Rao bound knows noise of pixels, not speckle: got the model coherent; give --model physical for the "
-            "bound of the expected levels"
-        )
-
-
 def cramer_rao_bound(
     simulator: Simulator,
     poses: ArrayLike,
@@ -283,7 +202,7 @@ def cramer_rao_bound(
     *,
     view: str | None = None,
     kind: str = "image",
-    law: str = "pixel",
+    law: str | None = None,
     frames: int = 2,
     pings: int | None = None,
 ) -> NDArray[np.float64]:
@@ -293,19 +212,20 @@ def cramer_rao_bound(
     Args:
         simulator: as for :func:`bounds_at`, with its poses and gain.
         poses: of the sonar ``(n, 6)``.
-        noise: of the pixels; without noise ask for the law ``rays``.
+        noise: of the pixels; without noise ask for the law ``rays``. The model ``coherent`` has its own: none.
         gain: that of the frames.
         view: which one; default: the only one, or all together where no two hear the same rays.
-        kind: of :data:`KINDS`.
-        law: of :data:`LAWS`.
+        kind: of :data:`KINDS`; the model ``coherent`` has images only.
+        law: of :func:`laws_of` the sonar; default: ``pixel``, of the model ``coherent`` ``ground``.
         frames: noisy ones, 1 or 2.
         pings: as for :func:`bounds_at`.
 
     Raises:
-        MitsonarError: unknown words; several portions that overlap, and none named; the model ``coherent``.
+        MitsonarError: unknown words; several portions that overlap, and none named; noise of pixels with speckle.
     """
-    _check(kind, law)
-    refuse_speckle(simulator.sonar)
+    speckle = simulator.coherent is not None
+    law = law or ("ground" if speckle else "pixel")
+    _check(kind, law, ["image"] if speckle else list(KINDS), list(laws_of(simulator.sonar)))
     portion = view or (ALL if len(simulator.views) > 1 else simulator.views[0].name)
     found = []
     for one in bounds_at(simulator, poses, noise, gain, pings=pings):
@@ -314,11 +234,6 @@ def cramer_rao_bound(
             raise MitsonarError(f"portions that overlap have no bound together: got view {view!r}; name one of {names}")
         found.append(one[portion, kind, law])
     return np.array([np.zeros(3) if one is None else one.std(frames) for one in found]).reshape(-1, 3)
-
-
-def overall(stds: Iterable[ArrayLike]) -> NDArray[np.float64]:
-    """One number an axis for many poses ``(3,)``: the root of the mean variance, which an RMSE is to be compared with."""
-    return np.asarray(np.sqrt(np.mean(np.square(np.array(list(stds), dtype=float)), axis=0)))
 
 
 # ---------------------------------------------------------------- what if

@@ -56,8 +56,8 @@ BLOCK_CAUCHY = 4.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
 
 MODEL = 4.5
-"""Squared errors over the covariance of the residuals, measured on rocky fields with high noise, thesis and physical model:
-the ground is neither level nor finely sampled. Without noise the standard deviations are too small by 1.2 and 2."""
+"""Squared errors over the covariance of the residuals, measured on rocky fields: the ground is neither level nor finely
+sampled. With it they are 1.2 times the covariance without noise and with speckle, 0.3 times with a high noise of pixels."""
 
 REMEMBERED = 4
 LEVER_M = 4.0
@@ -175,7 +175,11 @@ class Direct:
 
 
 class _Side(NamedTuple):
-    """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion."""
+    """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion.
+
+    ``curvature`` is the derivative of weight times residual by the residual. Outliers, whose weight falls as they grow, have
+    a negative one: a motion that the weights hold is known less well than the sum of the weights says.
+    """
 
     before: Floats
     after: Floats
@@ -183,7 +187,7 @@ class _Side(NamedTuple):
     slopes: tuple[Floats, Floats]
     residual: Floats
     jacobian: Floats
-    weight: Floats
+    curvature: Floats
     weighted: Floats
 
     def sums(self, values: Floats) -> NDArray[np.float64]:
@@ -224,10 +228,12 @@ def _linearised(
     for (before, after, inner), residual in zip(pairs, residuals, strict=True):
         slopes = slopes_of((before + after) * np.float32(0.5), level, scale)
         weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
+        curvature = weight * (2 * weight - 1)
         if last:
-            weight = weight * _block_weight(slopes, residual, weight, inner)
+            blocks = _block_weight(slopes, residual, weight, inner)
+            weight, curvature = weight * blocks, curvature * blocks
         jacobian = cells.along(slopes, inner)
-        sides.append(_Side(before, after, inner, slopes, residual, jacobian, weight, jacobian * weight))
+        sides.append(_Side(before, after, inner, slopes, residual, jacobian, curvature, jacobian * weight))
     normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
     pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
     return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
@@ -307,10 +313,11 @@ def _singular(normal: NDArray[np.float64]) -> bool:
 
 
 def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
-    """Return the normal matrix from slopes of one frame times slopes of the other, whose noise is independent."""
+    """Return how the gradient changes with the motion, from slopes of one frame times slopes of the other, whose noise is
+    independent."""
     frames = (side.before, side.after)
     one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
-    product = ((one * side.weight) @ other.T).astype(np.float64)
+    product = ((one * side.curvature) @ other.T).astype(np.float64)
     return (product + product.T) / 2
 
 

@@ -295,6 +295,7 @@ SIZES = {
     "height-hull-vector": (512, 1),
     "profilenet-circular-10m": (1024, 8),
     "profilenet-quadrants": (1024, 8),
+    "profilenet-quadrants-coherent": (512, 8),
 }
 """Range levels and columns that the networks of chapter 4 read (tables 4.1, 4.2, 4.4)."""
 

@@ -1,0 +1,158 @@
+"""``mitsonar recording``: what it prints, draws and converts, of recordings and of runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import Maker, write_bag
+from drawn_frames import as_zarr, over_ground, sway
+from helpers import Command, refused
+from PIL import Image
+
+from mitsonar import SonarFrames
+from mitsonar.mapping.any_recording import recording_at
+from mitsonar.recordings.mcap_writer import write_mcap
+
+pytest.importorskip("rosbags")
+
+
+@pytest.fixture(scope="module")
+def frames() -> SonarFrames:
+    drawn = over_ground(sway(6))
+    elevation = np.full(drawn.image.shape, -0.6, np.float32)
+    return replace(drawn, elevation_rad=elevation, shape_id=np.zeros(drawn.image.shape, np.int32))
+
+
+@pytest.fixture(scope="module")
+def places(frames: SonarFrames, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same frames as frames.npz, a run's folder with frames.zarr, and MCAP."""
+    folder = tmp_path_factory.mktemp("frames")
+    (folder / "run").mkdir()
+    frames.save(folder / "frames.npz")
+    as_zarr(frames, folder / "run/frames.zarr")
+    write_mcap([frames], folder / "run.mcap")
+    return {"npz": folder / "frames.npz", "zarr": folder / "run", "mcap": folder / "run.mcap"}
+
+
+@pytest.mark.parametrize("kind", ["npz", "zarr", "mcap"])
+def test_info_of_any_frames(mitsonar: Command, places: dict[str, Path], frames: SonarFrames, kind: str) -> None:
+    done = mitsonar("recording", "info", places[kind], "--json")
+    assert done.returncode == 0, done
+    found = json.loads(done.stdout)
+    (part,) = found["parts"]
+    assert (found["frames"], part["bins"], part["beams"], part["samples"]) == (6, 128, 96, "float32")
+    assert part["window_m"] == [3.6, 5.4]
+    assert part["rate_hz"] == pytest.approx(1 / np.median(np.diff(frames.time_s)))
+    assert part["bearing_deg"] == pytest.approx(np.degrees(frames.bearing_rad[[0, -1]]))
+    assert part["path_m"] == pytest.approx(np.linalg.norm(np.diff(frames.poses[:, :3], axis=0), axis=1).sum())  # type: ignore[index]
+    table = mitsonar("recording", "info", places[kind]).stdout
+    assert "window     " in table
+    assert "3.6..5.4 m, 128 bins of 14.06 mm" in " ".join(table.split())
+
+
+def test_info_tells_gaps_and_notes(mitsonar: Command, frames: SonarFrames, tmp_path: Path) -> None:
+    time = np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1]) + 1_790_000_000
+    replace(frames, time_s=time).save(tmp_path / "frames.npz")
+    table = mitsonar("recording", "info", tmp_path).stdout
+    assert "10 Hz, 1 gaps; the longest step takes 0.7 s" in table
+    assert "2026-09-21" in table
+
+
+@pytest.mark.parametrize("kind", ["npz", "zarr", "mcap"])
+def test_show_and_video(mitsonar: Command, places: dict[str, Path], tmp_path: Path, kind: str) -> None:
+    done = mitsonar("recording", "show", places[kind], "--frame", 3, "-o", tmp_path / "a.png")
+    assert done.returncode == 0, done
+    assert np.asarray(Image.open(tmp_path / "a.png").convert("L")).std() > 10
+    refused(mitsonar("recording", "show", places[kind], "-o", tmp_path / "a.png"), "exists and is kept")
+    refused(mitsonar("recording", "show", places[kind], "--frame", 6, "-o", tmp_path / "b.png"), "there is no frame 6")
+    done = mitsonar("recording", "video", places[kind], "-o", tmp_path / "a.mp4")
+    assert done.returncode == 0, done
+    assert "6 frames at" in done.stdout
+    assert (tmp_path / "a.mp4").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("kind", ["npz", "zarr", "mcap"])
+def test_frames_survive_folder_and_mcap_in_any_order(
+    mitsonar: Command, places: dict[str, Path], frames: SonarFrames, tmp_path: Path, kind: str
+) -> None:
+    first, second = tmp_path / "one.mcap", tmp_path / "two"
+    for source, out in ((places[kind], first), (first, second)):
+        done = mitsonar("recording", "convert", source, "-o", out)
+        assert done.returncode == 0, done
+        assert "6 frames in" in done.stdout
+    back = SonarFrames.load(second)
+    for name in ("image", "range_m", "bearing_rad"):
+        assert (getattr(back, name) == getattr(frames, name)).all(), name
+    assert back.time_s == pytest.approx(frames.time_s, abs=0.51e-9)  # ROS counts nanoseconds
+    assert back.poses == pytest.approx(frames.poses, abs=1e-8)
+    assert back.height_m == pytest.approx(frames.height_m, rel=1e-6)
+    assert back.sonar == frames.sonar
+    refused(mitsonar("recording", "convert", places[kind], "-o", first), "exists and is kept")
+    refused(mitsonar("recording", "convert", places[kind], "-o", second), "--resume goes on with it")
+    assert mitsonar("recording", "convert", first, "-o", second, "--resume").returncode == 0
+
+
+@pytest.mark.parametrize("kind", ["npz", "zarr"])
+def test_labels_of_a_run_become_points(mitsonar: Command, places: dict[str, Path], tmp_path: Path, kind: str) -> None:
+    from bags import decoded
+
+    assert mitsonar("recording", "convert", places[kind], "-o", tmp_path / "a.mcap").returncode == 0
+    clouds = decoded(tmp_path / "a.mcap")["/sonar/points"]
+    assert len(clouds) == 6
+    assert [one.name for one in clouds[0].fields] == ["x", "y", "z", "intensity", "shape_id"]
+    assert recording_at(places[kind]).part().read([1, 4]).elevation_rad == pytest.approx(-0.6)
+
+
+def test_frames_become_an_aris_file(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
+    refused(mitsonar("recording", "convert", places["mcap"], "-o", tmp_path / "a.aris"), "--beams 96")
+    done = mitsonar("recording", "convert", places["mcap"], "-o", tmp_path / "a.aris", "--beams", 96)
+    assert done.returncode == 0, done
+    assert "warning: 96 beams were interpolated" in done.stderr
+    assert "6 frames in" in done.stdout
+    assert json.loads(mitsonar("recording", "info", tmp_path / "a.aris", "--json").stdout)["frames"] == 6
+    again = ("recording", "convert", places["mcap"], "-o", tmp_path / "a.aris", "--beams", 96)
+    refused(mitsonar(*again), "exists and is kept")
+    assert mitsonar(*again, "--overwrite").returncode == 0
+    assert [one.name for one in tmp_path.iterdir()] == ["a.aris"]
+
+
+def test_odometry_reads_what_was_converted(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
+    done = mitsonar("odometry", places["mcap"], "--estimator", "zero", "-o", tmp_path / "out")
+    assert done.returncode == 0, done
+    assert (tmp_path / "out/true.tum").exists()
+
+
+def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
+    maker, sent = Maker(True), []
+    bearing, distance = np.radians(np.linspace(-20, 20, 8)), np.arange(1, 13, dtype=np.float64)
+    for topic, value in (("/port", 10), ("/starboard", 200)):
+        for time in (1.0, 1.1, 1.2):
+            image = np.full((12, 8), value, np.uint8)
+            sent.append((topic, time, maker.ping(image, time, bearing, distance)))
+    path = write_bag(tmp_path / "two.bag", maker, sent)
+    refused(mitsonar("recording", "info", path), "choose one of the topics /port, /starboard", "--topic")
+    found = json.loads(mitsonar("recording", "info", path, "--topic", "/starboard", "--json").stdout)
+    assert found["facts"]["topic"] == "/starboard"
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["info", "no.aris"], "there are no frames at no.aris"),
+        (["convert", "FRAMES", "-o", "a.bag"], "unknown ending"),
+        (["convert", "FRAMES", "-o", "a.mcap", "--resume"], "--resume is for folders"),
+        (["convert", "FRAMES", "-o", "a.mcap", "--part", "3"], "has no part 3"),
+        (["video", "FRAMES", "-o", "a.mp4", "--rate", "0"], "--rate must lie"),
+        (["show", "FRAMES", "-o", "a.png", "--span-db", "-1"], "the span must lie"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    mitsonar: Command, places: dict[str, Path], tmp_path: Path, words: list[str], reason: str
+) -> None:
+    given = [str(places["npz"]) if word == "FRAMES" else word for word in words]
+    refused(mitsonar("recording", *given, cwd=tmp_path), reason)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,194 @@
+"""The limit under speckle: covariance of scores against closed forms, and oracles that own the simulator and reach it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from helpers import Array, diffuse, floor, scene
+from scipy import special, stats
+from scipy.sparse import csr_array
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
+from mitsonar.estimation.crlb.score_covariance import CellCorrelation, ScoreCovariance
+from mitsonar.estimation.crlb.speckle_crlb import CellScores, SpeckleBounds, grain_law
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.pose import Pose
+
+if TYPE_CHECKING:
+    from mitsonar.simulation.imaging import Simulator
+
+SONAR = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=24, azimuth_fov_deg=7.25, beam_width_deg=0.3, range_min=4.0,
+                     range_max=4.45, range_bins=96, bearing="cone", absorption_db_per_m=0.0)  # fmt: skip
+POSE = Pose(0.0, 0.0, 2.5, float(np.radians(35)), 0.0, 0.0)
+
+
+def neighbours(size: int, value: float) -> Array:
+    """A correlation of neighbours only."""
+    return np.eye(size) + value * (np.eye(size, k=1) + np.eye(size, k=-1))
+
+
+def near(bins: int, beams: int) -> CellCorrelation:
+    return CellCorrelation(csr_array(neighbours(bins, 0.42)), neighbours(beams, 0.45))
+
+
+# ---------------------------------------------------------------- cells that share noise
+
+
+def test_the_covariance_is_that_of_the_formula_and_is_inverted() -> None:
+    rng = np.random.default_rng(1)
+    shape, shared = (7, 5), near(7, 5)
+    turn = np.sqrt(0.6) * np.exp(2j * np.pi * rng.random(shape))
+    power = np.sqrt(0.3) * np.ones(shape)
+    covariance = ScoreCovariance.of([(turn, shared), (power, shared * shared)], shape)
+    whole = np.kron(neighbours(7, 0.42), neighbours(5, 0.45))
+    flat = turn.ravel()
+    wanted = (flat.conj()[:, None] * whole * flat).real + 0.3 * whole**2 + 0.1 * np.eye(35)
+    values = rng.normal(size=(3, *shape))
+    np.testing.assert_allclose((covariance @ values).reshape(3, -1), values.reshape(3, -1) @ wanted, atol=1e-12)
+    np.testing.assert_allclose(np.diag(wanted), 1)
+    np.testing.assert_allclose(
+        covariance.solve(values).reshape(3, -1), np.linalg.solve(wanted, values.reshape(3, -1).T).T, rtol=1e-3, atol=1e-4
+    )
+
+
+def test_an_even_change_of_speckle_counts_independent_cells() -> None:
+    """A level that changes by one factor everywhere: cells over the sum of squared coherences, apart from the edges."""
+    shape, shared = (200, 120), near(200, 120)
+    covariance = ScoreCovariance.of([(np.ones(shape), shared * shared)], shape)
+    jacobian = np.zeros((2, *shape, 3))
+    jacobian[..., 0] = 1
+    told = CellScores(jacobian, np.ones(shape), covariance).bound().information[0, 0]
+    alone = (1 + 2 * 0.42**2) * (1 + 2 * 0.45**2)
+    assert told == pytest.approx(200 * 120 / alone, rel=0.01)
+
+
+def test_strong_echoes_have_gaussian_amplitudes() -> None:
+    """J' C^-1 J with the covariance N / 2 Re(r exp(j (phase difference))) of the amplitudes, as for any Gaussian."""
+    rng = np.random.default_rng(2)
+    shape, noise = (9, 6), 1e-7
+    echo = np.exp(2j * np.pi * rng.random(shape)) * rng.uniform(1, 2, shape)
+    slope = rng.normal(size=(*shape, 3))
+    found = CellScores(np.stack([slope, slope]), *grain_law(echo, np.full(shape, noise), near(*shape))).bound()
+    by_amplitude = (slope / (2 * np.abs(echo))[..., None]).reshape(-1, 3)
+    turn = np.exp(1j * np.angle(echo)).ravel()
+    whole = noise / 2 * (turn.conj()[:, None] * np.kron(neighbours(9, 0.42), neighbours(6, 0.45)) * turn).real
+    wanted = by_amplitude.T @ np.linalg.solve(whole, by_amplitude)
+    np.testing.assert_allclose(found.information, wanted, rtol=2e-3, atol=1e-3 * np.abs(wanted).max())
+
+
+def test_rounding_is_a_variance_and_without_noise_it_is_all() -> None:
+    shape = (4, 5)
+    echo, none = np.ones(shape, complex), np.zeros(shape)
+    weight, _ = grain_law(echo, none, near(*shape), 0.01)
+    np.testing.assert_allclose(weight, 100)
+    weight, _ = grain_law(echo, np.full(shape, 1e-4), near(*shape), 0.01)
+    np.testing.assert_allclose(weight, 1 / (0.01 + 2e-4), rtol=1e-3)  # var |s|^2 = 2 N |s|^2
+    with pytest.raises(MitsonarError, match="noise_level_db"):
+        grain_law(echo, none, near(*shape))
+
+
+# ---------------------------------------------------------------- oracles
+
+
+def source(noise_db: float, even: bool = False) -> Simulator:
+    """Even ground, or blotches of 8 cm; a noise of -90 dB lies 16 dB below the median echo."""
+    from mitsonar.simulation.imaging import Simulator
+
+    made = scene(floor=floor(diffuse(0.5 if even else {"type": "cell_noise", "cells": 500}), 20.0))
+    return Simulator(made, SONAR.replace(noise_level_db=noise_db))
+
+
+@lru_cache(maxsize=4)
+def limits(noise_db: float, even: bool = False) -> SpeckleBounds:
+    return SpeckleBounds(source(noise_db, even), 1.0)
+
+
+def reaches(value: float, draws: int) -> bool:
+    """Whether a mean of e' F e / 3 of so many draws is that of the bound."""
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], 3 * draws) / (3 * draws)
+    return bool(low < value < high)
+
+
+def pulled(told: CellScores, scores: Array) -> Array:
+    """Return J' W^1/2 C^-1 of standardised scores ``(n, bins, beams)``, as ``(n, 3)``."""
+    jacobian = told.jacobian.mean(axis=0, dtype=float) * np.sqrt(told.weight)[..., None]
+    return np.einsum("nij,ijk->nk", told.covariance.solve(scores), jacobian)
+
+
+def rician_scores(amplitude: Array, echo: Array, noise: Array, weight: Array) -> Array:
+    """Standardised derivatives of the log of the density of amplitudes by the power of their echo."""
+    z = 2 * amplitude * echo / noise
+    return np.asarray((amplitude / echo * special.i1e(z) / special.i0e(z) - 1) / noise / np.sqrt(weight))
+
+
+def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
+    """e' F e / 3 of scoring from a start that is off, with the echoes rendered anew at each step; noise as pings have it."""
+    pose = np.array(POSE)
+    told = bounds.grain(pose)
+    weight, covariance = grain_law(bounds.imager.echoes(pose)[0].astype(complex), bounds.noise, bounds.of_noise)
+    told = CellScores(told.jacobian, weight, covariance)  # amplitudes are not rounded here
+    limit = told.bound()
+    echo = bounds.imager.echoes(pose)[0]
+    amplitude = np.abs(np.array([echo + bounds.imager.noise(ping) for ping in range(draws)])).astype(float)
+    motion = np.tile(limit.std() * [2, -1, 1], (draws, 1))
+    for _ in range(3):
+        for frame in range(draws):
+            moved = np.abs(bounds.imager.echoes(np.array(compose(POSE, Motion(*motion[frame]))))[0]).astype(float)
+            scores = rician_scores(amplitude[frame], np.maximum(moved, 1e-12), bounds.noise, weight)
+            motion[frame] += np.linalg.solve(limit.information, pulled(told, scores[None])[0])
+    return float(np.einsum("ni,ij,nj->n", motion, limit.information, motion).mean() / 3)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("noise_db", [-90.0, -75.0])
+def test_an_oracle_of_the_scatterers_reaches_the_grain_bound(noise_db: float) -> None:
+    """At a high and at a low ratio of echo to noise."""
+    value = grain_oracle(limits(noise_db, even=True), 12)
+    assert reaches(value, 12), value
+
+
+def ground_oracle(bounds: SpeckleBounds, draws: int) -> float:
+    """e' F e / 3 of one step of scoring on frames whose scatterers are drawn anew; level and motion are known before."""
+    from mitsonar.simulation.coherent_imaging import CoherentImager
+
+    pose = np.array(POSE)
+    told = bounds.ground(pose, 32)
+    limit = told.bound()
+    level = next(bounds.expected.pings(np.tile(pose, (64, 1)), first=9000)).levels.mean(axis=0)
+    mean = level / bounds.imager.gain[:, None] + bounds.noise
+    scores = []
+    for seed in range(draws):
+        imager = CoherentImager(bounds.expected.tracer.scene, bounds.sonar.replace(seed=1000 + seed))
+        scores.append(np.abs(imager.image(pose, seed)[0].astype(complex)) ** 2 / mean - 1)
+    motion = np.linalg.solve(limit.information, pulled(told, np.array(scores)).T).T
+    return float(np.einsum("ni,ij,nj->n", motion, limit.information, motion).mean() / 3)
+
+
+@pytest.mark.usefixtures("variant")
+def test_an_oracle_of_the_level_reaches_the_ground_bound() -> None:
+    value = ground_oracle(limits(-75.0), 16)
+    assert reaches(value, 16), value
+
+
+# ---------------------------------------------------------------- the bound itself
+
+
+@pytest.mark.usefixtures("variant")
+def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
+    quiet, loud = (next(limits(noise_db).at(np.array(POSE), pings=4)) for noise_db in (-90.0, -75.0))
+    assert (quiet["grain"].std(2) < 0.05 * quiet["ground"].std(2)).all()
+    for law in ("grain", "ground"):
+        assert (quiet[law].std(2) < loud[law].std(2)).all()
+    simulator = source(-90.0)
+    found = cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1.0, pings=4)
+    np.testing.assert_allclose(found[0], quiet["ground"].std(2))
+    with pytest.raises(MitsonarError, match="noise of its own"):
+        cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["low"], 1e-3)
+    with pytest.raises(MitsonarError, match="unknown law 'rays'"):
+        cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1e-3, law="rays")

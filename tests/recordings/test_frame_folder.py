@@ -1,0 +1,91 @@
+"""Copies of recordings as runs: whole, resumed after a stop, and refused where something else is there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_frames import over_ground, sway
+
+from mitsonar import MitsonarError, SonarFrames
+from mitsonar.mapping.open_frames import load_frames
+from mitsonar.recordings import frame_folder
+from mitsonar.recordings.frame_folder import write_frames
+from mitsonar.recordings.recording import Part, Recording
+
+COUNT = 7
+
+
+@pytest.fixture(scope="module")
+def frames() -> SonarFrames:
+    drawn = over_ground(sway(COUNT))
+    return replace(drawn, image=(255 * drawn.image).astype(np.uint8), attitude_rad=drawn.poses[:, 3:])  # type: ignore[index]
+
+
+def of(frames: SonarFrames, stops_at: int | None = None) -> Recording:
+    """A recording of frames, whose reading may stop at one of them."""
+
+    def images(index: np.ndarray) -> np.ndarray:
+        if stops_at is not None and stops_at in index:
+            raise KeyboardInterrupt
+        return np.asarray(frames.image[index])
+
+    part = Part(frames.select(slice(0)), frames.time_s, images, frames.poses, frames.attitude_rad, frames.height_m)
+    return Recording("drawn", "drawn frames", (part,))
+
+
+def same(path: Path, frames: SonarFrames) -> None:
+    back = SonarFrames.load(path)
+    for name in ("image", "range_m", "bearing_rad", "time_s", "poses", "attitude_rad", "height_m"):
+        assert (getattr(back, name) == getattr(frames, name)).all(), name
+    assert back.image.dtype == frames.image.dtype
+    assert (back.sonar, back.level) == (frames.sonar, frames.level)
+
+
+def test_a_short_recording_becomes_frames_npz(frames: SonarFrames, tmp_path: Path) -> None:
+    told: list[int] = []
+    made = write_frames(of(frames), None, tmp_path / "run", progress=told.append)
+    assert made == tmp_path / "run/frames.npz"
+    same(made, frames)
+    assert sum(told) == COUNT
+    assert SonarFrames.load(made).about["format"] == "drawn frames"
+    assert (load_frames(tmp_path / "run").image == frames.image).all()
+
+
+@pytest.mark.parametrize("longest_npz", [3, 1000])
+def test_a_stopped_copy_goes_on_and_gives_the_same(
+    frames: SonarFrames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, longest_npz: int
+) -> None:
+    monkeypatch.setattr(frame_folder, "CHUNK_BYTES", 2 * frames.image[0].nbytes)
+    monkeypatch.setattr(frame_folder, "LONGEST_NPZ", longest_npz)
+    folder = tmp_path / "run"
+    with pytest.raises(KeyboardInterrupt):
+        write_frames(of(frames, stops_at=5), None, folder)
+    assert len(load_frames_of_unfinished(folder)) == 4
+    with pytest.raises(MitsonarError, match="--resume goes on with it"):
+        write_frames(of(frames), None, folder)
+    read: list[int] = []
+    made = write_frames(of(frames), None, folder, resume=True, progress=read.append)
+    assert read == [4, 2, 1]
+    assert made.name == ("frames.zarr" if longest_npz < COUNT else "frames.npz")
+    same(made, frames)
+    assert write_frames(of(frames, stops_at=0), None, folder, resume=True) == made  # nothing is read again
+
+
+def load_frames_of_unfinished(folder: Path) -> SonarFrames:
+    with pytest.warns(match="is not finished: 4 of 7"):
+        return load_frames(folder)
+
+
+def test_another_recording_is_not_resumed_and_other_things_are_kept(frames: SonarFrames, tmp_path: Path) -> None:
+    write_frames(of(frames), None, tmp_path / "run")
+    with pytest.raises(MitsonarError, match="frames"):
+        write_frames(of(frames.select(slice(3))), None, tmp_path / "run", resume=True)
+    made = write_frames(of(frames.select(slice(3))), None, tmp_path / "run", overwrite=True)
+    same(made, frames.select(slice(3)))
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/notes.txt").write_text("mine")
+    with pytest.raises(MitsonarError, match="holds other things"):
+        write_frames(of(frames), None, tmp_path / "other")

@@ -1,0 +1,168 @@
+"""Point spread of the model coherent: across beams, over range and elevation, and out of focus."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+import pytest
+from coherent_scenes import SONAR, imager, one_point
+from helpers import Array
+
+from mitsonar.instruments.aperture import Pattern
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.simulation.beam_former import elevation_end
+
+pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
+
+Shape: TypeAlias = Callable[[Array], Array]
+
+
+@pytest.mark.parametrize(("shading", "pattern"), [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")])
+def test_point_spread(shading: str, pattern: str) -> None:
+    """Across beams and over range: 0.5 dB down to -35 dB, and the tops of the first two side lobes."""
+    narrow = {"beams": 256, "azimuth_fov_deg": 10.0, "beam_width_deg": 0.4, "range_min": 4.2, "range_max": 4.6}
+    sonar = SONAR.replace(shading=shading, pattern=pattern, range_bins=256, pulse_m=0.02, elevation_pattern="box", **narrow)
+    loaded, fields, _ = one_point()
+    source = imager(loaded, sonar.replace(**fields))
+    made = np.abs(source.image(np.zeros(6), 0)[0]).astype(float)
+    range_m = sonar.range_m
+    bin_, beam = np.unravel_index(made.argmax(), made.shape)
+    for line, axis, shape in (
+        (made[bin_], np.sin(sonar.bearing_rad), sonar.aperture.pattern),
+        (made[:, beam], range_m, source.former.pulse.shape),
+    ):
+        truth = best_fit(line, axis, shape)
+        level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / truth.max()) for v in (line, truth))
+        main = wanted > -35 if shading != "uniform" else wanted > -25
+        inner = main & (np.abs(np.arange(len(line)) - line.argmax()) < first_null(wanted))
+        assert np.abs(level - wanted)[inner].max() < 0.5
+        tops = side_lobes(wanted)[:2]
+        assert len(tops) == (2 if pattern == "receive" or axis is range_m else 1)
+        for part in (slice(max(0, top - 2), top + 3) for top in tops):
+            assert level[part].max() == pytest.approx(wanted[part].max(), abs=1.0)
+
+
+def best_fit(line: Array, axis: Array, shape: Shape) -> Array:
+    """The shape at the place between samples where it fits best."""
+    step = axis[1] - axis[0]
+    places = axis[line.argmax()] + np.linspace(-1, 1, 401) * abs(step)
+    fits = [np.abs(shape(axis - place)) for place in places]
+    scale = [float(line @ fit / (fit @ fit)) for fit in fits]
+    errors = [float(((line - a * fit) ** 2).sum()) for a, fit in zip(scale, fits, strict=True)]
+    best = int(np.argmin(errors))
+    return np.asarray(scale[best] * fits[best])
+
+
+def first_null(level: Array) -> int:
+    """Samples from the top to the first minimum on its right."""
+    top = int(level.argmax())
+    return int(np.flatnonzero(np.diff(level[top:]) > 0)[0])
+
+
+def side_lobes(level: Array) -> list[int]:
+    """Indices of the maxima right of the main lobe."""
+    begin = int(level.argmax()) + first_null(level)
+    part = level[begin:]
+    return [begin + i for i in range(1, len(part) - 1) if part[i - 1] < part[i] >= part[i + 1] and part[i] > -75]
+
+
+# ---------------------------------------------------------------- elevation
+
+
+def upright_array(elevation: Array, half_deg: float, ways: int) -> Array:
+    """Amplitude of an even line of elements, there only or there and back, half power at ``half_deg``: a plain sum."""
+    place = (np.arange(1500) + 0.5) / 1500 - 0.5
+
+    def sum_over(length: float, angle: Array) -> Array:
+        waves = np.exp(2j * np.pi * length * place * np.sin(angle)[:, None])
+        return np.asarray(waves.mean(axis=1).real ** ways)
+
+    low, high = 0.0, 1 / math.sin(math.radians(half_deg))
+    for _ in range(50):
+        middle = (low + high) / 2
+        power = float(sum_over(middle, np.array([math.radians(half_deg)]))[0]) ** 2
+        low, high = (middle, high) if power > 0.5 else (low, middle)
+    return sum_over(low, elevation)
+
+
+@pytest.mark.parametrize(("pattern", "ways", "least_db"), [("receive", 1, -35.0), ("two_way", 2, -29.5)])
+def test_spread_over_elevation(pattern: Pattern, ways: int, least_db: float) -> None:
+    """A point that the sonar nods past keeps its bearing: its level follows the array's sum, to where the fan ends."""
+    loaded, fields, place = one_point(half=0.05)
+    sonar = SONAR.replace(elevation_pattern=pattern, beams=16, azimuth_fov_deg=4.8, range_min=4.2, range_max=4.6,
+                          range_bins=64, **fields)  # fmt: skip
+    source, nods = imager(loaded, sonar), np.radians(np.arange(-20.0, 20.1, 0.5))
+    images = [np.abs(source.image(np.array([0, 0, 0, nod, 0, 0]), 0)[0]).astype(float) for nod in nods]
+    brightest = np.unravel_index(images[len(nods) // 2].argmax(), images[0].shape)
+    made = np.array([image[brightest] for image in images])
+    elevation = math.atan2(place[2], place[1]) + nods
+    truth = upright_array(elevation, sonar.elevation_fov_deg / 2, ways)
+    truth *= made.max() / truth[made.argmax()]
+    level, wanted = (20 * np.log10(np.maximum(np.abs(v), 1e-12) / made.max()) for v in (made, truth))
+    seen = (wanted > least_db) & (np.abs(elevation) < elevation_end(sonar))
+    assert wanted[seen].min() < least_db + 8
+    assert np.abs(level - wanted)[seen].max() < 0.1
+    assert not made[np.abs(elevation) > elevation_end(sonar) + 0.005].any()
+
+
+@pytest.mark.parametrize(("pattern", "ways"), [("receive", 1), ("two_way", 2)])
+def test_law_over_elevation_to_the_second_side_lobe(pattern: Pattern, ways: int) -> None:
+    """The law itself, beyond the fan: tops of both side lobes, -13.26 and -17.83 dB one way, within 0.02 dB."""
+    import mitsuba as mi
+
+    from mitsonar.simulation.elevation_pattern import elevation_gain
+
+    sonar = SONAR.replace(elevation_pattern=pattern, elevation_fov_deg=6.0)
+    angle = np.radians(np.linspace(-30, 30, 3001))
+    made = np.array(elevation_gain(sonar, mi.Float(np.tan(angle).astype(np.float32))), dtype=float)
+    np.testing.assert_allclose(made, upright_array(angle, 3.0, ways), atol=1e-4)
+    level = 20 * np.log10(np.maximum(np.abs(made), 1e-9))
+    tops = side_lobes(level)[:2]
+    np.testing.assert_allclose(level[tops], ways * np.array([-13.26, -17.83]), atol=0.02)
+
+
+# ---------------------------------------------------------------- focus
+
+
+def focused_sum(sonar: Sonar, place: Array, focus_m: float) -> Array:
+    """Amplitude of a point in each beam ``(beams,)``, by exact ways to 4,000 elements of Hann's weights, there and back.
+
+    Each element is delayed by its way to the point of the beam's axis at the focus.
+    """
+    assert sonar.frequency_hz is not None
+    wavelength = sonar.sound_speed / sonar.frequency_hz
+    x = ((np.arange(4000) + 0.5) / 4000 - 0.5) * sonar.aperture.length * wavelength
+    weight = 1 + np.cos(2 * np.pi * x / (sonar.aperture.length * wavelength))
+    to_point = np.sqrt((place[0] - x) ** 2 + place[1] ** 2 + place[2] ** 2)
+    b = sonar.bearing_rad[:, None]
+    to_focus = np.sqrt((focus_m * np.sin(b) - x) ** 2 + (focus_m * np.cos(b)) ** 2)
+    one_way = (weight * np.exp(-2j * np.pi / wavelength * (to_point - to_focus))).sum(axis=1) / weight.sum()
+    return np.asarray(np.abs(one_way) ** 2)
+
+
+INSTRUMENTS = {
+    "DIDSON": {"frequency_hz": 1.8e6, "beam_width_deg": 29 / 96},
+    "ARIS": {"frequency_hz": 3.0e6, "beam_width_deg": 30.25 / 128},
+}
+
+
+@pytest.mark.parametrize("focus_m", [2.0, 3.0, 4.4, 12.0])
+@pytest.mark.parametrize("name", INSTRUMENTS)
+def test_focus_against_exact_ways_to_the_elements(name: str, focus_m: float) -> None:
+    """Near field of a lens: the level in each beam relative to the top in focus, 0.5 dB down to -30 dB, blurred or not."""
+    loaded, fields, place = one_point()
+    sonar = SONAR.replace(beams=64, azimuth_fov_deg=4.0, range_min=4.36, range_max=4.44, range_bins=10, **INSTRUMENTS[name],
+                          **fields)  # fmt: skip
+    images = [np.abs(imager(loaded, sonar.replace(focus_m=at)).image(np.zeros(6), 0)[0]) for at in (None, focus_m)]
+    bin_ = np.unravel_index(images[0].argmax(), images[0].shape)[0]
+    sharp, made = (image[bin_].astype(float) for image in images)
+    in_focus, truth = (focused_sum(sonar, place, at) for at in (float(np.linalg.norm(place)), focus_m))
+    level, wanted = (20 * np.log10(np.maximum(v, 1e-9) / top) for v, top in ((made, sharp.max()), (truth, in_focus.max())))
+    seen = wanted > -30
+    assert seen.sum() > 8
+    assert np.abs(level - wanted)[seen].max() < 0.5
+    if focus_m != 4.4:
+        assert wanted.max() < -0.5
