@@ -16,13 +16,13 @@ __all__ = ["FanSampler"]
 
 Doubles = NDArray[np.float64]
 
-MOST_WEIGHTS = 2**26
-"""Weights of a sampler, at most: half a GiB."""
+MOST_WEIGHTS = 2**25
+"""Weights of a sampler, at most: a quarter of a GiB."""
 
 MOST_BEAMS = 1024
 """Beams that are made where their number is not told, at most."""
 
-AT_A_TIME = 2**22
+AT_A_TIME = 2**20
 """Weights that are computed at a time."""
 
 

@@ -46,7 +46,7 @@ def test_a_folder_of_fans_becomes_a_path_and_a_mosaic(mitsonar: Command, picture
     found = np.array([[float(row[name]) for name in ("sideways_mm", "forward_mm", "yaw_deg")] for row in rows])
     step = np.diff(sway(10).poses, axis=0)
     assert np.degrees(step[:, 5]) == pytest.approx(found[:, 2], abs=0.02)
-    assert np.hypot(*step[:, :2].T) * 1e3 == pytest.approx(np.hypot(*found[:, :2].T), abs=0.6)
+    assert np.hypot(*step[:, :2].T) * 1e3 == pytest.approx(np.hypot(*found[:, :2].T), abs=1.0)
     laid = mitsonar("mosaic", pictures / "pictures", tmp_path / "path", "-o", tmp_path / "map.png", *told)
     assert laid.returncode == 0, laid.stderr
     assert (tmp_path / "map.png").stat().st_size > 1000
