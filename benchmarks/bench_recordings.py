@@ -38,6 +38,9 @@ RESTING = {
     "DIDSON, lamprey2": "didson-static-video/lamprey2_first30.npz",
     "DIDSON, lamprey4": "didson-static-video/lamprey4_first30.npz",
 }
+GEOMETRIES = Path(__file__).resolve().parents[1] / "tests/recordings/geometries"
+"""Geometry files of pictures that do not tell theirs, by the name of the pictures."""
+
 CHAIN = "marine-debris-aris3000/forward_chain.npz"
 
 SHIFT_PIXELS, SHIFT_DEG, LOOP = 3.0, 0.5, 8
@@ -47,7 +50,8 @@ def opened(path: Path) -> FrameSource:
     """Open a recording as `mitsonar odometry` does."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return with_assumed_plane(open_frames(path))
+        told = GEOMETRIES / f"{path.stem.removesuffix('_first30')}.yaml"
+        return with_assumed_plane(open_frames(path, geometry=told if told.exists() else None))
 
 
 def bin_m(source: FrameSource) -> float:

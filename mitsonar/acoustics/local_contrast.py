@@ -23,10 +23,10 @@ Images = NDArray[np.float32]
 SPREAD = 8.0
 """Standard deviations over the range of the values, 0 to 1."""
 
-SMOOTHINGS = ((0.0, 0.0), (1.0, 0.5), (2.0, 0.7), (4.0, 1.0), (8.0, 1.4), (16.0, 2.0))
+SMOOTHINGS = ((2.0, 0.7), (4.0, 1.0), (8.0, 1.4), (16.0, 2.0))
 """Smoothings that are tried, least first: standard deviations of Gaussians [bins, beams]."""
 
-ENOUGH = 0.7
+ENOUGH = 0.75
 """Correlation of consecutive frames at which they need no more smoothing."""
 
 NEIGHBOURHOOD = (0.12, 0.3)
@@ -73,7 +73,7 @@ def alike(images: Images) -> float:
 def fitted_contrast(runs: Sequence[Images]) -> LocalContrast:
     """Choose the least smoothing by which consecutive images are alike.
 
-    They correlate by 0.7 then. Where none of the smoothings reaches it, the one with the largest correlation is taken.
+    They correlate by 0.75 then. Where none of the smoothings reaches it, the one with the largest correlation is taken.
 
     Args:
         runs: consecutive images, each ``(frames, bins, beams)`` [dB].

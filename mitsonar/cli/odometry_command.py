@@ -46,7 +46,7 @@ def odometry(
         typer.Option(
             help="zero, ecc, flow, phase, direct, corrnet, or a checkpoint; NAME:key=value:key=value. Of several "
             "checkpoints, separated by commas, the one trained nearest to the height is used. For impulse responses: "
-            "zero, correlation, likelihood. Default: direct; ecc for recordings of real sonars; likelihood."
+            "zero, correlation, likelihood. Default: direct, or likelihood."
         ),
     ] = None,
     smooth: Annotated[str, typer.Option(help="none, spline or kalman. Invalid motions are bridged in any case.")] = "none",
@@ -111,7 +111,7 @@ def odometry(
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
     reading = Reading(sequence, view, noise, seed, height, pitch, height_by, geometry, contrast)
     images, recorded = record_at(frames) is SonarFrames, is_recording(frames)
-    estimator = estimator or ("ecc" if recorded else "direct" if images else "likelihood")
+    estimator = estimator or ("direct" if images else "likelihood")
     try:
         method = estimator_from(estimator)
     except MitsonarError:

@@ -1,0 +1,129 @@
+"""Closure of loops: what exact steps leave over, what a pull towards rest does, and covariances that explain it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from drawn_frames import sway
+from numpy.typing import NDArray
+
+from mitsonar import MitsonarError
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping.closure import Closure, closure_of
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.odometry import odometry
+from mitsonar.mapping.pair_estimation import estimate_motions
+from mitsonar.motion.composition import Motion, motions
+from mitsonar.records.sonar_frames import SonarFrames
+
+FRAMES, STEPS = 129, 8
+STD = np.array([1e-3, 5e-4, 2e-4])
+
+
+def numbered(frames: int) -> SonarFrames:
+    """Frames whose pixels are their number, so that an estimator can look the motion up."""
+    path, sonar = sway(frames), Sonar(beams=2, range_bins=3)
+    image = np.broadcast_to(np.arange(frames, dtype=np.float32)[:, None, None], (frames, 3, 2)).copy()
+    return SonarFrames(image, sonar.range_m, sonar.bearing_rad, path.time_s, sonar, path.poses, np.full(frames, 2.5))
+
+
+@dataclass(frozen=True)
+class Known:
+    """Tells the true motion with errors: Gaussian ones of ``std``, independent of the length, and a ``pull`` towards rest.
+
+    The pull is a part of motions of one step; over several steps there is none, as with light that moves with a sonar.
+    """
+
+    poses: NDArray[np.float64]
+    std: NDArray[np.float64]
+    told: NDArray[np.float64] | None
+    pull: float = 0.0
+    lost: tuple[int, ...] = ()
+
+    consumes = SonarFrames
+    inputs = "nothing"
+    digest = ""
+
+    def estimate(self, frames: SonarFrames, /) -> Estimate:
+        first, second = (int(number) for number in frames.image[:, 0, 0])
+        answer = motions(self.poses[[first, second]])[0] * (1 - self.pull * (second - first == 1))
+        answer = answer + np.random.default_rng([first, second]).normal(0, self.std)
+        return Estimate(Motion(*answer), None if self.told is None else np.diag(self.told**2), first not in self.lost)
+
+
+def closed(estimator: Known, frames: SonarFrames) -> tuple[Closure, list[Estimate]]:
+    source, numbers = FrameSource.of(frames), np.arange(len(frames))
+    estimates = estimate_motions(source, estimator, numbers)
+    found = closure_of(source, estimator, numbers, estimates, STEPS)
+    assert found is not None
+    return found, estimates
+
+
+def test_exact_motions_close() -> None:
+    frames = numbered(FRAMES)
+    assert frames.poses is not None
+    found, _ = closed(Known(frames.poses, np.zeros(3), STD), frames)
+    assert found.residuals.shape == (16, 3)
+    np.testing.assert_allclose(found.residuals, 0, atol=1e-12)
+    assert found.factor == 1
+
+
+def test_residuals_have_the_variance_of_nine_motions_and_true_covariances_stay() -> None:
+    frames = numbered(1601)
+    assert frames.poses is not None
+    found, estimates = closed(Known(frames.poses, STD, STD), frames)
+    # 200 loops: the rms scatters by 5 %; turns of a degree mix the axes by less
+    np.testing.assert_allclose(found.rms, 3 * STD, rtol=0.2)
+    assert found.factor == pytest.approx(1, abs=0.25)
+    honest = found.honest(estimates)
+    np.testing.assert_allclose(np.asarray(honest[0].covariance), np.diag(STD**2) * found.factor)
+
+
+@pytest.mark.parametrize("told", [STD / 5, None])
+def test_covariances_that_are_too_small_or_missing_are_made_honest(told: NDArray[np.float64] | None) -> None:
+    frames = numbered(1601)
+    assert frames.poses is not None
+    found, estimates = closed(Known(frames.poses, STD, told), frames)
+    covariance = np.asarray(found.honest(estimates)[3].covariance)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), STD, rtol=0.2)
+
+
+def test_a_pull_towards_rest_shows_in_the_mean() -> None:
+    frames = numbered(FRAMES)
+    assert frames.poses is not None
+    found, _ = closed(Known(frames.poses, np.zeros(3), STD / 100, pull=0.1), frames)
+    true = motions(frames.poses)
+    assert found.mean[1] == pytest.approx(-0.1 * STEPS * true[:128, 1].mean(), rel=0.05)
+    assert found.factor > 100
+
+
+def test_loops_with_invalid_motions_are_left_out_and_one_loop_is_none() -> None:
+    frames = numbered(FRAMES)
+    assert frames.poses is not None
+    found, _ = closed(Known(frames.poses, np.zeros(3), STD, lost=(3, 50)), frames)
+    assert len(found.residuals) == 14
+    short = numbered(STEPS + 1)
+    assert short.poses is not None
+    source, numbers = FrameSource.of(short), np.arange(STEPS + 1)
+    known = Known(short.poses, np.zeros(3), STD)
+    assert closure_of(source, known, numbers, estimate_motions(source, known, numbers), STEPS) is None
+
+
+def test_odometry_tells_the_closure_and_raises_its_covariances() -> None:
+    frames = numbered(FRAMES)
+    assert frames.poses is not None
+    estimator = Known(frames.poses, STD, STD / 5)
+    plain, closing = odometry(frames, estimator), odometry(frames, estimator, closure=STEPS)
+    assert plain.closure is None
+    assert closing.closure is not None
+    np.testing.assert_array_equal(plain.series.motions, closing.series.motions)
+    assert plain.series.covariances is not None
+    assert closing.series.covariances is not None
+    np.testing.assert_allclose(closing.series.covariances, plain.series.covariances * closing.closure.factor)
+    names = [name for name, _, _ in closing.rows()]
+    assert "closure over 8 motions, rms, forward" in names
+    with pytest.raises(MitsonarError, match="must be 0, or 2 motions or more: got 1"):
+        odometry(frames, estimator, closure=1)
