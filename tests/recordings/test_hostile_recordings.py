@@ -162,7 +162,8 @@ def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
     count = FEWER if "bag" in name or "mcap" in name else USUAL
     found = attack(name, tmp_path, count, readers=READERS)
     assert found["read"] + found["refused"] == count
-    assert min(found.values()) > 0
+    assert found["refused"] > 0
+    assert found["read"] > 0 or name == "mcap of a run"  # whose every byte has a checksum
 
 
 @pytest.mark.slow
