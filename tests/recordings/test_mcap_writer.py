@@ -18,13 +18,9 @@ from scipy.spatial.transform import Rotation
 from mitsonar import MitsonarError, Simulator, SonarFrames, open_recording
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import to_uint8
-
-pytest.importorskip("rosbags")
-pytest.importorskip("mcap")
-
 from mitsonar.recordings.mcap_writer import write_mcap
 from mitsonar.recordings.ros_pings import is_beam_major
+from mitsonar.records.sonar_frames import to_uint8
 
 SONAR = Sonar(beams=24, range_bins=60, range_min=3.0, range_max=6.0, frequency_hz=1.8e6)
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bags import Maker, Sent, write_bag
+from helpers import run_python
 from mutations import changed_bytes, outcome
 from numpy.typing import NDArray
 from PIL import Image
@@ -339,6 +340,20 @@ def test_a_wrong_name_is_said(tmp_path: Path) -> None:
     path.rename(tmp_path / "a.orig")
     with pytest.raises(MitsonarError, match=r"must end with \.bag: rename it"):
         open_recording(tmp_path / "a.orig")
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n".ljust(100, b"\0"))
+    script = f"""
+        import mitsonar
+        try:
+            mitsonar.open_recording({str(tmp_path / "a.mcap")!r})
+        except mitsonar.MitsonarError as error:
+            assert "rosbags" in str(error) and "pip install 'mitsonar[ros]'" in str(error), error
+        else:
+            raise AssertionError("it must be missed")
+    """
+    run_python(script, block=("rosbags", "mcap"))
 
 
 # ---------------------------------------------------------------- pictures
