@@ -27,6 +27,10 @@ ENDS = {ROS1: ".bag", MCAP: ".mcap", SQLITE: ".db3"}
 """First bytes of bags of one file, and how their names end."""
 
 
+REPAIRS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
+"""What makes a bag whole that a recorder has not closed, by the end of its name."""
+
+
 class Topic(NamedTuple):
     """A topic: its name, its type (``sensor_msgs/msg/Image``) and its number of messages."""
 
@@ -132,6 +136,8 @@ class BagFile:
             raise
         except Exception as error:  # a damaged bag raises errors of many kinds
             reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+            repair = REPAIRS.get(self.path.suffix)
             raise MitsonarError(
                 f"cannot read the bag {self.path}: {reason}; the file is cut off, damaged or of another kind"
+                + (f": `{repair}` may repair it" if repair else "")
             ) from None

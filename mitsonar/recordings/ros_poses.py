@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -31,6 +32,12 @@ MOST_LINKS = 32
 
 BEYOND_S = 0.25
 """Time before the first and after the last pose in which that pose is held [s]."""
+
+FARTHEST_M = 1e8
+"""Largest coordinate of a position that counts [m]."""
+
+NOT_UNIT = 0.1
+"""By how much the length of a quaternion may differ from 1."""
 
 LARGEST_GAP_S = 2.0
 """Longest time between two poses over which poses are interpolated [s]."""
@@ -69,12 +76,13 @@ class Link:
     parent: str
     topic: str
     fixed: bool = False
-    numbers: list[tuple[float, ...]] = field(default_factory=list)
+    numbers: array[float] = field(default_factory=lambda: array("d"))
 
     def at(self, time_s: Array) -> tuple[Array, Rotation] | None:
         """Return positions ``(n, 3)`` and rotations at these times; None where a time lies beyond what is known."""
-        table = np.array(self.numbers, dtype=float).reshape(-1, 8)
-        table = table[np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 4:], axis=1) > 1e-6)]
+        table = np.array(self.numbers).reshape(-1, 8)
+        table = table[np.isfinite(table).all(axis=1) & (np.abs(table[:, 1:4]) < FARTHEST_M).all(axis=1)]
+        table = table[np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) < NOT_UNIT]
         table = table[np.unique(table[:, 0], return_index=True)[1]]
         if not len(table):
             return None
@@ -100,9 +108,9 @@ def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion
         axes: starboard, forward and up of the sonar in that frame ``(3, 3)``.
         time_s: of the frames ``(frames,)``.
     """
-    poses = _poses_in(bag, frame_id, axes, time_s)
-    attitude = _attitude_in(bag, frame_id, axes, time_s)
-    return replace(poses, attitude_rad=attitude, height_m=_heights_in(bag, time_s))
+    topics = [one for one in bag.topics() if one.messages]
+    others = _Others(bag, topics, _transforms(bag, topics), _plain(frame_id), axes, time_s)
+    return replace(others.poses(), attitude_rad=others.attitude(), height_m=others.heights())
 
 
 def with_motion(part: Part, motion: Motion, places: Index) -> Part:
@@ -115,71 +123,79 @@ def with_motion(part: Part, motion: Motion, places: Index) -> Part:
     )
 
 
-def _poses_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion:
-    """Return the poses of a sonar by the transforms, or else the odometry or the poses, of its bag.
+@dataclass(frozen=True)
+class _Others:
+    """The other topics of a bag, and what is asked of them, as in :func:`motion_in`."""
 
-    Transforms (TF) that lead from the sonar's frame to a world come first. Next is the only odometry: its child frame must
-    lead to the sonar's by fixed transforms, or it counts as the sonar's, which a note says. The only topic of poses counts
-    as the sonar's. Several of a kind are ambiguous: then there are no poses, and a note names them.
-    """
-    topics = [one for one in bag.topics() if one.messages]
-    links = _transforms(bag, topics)
-    chain = _chain(links, _plain(frame_id))
-    if chain and any(not one.fixed for one in chain):
-        return _along(chain, axes, time_s, "the transforms")
-    found, notes = _only(bag, topics)
-    if found is None:
-        return Motion(notes=notes)
-    child, link = found
-    mount = _between(links, _plain(frame_id), child) if child else None
-    if mount is None:
-        notes = (*notes, f"poses of {link.topic} count as those of the sonar: no transform leads from them to {frame_id!r}")
-    moved = _along([*(mount or []), link], axes, time_s, link.topic)
-    return replace(moved, notes=notes if moved.poses is not None else moved.notes)
+    bag: BagFile
+    topics: list[Topic]
+    links: dict[str, Link]
+    frame: str
+    axes: Array
+    time_s: Array
 
+    def poses(self) -> Motion:
+        """Return the poses of the sonar by the transforms, or else the odometry or the poses.
 
-def _attitude_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Array | None:
-    """Return pitch, roll and heading of a sonar ``(frames, 3)`` [rad] by the only IMU of its bag; None without one.
+        Transforms (TF) that lead from the sonar's frame to a world come first. Next is the only odometry: its child frame
+        must lead to the sonar's by fixed transforms, or it counts as the sonar's, which a note says. The only topic of poses
+        counts as the sonar's. Several of a kind are ambiguous: then there are no poses, and a note names them.
+        """
+        chain = _chain(self.links, self.frame)
+        if chain and any(not one.fixed for one in chain):
+            return _along(chain, self.axes, self.time_s, "the transforms")
+        found, notes = _only(self.bag, self.topics)
+        if found is None:
+            return Motion(notes=notes)
+        child, link = found
+        mount = _between(self.links, self.frame, child) if child else None
+        if mount is None:
+            told = f"poses of {link.topic} count as those of the sonar: no transform leads from them to {self.frame!r}"
+            notes = (*notes, told)
+        moved = _along([*(mount or []), link], self.axes, self.time_s, link.topic)
+        return replace(moved, notes=notes if moved.poses is not None else moved.notes)
 
-    Fixed transforms must lead from the sonar's frame to that of the IMU. Its orientation is relative to east, north, up
-    (REP 145).
-    """
-    topics = [one for one in bag.topics() if one.messages]
-    these = [one for one in topics if one.kind == IMU]
-    if len(these) != 1:
-        return None
-    child, link = "", Link("", these[0].name)
-    for _, raw in bag.messages(these[0].name):
-        message = bag.decode(raw, IMU)
-        child = _plain(message.header.frame_id)
-        if float(message.orientation_covariance[0]) != -1:
-            link.numbers.append((_seconds(message), 0.0, 0.0, 0.0, *_numbers(message.orientation)))
-    mount = _between(_transforms(bag, topics), _plain(frame_id), child)
-    if mount is None:
-        return None
-    found = _along([*mount, link], axes, time_s, link.topic).poses
-    return None if found is None else found[:, 3:]
+    def attitude(self) -> Array | None:
+        """Return pitch, roll and heading of the sonar ``(frames, 3)`` [rad] by the only IMU; None without one.
 
+        Fixed transforms must lead from the sonar's frame to that of the IMU. Its orientation is relative to east, north, up
+        (REP 145).
+        """
+        these = [one for one in self.topics if one.kind == IMU]
+        if len(these) != 1:
+            return None
+        child, link = "", Link("", these[0].name)
+        for _, raw in self.bag.messages(these[0].name):
+            message = self.bag.decode(raw, IMU)
+            child = _plain(message.header.frame_id)
+            if float(message.orientation_covariance[0]) != -1:
+                link.numbers.extend((_seconds(message), 0.0, 0.0, 0.0, *_numbers(message.orientation)))
+        mount = _between(self.links, self.frame, child)
+        if mount is None:
+            return None
+        found = _along([*mount, link], self.axes, self.time_s, link.topic).poses
+        return None if found is None else found[:, 3:]
 
-def _heights_in(bag: BagFile, time_s: Array) -> Array | None:
-    """Return heights over the ground ``(frames,)`` [m] by the only topic of an altimeter; nan where unknown, None without.
+    def heights(self) -> Array | None:
+        """Return heights over the ground ``(frames,)`` [m] by the only altimeter; nan where unknown, None without one.
 
-    A topic is one of an altimeter where it holds ``sensor_msgs/Range`` and its name holds ``alti``.
-    """
-    these = [one for one in bag.topics() if one.messages and one.kind == RANGE and "alti" in one.name.lower()]
-    if len(these) != 1:
-        return None
-    numbers = []
-    for _, raw in bag.messages(these[0].name):
-        message = bag.decode(raw, RANGE)
-        numbers.append((_seconds(message), float(message.range)))
-    table = np.array(sorted(numbers), dtype=float)
-    after = np.clip(np.searchsorted(table[:, 0], time_s), 1, max(1, len(table) - 1))
-    ends = np.stack([table[after - 1], table[np.minimum(after, len(table) - 1)]])
-    near = np.abs(ends[:, :, 0] - time_s).min(axis=0) <= LARGEST_GAP_S / 2
-    table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0), 1] = np.nan
-    height = np.where(near, np.interp(time_s, table[:, 0], table[:, 1]), np.nan)
-    return height if np.isfinite(height).any() else None
+        A topic is one of an altimeter where it holds ``sensor_msgs/Range`` and its name holds ``alti``.
+        """
+        these = [one for one in self.topics if one.kind == RANGE and "alti" in one.name.lower()]
+        if len(these) != 1:
+            return None
+        numbers = array("d")
+        for _, raw in self.bag.messages(these[0].name):
+            message = self.bag.decode(raw, RANGE)
+            numbers.extend((_seconds(message), float(message.range)))
+        table = np.array(numbers).reshape(-1, 2)
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        after = np.clip(np.searchsorted(table[:, 0], self.time_s), 1, max(1, len(table) - 1))
+        ends = np.stack([table[after - 1], table[np.minimum(after, len(table) - 1)]])
+        near = np.abs(ends[:, :, 0] - self.time_s).min(axis=0) <= LARGEST_GAP_S / 2
+        table[~np.isfinite(table[:, 1]) | (table[:, 1] <= 0) | (table[:, 1] > FARTHEST_M), 1] = np.nan
+        height = np.where(near, np.interp(self.time_s, table[:, 0], table[:, 1]), np.nan)
+        return height if np.isfinite(height).any() else None
 
 
 def _along(chain: Sequence[Link], axes: Array, times: Array, source: str) -> Motion:
@@ -217,7 +233,7 @@ def _stamped(bag: BagFile, topic: Topic) -> tuple[str, Link]:
         pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
         link.parent = _plain(message.header.frame_id)
         child = _plain(getattr(message, "child_frame_id", ""))
-        link.numbers.append((_seconds(message), *_numbers(pose.position), *_numbers(pose.orientation)))
+        link.numbers.extend((_seconds(message), *_numbers(pose.position), *_numbers(pose.orientation)))
     return child, link
 
 
@@ -234,7 +250,7 @@ def _transforms(bag: BagFile, topics: Sequence[Topic]) -> dict[str, Link]:
                 link = links.setdefault(child, Link(parent, topic.name, fixed))
                 if link.parent == parent:
                     where = one.transform
-                    link.numbers.append((_seconds(one), *_numbers(where.translation), *_numbers(where.rotation)))
+                    link.numbers.extend((_seconds(one), *_numbers(where.translation), *_numbers(where.rotation)))
     return links
 
 

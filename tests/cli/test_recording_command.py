@@ -17,8 +17,6 @@ from mitsonar import SonarFrames
 from mitsonar.mapping.any_recording import recording_at
 from mitsonar.recordings.mcap_writer import write_mcap
 
-pytest.importorskip("rosbags")
-
 
 @pytest.fixture(scope="module")
 def frames() -> SonarFrames:

@@ -18,12 +18,9 @@ from scipy.spatial.transform import Rotation
 from mitsonar import MitsonarError, Simulator, SonarFrames, open_recording
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import to_uint8
-
-pytest.importorskip("rosbags")
-pytest.importorskip("mcap")
-
 from mitsonar.recordings.mcap_writer import write_mcap
+from mitsonar.recordings.ros_pings import is_beam_major
+from mitsonar.records.sonar_frames import to_uint8
 
 SONAR = Sonar(beams=24, range_bins=60, range_min=3.0, range_max=6.0, frequency_hz=1.8e6)
 
@@ -215,5 +212,8 @@ def test_real_recordings_come_back_bit_for_bit(tmp_path: Path, name: str) -> Non
     for column in ("image", "range_m", "bearing_rad", "time_s"):
         assert (getattr(read, column) == getattr(frames, column)).all(), column
     assert (read.sonar, read.level) == (frames.sonar, frames.level)
+    for turned in (False, True):
+        flat = [one.T.ravel() if turned else one.ravel() for one in frames.image]
+        assert is_beam_major(flat, *frames.image.shape[1:]) == turned
     if frames.attitude_rad is not None:
         assert read.attitude_rad == pytest.approx(frames.attitude_rad, abs=1e-9)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import pickle
+import sqlite3
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from bags import Maker, Sent, write_bag
+from helpers import run_python
 from mutations import changed_bytes, outcome
 from numpy.typing import NDArray
 from PIL import Image
+from rosbags.rosbag1 import Writer
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
@@ -21,8 +25,6 @@ from mitsonar.mapping.open_frames import open_frames
 from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.recordings.ros_messages import OCULUS, PROJECTED, ros1_types
-
-pytest.importorskip("rosbags")
 
 BEARING = np.radians(np.linspace(-30, 28, 24)) + 0.01 * np.sin(np.arange(24))
 RANGE: NDArray[np.float64] = 1.0 + 0.05 * np.arange(40, dtype=np.float64)
@@ -160,6 +162,29 @@ def test_a_reader_can_be_sent_to_another_process(tmp_path: Path) -> None:
     source = open_frames(bag(tmp_path / "a.bag"))
     again = pickle.loads(pickle.dumps(source.images))
     assert (again(np.array([2])) == source.images(np.array([2]))).all()
+
+
+def test_a_database_by_itself_and_without_definitions(tmp_path: Path) -> None:
+    """Bags of ROS 2 before Iron hold no definitions of their messages."""
+    path, images = bag(tmp_path / "two"), smooth()
+    database = next(path.glob("*.db3"))
+    assert (open_recording(database).part().read([3]).image[0] == images[3]).all()
+    with contextlib.closing(sqlite3.connect(database)) as opened:
+        opened.execute("delete from message_definitions")
+        opened.commit()
+    for one in (path, database):
+        assert (open_recording(one).part().read([2]).image[0] == images[2]).all()
+
+
+@pytest.mark.parametrize("packing", ["BZ2", "LZ4"])
+def test_packed_bags_of_ros_1(tmp_path: Path, packing: str) -> None:
+    maker, writer = Maker(True), Writer(tmp_path / "a.bag")
+    writer.set_compression(Writer.CompressionFormat[packing])
+    with writer:
+        connection = writer.add_connection("/sonar", PROJECTED[0], typestore=maker.types)
+        for _, time, message in pings(maker, smooth()):
+            writer.write(connection, round(time * 1e9), maker.types.serialize_ros1(message, PROJECTED[0]))
+    assert (open_recording(tmp_path / "a.bag").part().read([4]).image[0] == smooth()[4]).all()
 
 
 # ---------------------------------------------------------------- topics
@@ -315,6 +340,20 @@ def test_a_wrong_name_is_said(tmp_path: Path) -> None:
     path.rename(tmp_path / "a.orig")
     with pytest.raises(MitsonarError, match=r"must end with \.bag: rename it"):
         open_recording(tmp_path / "a.orig")
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n".ljust(100, b"\0"))
+    script = f"""
+        import mitsonar
+        try:
+            mitsonar.open_recording({str(tmp_path / "a.mcap")!r})
+        except mitsonar.MitsonarError as error:
+            assert "rosbags" in str(error) and "pip install 'mitsonar[ros]'" in str(error), error
+        else:
+            raise AssertionError("it must be missed")
+    """
+    run_python(script, block=("rosbags", "mcap"))
 
 
 # ---------------------------------------------------------------- pictures
