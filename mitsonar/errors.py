@@ -39,6 +39,9 @@ EXTRAS = {
     "onnxscript": ("learn", "writing ONNX"),
     "sklearn": ("learn", "classical regression"),
     "s3fs": ("s3", "object storage"),
+    "foxglove": ("live", "a live sonar"),
+    "websockets": ("live", "a client of a live sonar"),
+    "rerun": ("view", "showing frames in Rerun"),
 }
 """Optional packages: the extra that installs each, and what needs it."""
 

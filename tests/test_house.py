@@ -33,6 +33,7 @@ ROOMS = (
     "networks",
     "estimation",
     "mapping",
+    "live",
     "training",
     "cli",
     "__main__",

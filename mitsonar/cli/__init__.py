@@ -38,6 +38,7 @@ def application() -> typer.Typer:
         presets_command,
         render_command,
         reproduce_command,
+        serve_command,
         sonar_command,
         train_command,
         world_command,
@@ -66,6 +67,7 @@ def application() -> typer.Typer:
     app.command()(evaluate_command.evaluate)
     app.command()(export_command.export)
     app.command()(reproduce_command.reproduce)
+    app.command()(serve_command.serve)
     app.add_typer(world_command.worlds(), name="world")
     app.add_typer(sonar_command.sonars(), name="sonar")
     app.add_typer(dataset_command.datasets(), name="dataset")

@@ -58,9 +58,7 @@ class Tally:
         """Return a sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
         return list(self.findings(source, poses).values())
 
-    def findings(
-        self, source: Any, poses: NDArray[np.float64], first: int = 0, told: Container[str] = ()
-    ) -> dict[str, str]:
+    def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0, told: Container[str] = ()) -> dict[str, str]:
         """Return the sentences of :meth:`warnings`, each by the name of what it is about.
 
         Args:
