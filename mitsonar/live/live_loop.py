@@ -83,8 +83,8 @@ def live_pings(
 ) -> Iterator[LivePing]:
     """Ping until told to end, and publish each ping; yield it afterwards.
 
-    A client's pose is rendered at once. The path is played in a circle until the first pose comes, and goes on when none came
-    for a while. A path of a single pose is one ping.
+    A client's pose is rendered at once. The path is played in a circle until the first pose comes, and goes on when none
+    came for a while. A path of a single pose is one ping.
 
     Args:
         simulator: of the scene and the sonar.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.sparse import csr_array
 
 from mitsonar.io.plain_data import PlainValue
 from mitsonar.live.live_loop import LivePing
@@ -61,7 +62,7 @@ UINT8 = 0
 
 
 class FanEncoder:
-    """Encodes frames of one sonar as JPEG fans.
+    """Encodes frames of one sonar as JPEG fans: those of :class:`FanPictures` to one step of 255, by a sparse matrix.
 
     Args:
         quality: of JPEG, 1..95.
@@ -69,16 +70,30 @@ class FanEncoder:
 
     def __init__(self, quality: int = 85) -> None:
         self.quality = quality
-        self._pictures: FanPictures | None = None
+        self._inside: NDArray[np.intp] | None = None
 
     def jpeg(self, frames: SonarFrames, index: int = 0) -> bytes:
         """Return one frame's fan, forward up, starboard to the right, grey; black outside the fan."""
-        if self._pictures is None:
-            self._pictures = FanPictures(frames)
         buffer = io.BytesIO()
-        picture = self._pictures.picture(frames.image[index])
-        Image.fromarray(picture).save(buffer, format="JPEG", quality=self.quality)
+        Image.fromarray(self.picture(frames, index)).save(buffer, format="JPEG", quality=self.quality)
         return buffer.getvalue()
+
+    def picture(self, frames: SonarFrames, index: int = 0) -> NDArray[np.uint8]:
+        """Return one frame's fan ``(rows, columns)``, 0..255."""
+        if self._inside is None:
+            fan = FanPictures(frames).fan
+            self._shape = fan.index.shape[1:]
+            self._inside = np.flatnonzero(fan.weight.any(axis=0))
+            cells = fan.index.reshape(4, -1)[:, self._inside].T
+            parts = fan.weight.reshape(4, -1)[:, self._inside].T
+            rows = np.arange(0, 4 * len(cells) + 1, 4)
+            size = (len(cells), frames.image[0].size)
+            self._matrix = csr_array((parts.ravel(), cells.ravel().astype(np.int32), rows), shape=size)
+        image = frames.image[index]
+        levels = image if image.dtype == np.uint8 else to_uint8(image)  # beam by beam, as sonars send them
+        picture = np.zeros(self._shape, np.uint8)
+        picture.reshape(-1)[self._inside] = self._matrix @ levels.reshape(-1).astype(np.float32) + np.float32(0.5)
+        return picture
 
 
 def projected_image(frames: SonarFrames, time_ns: int, frame_id: str, index: int = 0) -> bytes:
