@@ -41,6 +41,7 @@ def application() -> typer.Typer:
         serve_command,
         sonar_command,
         train_command,
+        view_command,
         world_command,
     )
 
@@ -68,6 +69,7 @@ def application() -> typer.Typer:
     app.command()(export_command.export)
     app.command()(reproduce_command.reproduce)
     app.command()(serve_command.serve)
+    app.command()(view_command.view)
     app.add_typer(world_command.worlds(), name="world")
     app.add_typer(sonar_command.sonars(), name="sonar")
     app.add_typer(dataset_command.datasets(), name="dataset")
