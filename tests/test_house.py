@@ -33,6 +33,7 @@ ROOMS = (
     "networks",
     "estimation",
     "mapping",
+    "exports",
     "live",
     "training",
     "cli",

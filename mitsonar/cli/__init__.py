@@ -30,6 +30,7 @@ def application() -> typer.Typer:
         doctor_command,
         evaluate_command,
         export_command,
+        frames_command,
         height_command,
         image_command,
         impulse_command,
@@ -73,4 +74,5 @@ def application() -> typer.Typer:
     app.add_typer(world_command.worlds(), name="world")
     app.add_typer(sonar_command.sonars(), name="sonar")
     app.add_typer(dataset_command.datasets(), name="dataset")
+    app.add_typer(frames_command.frames(), name="frames")
     return app
