@@ -112,7 +112,7 @@ def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
     """Return the edges of the volume that the beams see, as lines ``(points, 3)`` [m] in (starboard, forward, up)."""
     half = sonar.bearing_rad[[0, -1]] + np.array([-0.5, 0.5]) * sonar.beam_width_rad
     elevation = np.radians(sonar.elevation_fov_deg) / 2 * np.array([-1, 1])
-    across, up = np.linspace(*half, steps), np.linspace(*elevation, steps)
+    across, up = np.linspace(half[0], half[1], steps), np.linspace(elevation[0], elevation[1], steps)
     ends = (max(sonar.range_min, 1e-3), sonar.range_max)
     lines = [radius * _direction(sonar, across, np.full(steps, edge)) for radius in ends for edge in elevation]
     lines += [radius * _direction(sonar, np.full(steps, edge), up) for radius in ends for edge in half]

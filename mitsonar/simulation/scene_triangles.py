@@ -57,8 +57,8 @@ def _triangles_of(shape: mi.Shape) -> Triangles:
 
     name = shape.id()
     if isinstance(shape, mi.Mesh) and shape.face_count() <= MOST_FACES:
-        vertices = np.array(shape.vertex_positions_buffer(), dtype=np.float32).reshape(-1, 3)
-        return Triangles(name, vertices, np.array(shape.faces_buffer(), dtype=np.uint32).reshape(-1, 3), True)
+        corners = np.array(shape.vertex_positions_buffer(), dtype=np.float32).reshape(-1, 3)
+        return Triangles(name, corners, np.array(shape.faces_buffer(), dtype=np.uint32).reshape(-1, 3), True)
     kind = shape.class_name() if not isinstance(shape, mi.Mesh) else "Mesh"
     if kind in UNIT:
         turned = np.array(mi.traverse(shape)["to_world"].matrix, dtype=float).reshape(4, 4, -1)[..., 0]
