@@ -43,7 +43,7 @@ def main() -> None:
     rows = [measured(asked.scene, asked.sonar, beams, bins, pings, *case) for case in cases]
     print(f"{asked.scene}, {asked.sonar}, {beams} beams x {bins} bins, {len(os.sched_getaffinity(0))} cores")
     print(
-        "| model | quality | rate [Hz] | latency, median [ms] | 95 % | worst | rendering, median [ms] | processor time [ms] | fan [px] |"
+        "| model | quality | rate [Hz] | latency, median [ms] | 95 % | worst | rendering [ms] | processor time [ms] | fan [px] |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     for row in rows:
