@@ -42,9 +42,9 @@ def main() -> None:
     pings, cases = (5, CASES[:1]) if asked.quick else (asked.pings, CASES)
     rows = [measured(asked.scene, asked.sonar, beams, bins, pings, *case) for case in cases]
     print(f"{asked.scene}, {asked.sonar}, {beams} beams x {bins} bins, {len(os.sched_getaffinity(0))} cores")
-    print(
-        "| model | quality | rate [Hz] | latency, median [ms] | 95 % | worst | rendering [ms] | processor time [ms] | fan [px] |"
-    )
+    latency = ("latency, median [ms]", "95 %", "worst")
+    columns = ("model", "quality", "rate [Hz]", *latency, "rendering [ms]", "processor [ms]", "fan [px]")
+    print(f"| {' | '.join(columns)} |")
     print("|---|---|---|---|---|---|---|---|---|")
     for row in rows:
         print(
