@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -55,7 +56,7 @@ def main() -> None:
         asked.json.write_text(json.dumps(rows, indent=2) + "\n")
 
 
-def measured(scene: str, sonar: str, beams: int, bins: int, pings: int, model: str, quality: str) -> dict[str, object]:
+def measured(scene: str, sonar: str, beams: int, bins: int, pings: int, model: str, quality: str) -> dict[str, Any]:
     """Start a server, send poses of the shipped path, and return the figures."""
     words = ["--set", f"beams={beams}", "--set", f"range_bins={bins}", "--model", model, "--quality", quality]
     command = [sys.executable, "-m", "mitsonar", "serve", scene, "--sonar", sonar, *words, "--port", "0"]
@@ -71,7 +72,7 @@ def measured(scene: str, sonar: str, beams: int, bins: int, pings: int, model: s
         process.wait(timeout=60)
 
 
-def rounds(client: LiveClient, scene: str, pings: int, server: int) -> dict[str, object]:
+def rounds(client: LiveClient, scene: str, pings: int, server: int) -> dict[str, Any]:
     """Close the loop so many times. The first ten are not counted: the first ping compiles."""
     poses = Trajectory.load_tum(shipped_trajectory(scene)).poses
     latency, render, picture = [], [], b""

@@ -45,7 +45,7 @@ def frames() -> SonarFrames:
         shape[k, 30, 2:20] = 1
     shape[:, :2] = part[:, :2] = -1
     poses = np.array([[0.3 * k, 0.1 * k, 2.5, 0.4, 0.05 * k, 0.2 * k] for k in range(FRAMES)])
-    names = {"shape_names": ("sand", "wall", "barrels"), "object_names": ("", "barrels 1", "barrels 2")}
+    names: dict[str, Any] = {"shape_names": ("sand", "wall", "barrels"), "object_names": ("", "barrels 1", "barrels 2")}
     time = 100 + np.arange(FRAMES) / 10
     return SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, time, SONAR, poses, shape_id=shape, object_id=part, **names)
 
@@ -79,7 +79,7 @@ def test_coco_reads_boxes_masks_and_classes(
         shape, part = frames.shape_id[number], frames.object_id[number]  # type: ignore[index]
         wanted_pixels = to_uint8(frames.image[number])
         if picture == "fan":
-            shape, part = nearest_cells(fans.fan, shape, -1), nearest_cells(fans.fan, part, -1)  # type: ignore[assignment]
+            shape, part = nearest_cells(fans.fan, shape, -1), nearest_cells(fans.fan, part, -1)
             wanted_pixels = fans.picture(frames.image[number])
         np.testing.assert_array_equal(pixels, wanted_pixels)
         found = coco.loadAnns(coco.getAnnIds(imgIds=[number + 1]))
