@@ -41,6 +41,9 @@ EXTRAS = {
     "s3fs": ("s3", "object storage"),
     "rosbags": ("ros", "reading ROS bags and writing MCAP"),
     "mcap": ("ros", "writing MCAP"),
+    "foxglove": ("live", "a live sonar"),
+    "websockets": ("live", "a client of a live sonar"),
+    "rerun": ("view", "showing frames in Rerun"),
 }
 """Optional packages: the extra that installs each, and what needs it."""
 

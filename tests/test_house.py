@@ -33,6 +33,8 @@ ROOMS = (
     "networks",
     "estimation",
     "mapping",
+    "exports",
+    "live",
     "training",
     "cli",
     "__main__",

@@ -30,6 +30,7 @@ def application() -> typer.Typer:
         doctor_command,
         evaluate_command,
         export_command,
+        frames_command,
         height_command,
         image_command,
         impulse_command,
@@ -39,8 +40,10 @@ def application() -> typer.Typer:
         recording_command,
         render_command,
         reproduce_command,
+        serve_command,
         sonar_command,
         train_command,
+        view_command,
         world_command,
     )
 
@@ -67,8 +70,11 @@ def application() -> typer.Typer:
     app.command()(evaluate_command.evaluate)
     app.command()(export_command.export)
     app.command()(reproduce_command.reproduce)
+    app.command()(serve_command.serve)
+    app.command()(view_command.view)
     app.add_typer(world_command.worlds(), name="world")
     app.add_typer(sonar_command.sonars(), name="sonar")
     app.add_typer(dataset_command.datasets(), name="dataset")
     app.add_typer(recording_command.recordings(), name="recording")
+    app.add_typer(frames_command.frames(), name="frames")
     return app

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypedDict
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render_command import NOISE, SIX, Frame, _instrument, _path, scene_parameters
+from mitsonar.cli.render_command import NOISE, SIX, Frame, instrument_for, path_for, scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def _of_scene(
     from mitsonar.simulation.scene import load_scene
 
     loaded = load_scene(source, **parameters)
-    instrument, attitude = _instrument(loaded, sonar, model, seed)
+    instrument, attitude = instrument_for(loaded, sonar, model, seed)
     count = poses["count"] or (20 if poses["file"] else None)
-    path = _path(instrument, attitude, source, count, poses["start"], poses["end"], poses["file"], poses["frame"])
+    path = path_for(instrument, attitude, source, count, poses["start"], poses["end"], poses["file"], poses["frame"])
     return subject_of_scene(loaded, instrument, path.poses, segments=segments.split(",") if segments else [], gain=gain)

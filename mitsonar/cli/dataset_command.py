@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
+from mitsonar.cli.frames_command import Least, Out, Picture, Polygons, To, Without, exported
 from mitsonar.errors import MitsonarError
 
 __all__ = ["datasets"]
@@ -21,7 +22,7 @@ Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s
 def datasets() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Make, show and check labelled data sets.", no_args_is_help=True)
-    for command in (make, info, show, check, recipes):
+    for command in (make, info, show, check, recipes, export):
         app.command()(command)
     return app
 
@@ -177,3 +178,22 @@ def recipes(
 
     for key, path in shipped_recipes().items():
         say(f"{key:24} {yaml.safe_load(path.read_text(encoding='utf-8'))['about']}")
+
+
+@answered
+def export(
+    data: Data,
+    to: To,
+    out: Out,
+    picture: Picture = "polar",
+    without: Without = None,
+    least: Least = 1,
+    polygons: Polygons = False,
+    view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
+) -> None:
+    """Write a data set in the layout of another tool, whole or absent."""
+    from mitsonar.mapping.open_frames import is_data_set
+
+    if not is_data_set(data):
+        raise MitsonarError(f"no data set at {data}: {command_line('frames', 'export')} exports runs and recordings")
+    exported(data, to, out, picture, without or [], least, polygons, view)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["NOISE", "SIX", "Frame", "render", "scene_parameters"]
+__all__ = ["NOISE", "SIX", "Frame", "instrument_for", "path_for", "render", "scene_parameters", "sonar_changes"]
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 NOISE = (
@@ -80,9 +80,9 @@ def render(
     )
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
-    instrument, attitude = _instrument(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))
+    instrument, attitude = instrument_for(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))
     refuse_noise(outputs.noise, instrument)
-    path = _path(instrument, attitude, scene, frames, start, end, trajectory, frame)
+    path = path_for(instrument, attitude, scene, frames, start, end, trajectory, frame)
     folder = out or Path("out") / find_scene(scene).stem
     if mirrors and instrument.model != "coherent":
         raise MitsonarError(
@@ -124,7 +124,7 @@ def sonar_changes(pairs: list[str], quality: str | None) -> dict[str, Any]:
     return changes if quality is None else {**changes, "quality": quality}
 
 
-def _instrument(
+def instrument_for(
     scene: Any, name: str | None, model: str | None, seed: int | None, changes: dict[str, Any] | None = None
 ) -> tuple[Sonar, Pose | None]:
     """Return the sonar to use and the pose that the scene gives it."""
@@ -149,7 +149,7 @@ def _instrument(
     return sonar, found[1] if found else None
 
 
-def _path(
+def path_for(
     sonar: Sonar,
     attitude: Pose | None,
     scene: str,

@@ -356,7 +356,7 @@ class Simulator:
         """Warn of what a step shows, each kind once in a loop."""
         tally = Tally(self.sonar, self._gain_from)
         tally.add(pings, image)
-        found = {note: note for note in self.notes} | tally.findings(self, pose, pings.first)
+        found = {note: note for note in self.notes} | tally.findings(self, pose, pings.first, self._told)
         for kind in [kind for kind in found if kind not in self._told]:
             self._told.add(kind)
             warnings.warn(found[kind], MitsonarWarning, stacklevel=3)

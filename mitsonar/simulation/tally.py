@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,25 +64,26 @@ class Tally:
         """Return a sentence for each thing that the user should know; ``source`` finds the ranges of the worst frame."""
         return list(self.findings(source, poses).values())
 
-    def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0) -> dict[str, str]:
+    def findings(self, source: Any, poses: NDArray[np.float64], first: int = 0, told: Container[str] = ()) -> dict[str, str]:
         """Return the sentences of :meth:`warnings`, each by the name of what it is about.
 
         Args:
             source: finds the ranges of the worst frame.
             poses: of the frames ``(frames, 6)``.
             first: number of the first of them.
+            told: names of sentences that are not wanted again; ranges, which take another tracing, are not sought for them.
         """
         sonar, rays = self.sonar, self.rays
         outside = rays["nearer"] + rays["farther"]
         hits = rays["inside"] + outside
         found = {}
-        if self.empty:
+        if self.empty and "empty" not in told:
             number, *its_rays = self.first_empty
             pose = poses[number - first]
             window = (sonar.range_min, sonar.range_max)
             beside = source.window_range(pose, number)
             found["empty"] = empty_frames(self.empty, self.frames, (number, pose), its_rays, window, beside)
-        if outside > 0:
+        if outside > 0 and "window" not in told:
             frame = self.worst[1]
             ends = source.window_range(poses[frame - first], frame)
             where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""

@@ -1,0 +1,150 @@
+"""``mitsonar view``: frames, scene and paths in the viewer Rerun."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
+from mitsonar.cli.render_command import Frame, scene_parameters
+from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.live.rerun_recording import Shown
+    from mitsonar.motion.trajectory import Trajectory
+
+__all__ = ["view"]
+
+
+@answered
+def view(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="RUN|FILE|DATA.zarr|SCENE", help="A run, frames, a recording, a data set, or a scene (XML or name)."
+        ),
+    ],
+    save: Annotated[Path | None, typer.Option("--save", help="Write a recording (.rrd) and open no viewer.")] = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", help="Make a folder: a page with the viewer, for any web server.")
+    ] = None,
+    path: Annotated[
+        Path | None, typer.Option("--path", help="Estimated path too: the folder of an odometry, a TUM or CSV file.")
+    ] = None,
+    frame: Frame = "mitsonar",
+    scene: Annotated[
+        str | None, typer.Option(help="Scene to draw: XML or name (default: that of the run; `none`: no scene).")
+    ] = None,
+    sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
+    view_: Annotated[str | None, typer.Option("--view", help="View of a data set (default: the first).")] = None,
+    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
+) -> None:
+    """Show fan, polar image and levels of each frame; scene, wedge of the beams, true and estimated path."""
+    from mitsonar.io.run_directory import refuse_to_replace
+    from mitsonar.live.rerun_recording import write_recording
+    from mitsonar.live.viewer_page import RECORDING, VIEWER, write_page
+
+    if save is not None and html is not None:
+        raise MitsonarError("--save and --html contradict each other: the page has the recording in it")
+    if save is not None and (save.suffix != ".rrd" or not save.parent.is_dir()):
+        raise MitsonarError(f"--save must name an .rrd file in a folder that is there: got {save}")
+    target = html / RECORDING if html is not None else save
+    if target is not None:
+        option = "--save" if html is None else "--html"
+        refuse_to_replace(target, *[html / name for name in VIEWER if html], overwrite=overwrite, option=option)
+    shown = _shown(what, scene, dict(scene_parameters(parameter or [])), _paths(path, frame), sequence, view_)
+    if html is not None:
+        html.mkdir(parents=True, exist_ok=True)
+    frames = 0 if shown.source is None else len(shown.source)
+    with progress_bar("logging", frames, "frames") as progress:
+        boxed = write_recording(shown, target, progress)
+    if boxed:
+        names = ", ".join(boxed[:5]) + (" ..." if len(boxed) > 5 else "")
+        warn(f"of {len(boxed)} shapes only the box is drawn, of instances and of meshes that are too large: {names}")
+    said = f"{frames:,} frames, {len(shown.shapes)} shapes, {len(shown.estimated)} estimated paths"
+    if html is not None:
+        write_page(html)
+        say(f"{said}: {html}; serve it: python -m http.server -d {html}")
+    elif target is not None:
+        say(f"{said}: {target} ({target.stat().st_size:,} bytes); open it: rerun {target}")
+
+
+def _shown(
+    what: str,
+    scene: str | None,
+    parameters: dict[str, str],
+    estimated: dict[str, Trajectory],
+    sequence: int | None,
+    view_: str | None,
+) -> Shown:
+    """Return what to show: frames with the scene they were made of, or a scene with its sonar and its shipped path."""
+    from mitsonar.live.rerun_recording import Shown
+    from mitsonar.mapping.open_frames import is_data_set, is_recording, open_frames
+
+    place = Path(what)
+    frames_there = is_data_set(what) or is_recording(what) or place.is_dir() or place.suffix in (".npz", ".zarr")
+    if frames_there:
+        source = open_frames(what, sequence=sequence, view=view_)
+        named, told = (scene, parameters) if scene is not None else _scene_of(place)
+        shapes = [] if named in (None, "none") else _loaded(str(named), told)[0]
+        return Shown(source.name, source, source.like.sonar, None, shapes, estimated)
+    if sequence is not None or view_ is not None or scene is not None:
+        raise MitsonarError(f"--sequence, --view and --scene are for frames: {what} is a scene, or is not there")
+    shapes, found, path = _loaded(what, parameters)
+    return Shown(what, None, found, path, shapes, estimated)
+
+
+def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
+    """Load a scene: its triangles, its sonar, and the path that lies beside it or the pose of the sonar."""
+    import numpy as np
+
+    from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.simulation.scene import find_scene, load_scene, sonar_in
+    from mitsonar.simulation.scene_triangles import triangles_in
+
+    loaded = load_scene(scene, **parameters)
+    found = sonar_in(loaded)
+    beside = find_scene(scene).with_suffix(".tum")
+    path = Trajectory(np.array([found[1]]), np.zeros(1)) if found else None
+    if beside.is_file():
+        path = Trajectory.load_tum(beside)
+    return triangles_in(loaded), found and found[0], path
+
+
+def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
+    """Return the scene that a run was made of, where it says it and it is there, and its parameters."""
+    from mitsonar.io.whole_files import read_json
+    from mitsonar.simulation.scene import find_scene
+
+    folder = run if run.is_dir() else run.parent
+    if not (folder / "run.json").is_file():
+        return None, {}
+    told = read_json(folder / "run.json")
+    asked = told.get("asked", told)
+    name, parameters = asked.get("scene", told.get("scene")), asked.get("parameters", told.get("parameters", {}))
+    if not isinstance(name, str) or not isinstance(parameters, dict):
+        return None, {}
+    try:
+        find_scene(name)
+    except MitsonarError:
+        warn(f"the scene of the run, {name}, is not there: give it by --scene, or `--scene none`")
+        return None, {}
+    return name, {str(key): str(value) for key, value in parameters.items()}
+
+
+def _paths(path: Path | None, frame: str) -> dict[str, Trajectory]:
+    """Load an estimated path; of an odometry's folder the true one as well."""
+    from mitsonar.mapping.odometry_run import OdometryFolder
+    from mitsonar.motion.trajectory import Trajectory
+
+    if path is None:
+        return {}
+    if not path.exists():
+        raise MitsonarError(f"there is no path {path}: {command_line('odometry')} makes one, or give a TUM or CSV file")
+    if path.is_dir():
+        folder = OdometryFolder.open(path)
+        return {"estimated": folder.estimated} | ({} if folder.true is None else {"true": folder.true})
+    return {"estimated": Trajectory.load(path, frame)}

@@ -1,0 +1,173 @@
+"""Frames with labels of a run, a recording or a data set, read some at a time."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.config.data_recipe import array_names
+from mitsonar.datasets.split import deal, world_of
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.mapping.open_frames import is_data_set, open_frames
+from mitsonar.records.columns import open_group
+from mitsonar.records.sonar_frames import COLUMNS, LABELS, SonarFrames
+
+__all__ = ["ExportSource", "open_export"]
+
+AT_ONCE_BYTES = 2**24
+"""Approximate size of the pixels and labels that are read at a time [bytes]."""
+
+Read = Callable[[slice], SonarFrames]
+
+
+@dataclass(frozen=True)
+class ExportSource:
+    """Frames to export; pixels and labels are read on demand.
+
+    Attributes:
+        name: of the source.
+        frames: number of them.
+        sequence: number of the sequence of each frame ``(frames,)``.
+        like: no frames, but all that is the same for each of them: sonar, ranges, bearings, names of shapes and objects.
+        labels: names of the labels that there are.
+        posed: whether poses are known.
+        part: of each frame, ``train``, ``validation`` or ``test`` ``(frames,)``, as the recipe splits; else ``train``.
+        read: reads frames with labels.
+        about: what made them, for metadata.
+    """
+
+    name: str
+    frames: int
+    sequence: NDArray[np.int64]
+    like: SonarFrames
+    labels: tuple[str, ...]
+    posed: bool
+    part: NDArray[np.str_]
+    read: Read
+    about: str = ""
+
+    def pieces(self) -> Iterator[tuple[int, SonarFrames]]:
+        """Yield the frames a few at a time, with the number of the first."""
+        cells = max(1, self.like.image.shape[1] * self.like.image.shape[2])
+        many = max(1, AT_ONCE_BYTES // (cells * (4 + 4 * len(self.labels))))
+        for first in range(0, self.frames, many):
+            yield first, self.read(slice(first, min(first + many, self.frames)))
+
+
+def open_export(where: str | Path, *, view: str | None = None) -> ExportSource:
+    """Open the frames at a path or URL for export: all sequences of a data set, a run, or a recording.
+
+    Args:
+        where: a data set, ``frames.npz``, ``frames.zarr``, the folder of a run, or a recording.
+        view: of a data set; default: the first.
+
+    Raises:
+        MitsonarError: no frames there.
+    """
+    if is_data_set(where):
+        return _of_data_set(str(where), view)
+    if view is not None:
+        raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
+    path = Path(where)
+    if path.is_dir():
+        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+        path = found[0] if found else path
+    if path.suffix == ".npz":
+        return _in_memory(SonarFrames.load(path), str(where))
+    source = open_frames(where)
+    if not len(source):
+        raise MitsonarError(f"{source.name} holds no frames: give those of a finished run")
+    stored, like = _labels_of_zarr(path) if path.suffix == ".zarr" else ({}, {})
+
+    def read(part: slice) -> SonarFrames:
+        index = np.arange(part.start, part.stop)
+        frames = source.read(index)
+        labels = {name: np.asarray(array[part]) for name, array in stored.items()}
+        poses = None if source.poses is None else source.poses[part]
+        return replace(frames, poses=poses, **like, **labels)
+
+    base = replace(source.like, **like)
+    sequence, posed = np.zeros(len(source), np.int64), source.poses is not None
+    return ExportSource(source.name, len(source), sequence, base, tuple(stored), posed, _all_train(len(source)), read)
+
+
+def _in_memory(frames: SonarFrames, name: str) -> ExportSource:
+    """Take frames that are in memory."""
+    if not len(frames):
+        raise MitsonarError(f"{name} holds no frames: give those of a finished run")
+    labels = tuple(label for label in LABELS if getattr(frames, label) is not None)
+    sequence, posed = np.zeros(len(frames), np.int64), frames.poses is not None
+    like = frames.select(slice(0))
+    return ExportSource(name, len(frames), sequence, like, labels, posed, _all_train(len(frames)), frames.select)
+
+
+def _all_train(frames: int) -> NDArray[np.str_]:
+    return np.full(frames, "train", dtype="<U10")
+
+
+def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the label arrays of a long run, unread, and the names that they refer to."""
+    found, _ = open_group(path, COLUMNS, "time_s", "frames_done")
+    stored = {name: found[name] for name in LABELS if name in found}
+    nothing = {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+    for name in COLUMNS:
+        if name in found:
+            nothing[name] = found[name][:0] if name not in ("range_m", "bearing_rad") else found[name][...]
+    like = SonarFrames.from_arrays(nothing, str(path))
+    return stored, {"shape_names": like.shape_names, "object_names": like.object_names}
+
+
+def _of_data_set(url: str, view: str | None) -> ExportSource:
+    """Take all frames of one view of a data set."""
+    store = DataStore.open(url)
+    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
+    if not stored:
+        raise MitsonarError(f"{url} holds vectors, no images: give a data set of images")
+    views = {one.name: one for one in store.recipe.views}
+    name = next(iter(stored)) if view is None else view
+    if name not in stored:
+        raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
+    one = views[name]
+    labels = {label: f"{label}{store.recipe.suffix(name)}" for label in store.recipe.labels}
+    scale = float(store.about["level_scale"])
+
+    def read(part: slice) -> SonarFrames:
+        return SonarFrames(
+            image=store.read(stored[name], part),
+            range_m=one.sonar.range_m,
+            bearing_rad=one.bearing_rad,
+            time_s=store.read("time_s", part),
+            sonar=one.sonar,
+            poses=store.read("pose", part),
+            height_m=store.read("height_m", part),
+            level_scale=scale,
+            **{label: store.read(array, part) for label, array in labels.items()},
+        )
+
+    sequence = np.asarray(store.read("sequence"), dtype=np.int64)
+    about = str(store.about["recipe"].get("about") or store.recipe.name)
+    return ExportSource(url, len(store), sequence, read(slice(0, 0)), tuple(labels), True, _parts(store), read, about)
+
+
+def _parts(store: DataStore) -> NDArray[np.str_]:
+    """Return the part of each frame by the recipe's split; a split of samples does not divide frames."""
+    parts, split = _all_train(len(store)), store.recipe.split
+    if split.by == "sample":
+        return parts
+    sequence = np.asarray(store.read("sequence"), dtype=np.int32)
+    world = world_of(store.recipe, store.scenes)[np.asarray(store.read("scene"))]
+    try:
+        for name in ("validation", "test"):
+            if getattr(split, name) > 0:
+                parts[deal(world, sequence, split, name)] = name
+    except MitsonarError as error:  # too few sequences or worlds for its parts
+        warnings.warn(f"all frames are for training: {error}", MitsonarWarning, stacklevel=2)
+        return _all_train(len(store))
+    return parts

@@ -1,0 +1,177 @@
+"""A client of a live sonar, in plain Python: poses in, messages out; text is JSON, binary is a message."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import struct
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+from websockets.exceptions import WebSocketException
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from mitsonar.errors import MitsonarError
+from mitsonar.io.plain_data import PlainValue
+
+__all__ = ["LiveClient", "LiveMessage", "image_of"]
+
+PROTOCOL = Subprotocol("foxglove.sdk.v1")
+POSES, MESSAGE = 1, 1
+
+
+class LiveMessage(NamedTuple):
+    """What came on a channel.
+
+    Attributes:
+        topic: of the channel.
+        time_ns: of the ping [ns].
+        content: bytes of the message, in the channel's encoding.
+    """
+
+    topic: str
+    time_ns: int
+    content: bytes
+
+
+class LiveClient:
+    """Subscribes to topics of ``mitsonar serve`` and publishes poses, over the Foxglove WebSocket protocol.
+
+    Args:
+        address: of the server, ``ws://127.0.0.1:8765``.
+        topics: to subscribe to.
+        pose_topic: to publish poses on.
+        encoding: of the poses; the server reads ``json``.
+
+    Attributes:
+        channels: that the server has, by topic, as it advertises them.
+        status: sentences that the server said, such as why it refused a pose.
+        info: what the server says of itself.
+
+    Raises:
+        MitsonarError: no server answers there, or it lacks a topic.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        topics: Sequence[str] = ("/sonar/fan", "/sonar/timing"),
+        *,
+        pose_topic: str = "/pose",
+        encoding: str = "json",
+    ) -> None:
+        self.status: list[str] = []
+        self.info: dict[str, PlainValue] = {}
+        self.channels: dict[str, dict[str, PlainValue]] = {}
+        self._ends = contextlib.ExitStack()
+        try:
+            self._socket = self._ends.enter_context(connect(address, subprotocols=[PROTOCOL], max_size=None))
+        except (OSError, WebSocketException) as error:
+            raise MitsonarError(f"no live sonar answers at {address} ({error}): start `mitsonar serve`") from None
+        end = time.monotonic() + 20
+        while not (self.info and all(topic in self.channels for topic in topics)):
+            try:
+                self._text(self._socket.recv(timeout=max(0.01, end - time.monotonic())))
+            except TimeoutError:
+                known = ", ".join(self.channels)
+                raise MitsonarError(f"{address} lacks one of the topics {', '.join(topics)}: it has {known}") from None
+        self._topics = dict(enumerate(topics))
+        wanted = [{"id": number, "channelId": self.channels[topic]["id"]} for number, topic in self._topics.items()]
+        self._send(op="subscribe", subscriptions=wanted)
+        self._send(op="advertise", channels=[{"id": POSES, "topic": pose_topic, "encoding": encoding, "schemaName": "pose"}])
+
+    def publish(self, pose: dict[str, Any] | bytes) -> None:
+        """Publish a pose: ``{"x": 1, "y": 0, "z": 2, "pitch": 30, "id": 7}``, in m and deg."""
+        content = pose if isinstance(pose, bytes) else json.dumps(pose).encode()
+        self._socket.send(struct.pack("<BI", MESSAGE, POSES) + content)
+
+    def receive(self, timeout_s: float = 30.0) -> LiveMessage:
+        """Wait for the next message. Sentences on the way are added to ``status``.
+
+        Raises:
+            TimeoutError: none came in time.
+        """
+        end = time.monotonic() + timeout_s
+        while True:
+            self._acknowledge()
+            got = self._socket.recv(timeout=max(0.01, end - time.monotonic()))
+            if isinstance(got, bytes):
+                kind, subscription, when = struct.unpack_from("<BIQ", got)
+                if kind == MESSAGE:
+                    return LiveMessage(self._topics[subscription], when, got[13:])
+            else:
+                self._text(got)
+
+    def wait_for_status(self, timeout_s: float = 10.0) -> str:
+        """Wait for the next sentence of the server and return it. Messages on the way are lost.
+
+        Raises:
+            TimeoutError: none came in time.
+        """
+        known, end = len(self.status), time.monotonic() + timeout_s
+        while len(self.status) == known:
+            self._text(self._socket.recv(timeout=max(0.01, end - time.monotonic())))
+        return self.status[known]
+
+    def close(self) -> None:
+        """Leave."""
+        self._ends.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _acknowledge(self) -> None:
+        """Acknowledge at once: the server's TCP holds a small message back until the one before is, for 40 ms otherwise."""
+        with contextlib.suppress(AttributeError, OSError):  # Linux has the option
+            self._socket.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
+    def _send(self, **words: PlainValue) -> None:
+        self._socket.send(json.dumps(words))
+
+    def _text(self, got: str | bytes) -> None:
+        """Take what the server says in JSON; a message is left out."""
+        if isinstance(got, bytes):
+            return
+        table = json.loads(got)
+        if table["op"] == "serverInfo":
+            self.info = table
+        elif table["op"] == "advertise":
+            self.channels |= {one["topic"]: one for one in table["channels"]}
+        elif table["op"] == "status":
+            self.status.append(table["message"])
+
+
+def image_of(content: bytes) -> bytes:
+    """Take the picture's bytes out of a ``foxglove.CompressedImage``: field 2 of the protobuf message.
+
+    Raises:
+        MitsonarError: the message is none.
+    """
+    place = 0
+    try:
+        while place < len(content):
+            key, place = _varint(content, place)
+            length, place = _varint(content, place)
+            if key == (2 << 3 | 2):
+                return content[place : place + length]
+            place += length
+    except IndexError:
+        pass
+    raise MitsonarError("this message is no foxglove.CompressedImage: subscribe to /sonar/fan")
+
+
+def _varint(content: bytes, place: int) -> tuple[int, int]:
+    """Return a number of protobuf, and where the next one begins."""
+    value = shift = 0
+    while True:
+        byte = content[place]
+        value |= (byte & 127) << shift
+        place, shift = place + 1, shift + 7
+        if byte < 128:
+            return value, place

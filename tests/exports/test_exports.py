@@ -1,0 +1,332 @@
+"""Every layout is read by the tool that it is for."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import Command, axes, direction, files_of, refused, tiny_recipe
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as some
+from numpy.typing import NDArray
+from PIL import Image
+
+from mitsonar.errors import MitsonarError
+from mitsonar.exports.export_source import open_export
+from mitsonar.exports.labelled_pictures import LabelledPictures
+from mitsonar.exports.named_exports import export_to
+from mitsonar.exports.run_length import compressed, runs_of
+from mitsonar.geometry.scan_conversion import nearest_cells
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.records.frame_store import FrameStore
+from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+
+FRAMES, BINS, BEAMS = 5, 40, 24
+SONAR = Sonar(beams=BEAMS, range_bins=BINS, azimuth_fov_deg=60)
+
+
+@pytest.fixture(scope="module")
+def frames() -> SonarFrames:
+    """Frames with two barrels of one mesh and a wall on sand, which move from frame to frame."""
+    rng = np.random.default_rng(8)
+    image = rng.random((FRAMES, BINS, BEAMS), np.float32)
+    shape = np.zeros((FRAMES, BINS, BEAMS), np.int32)
+    part = np.zeros_like(shape)
+    for k in range(FRAMES):
+        shape[k, 5 + k : 12 + k, 3:8], part[k, 5 + k : 12 + k, 3:8] = 2, 1
+        shape[k, 20:26, 10 + k : 15 + k], part[k, 20:26, 10 + k : 15 + k] = 2, 2
+        shape[k, 30, 2:20] = 1
+    shape[:, :2] = part[:, :2] = -1
+    poses = np.array([[0.3 * k, 0.1 * k, 2.5, 0.4, 0.05 * k, 0.2 * k] for k in range(FRAMES)])
+    names: dict[str, Any] = {"shape_names": ("sand", "wall", "barrels"), "object_names": ("", "barrels 1", "barrels 2")}
+    time = 100 + np.arange(FRAMES) / 10
+    return SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, time, SONAR, poses, shape_id=shape, object_id=part, **names)
+
+
+@pytest.fixture(scope="module")
+def run(frames: SonarFrames, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    frames.save(folder / "frames.npz")
+    return folder
+
+
+# ---------------------------------------------------------------- COCO and YOLO
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("picture", ["polar", "fan"])
+def test_coco_reads_boxes_masks_and_classes(
+    mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path, picture: str
+) -> None:
+    coco_api = pytest.importorskip("pycocotools.coco")
+    out = tmp_path / "coco"
+    done = mitsonar("frames", "export", run, "--to", "coco", "-o", out, "--without", "sand", "--picture", picture)
+    assert done.returncode == 0, done.stderr
+    coco = coco_api.COCO(str(out / "annotations.json"))
+    assert {one["name"]: one["id"] for one in coco.loadCats(coco.getCatIds())} == {"sand": 1, "wall": 2, "barrels": 3}
+    fans = FanPictures(frames)
+    for number in range(FRAMES):
+        told = coco.loadImgs([number + 1])[0]
+        pixels = np.asarray(Image.open(out / "images" / told["file_name"]))
+        assert pixels.shape == (told["height"], told["width"])
+        shape, part = frames.shape_id[number], frames.object_id[number]  # type: ignore[index]
+        wanted_pixels = to_uint8(frames.image[number])
+        if picture == "fan":
+            shape, part = nearest_cells(fans.fan, shape, -1), nearest_cells(fans.fan, part, -1)
+            wanted_pixels = fans.picture(frames.image[number])
+        np.testing.assert_array_equal(pixels, wanted_pixels)
+        found = coco.loadAnns(coco.getAnnIds(imgIds=[number + 1]))
+        assert {(one["category_id"], one["attributes"]["object_name"]) for one in found} == {
+            (2, ""),
+            (3, "barrels 1"),
+            (3, "barrels 2"),
+        }
+        for one in found:
+            mask = coco.annToMask(one).astype(bool)
+            wanted = (shape == one["category_id"] - 1) & (part == one["attributes"]["object"])
+            np.testing.assert_array_equal(mask, wanted)
+            assert one["area"] == wanted.sum() == mask.sum()
+            rows, columns = np.nonzero(wanted)
+            x, y, width, height = one["bbox"]
+            assert (x, y, x + width, y + height) == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+
+
+@given(some.arrays(np.bool_, st.tuples(st.integers(1, 40), st.integers(1, 40))))
+@settings(max_examples=60, deadline=None)
+def test_masks_are_those_of_the_tool(mask: NDArray[np.bool_]) -> None:
+    masks = pytest.importorskip("pycocotools.mask")
+    counts = compressed(runs_of(mask))
+    assert counts.encode() == masks.encode(np.asfortranarray(mask.astype(np.uint8)))["counts"]
+
+
+@pytest.mark.e2e
+def test_yolo_has_a_line_an_object(mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path) -> None:
+    import yaml
+
+    out = tmp_path / "yolo"
+    words = ("frames", "export", run, "--to", "yolo", "--without", "sand")
+    assert mitsonar(*words, "-o", out).returncode == 0
+    told = yaml.safe_load((out / "data.yaml").read_text())
+    assert told == {"train": "images/train", "val": "images/train", "names": {0: "sand", 1: "wall", 2: "barrels"}}
+    for number in range(FRAMES):
+        assert Image.open(out / "images" / "train" / f"{number:06d}.png").size == (BEAMS, BINS)
+        rows = np.loadtxt(out / "labels" / "train" / f"{number:06d}.txt", ndmin=2)
+        assert rows[:, 0].tolist() == [1, 2, 2]
+        middle = [(2 + 9) / BEAMS, 30.5 / BINS, 18 / BEAMS, 1 / BINS]
+        np.testing.assert_allclose(rows[0, 1:], middle, atol=1e-6)
+        np.testing.assert_allclose(rows[1, 1:], [5.5 / BEAMS, (8.5 + number) / BINS, 5 / BEAMS, 7 / BINS], atol=1e-6)
+    cv2 = pytest.importorskip("cv2")
+    assert mitsonar(*words, "-o", tmp_path / "outlines", "--polygons").returncode == 0
+    for line in (tmp_path / "outlines" / "labels" / "train" / "000001.txt").read_text().splitlines()[-2:]:
+        kind, *numbers = line.split()
+        points = np.array(numbers, float).reshape(-1, 2) * (BEAMS, BINS) - 0.5
+        drawn = cv2.fillPoly(np.zeros((BINS, BEAMS), np.uint8), [points.round().astype(np.int32)], 1)
+        assert (frames.shape_id[1][drawn > 0] == int(kind)).all()  # type: ignore[index]
+        assert drawn.sum() in ((frames.object_id[1] == 1).sum(), (frames.object_id[1] == 2).sum())  # type: ignore[index]
+
+
+# ---------------------------------------------------------------- WebDataset and Hugging Face
+
+
+@pytest.mark.e2e
+def test_webdataset_decodes_samples(
+    mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    webdataset = pytest.importorskip("webdataset")
+    from mitsonar.exports import webdataset_export
+
+    monkeypatch.setattr(webdataset_export, "OF_SHARD", 2)
+    assert mitsonar("frames", "export", run, "--to", "webdataset", "-o", tmp_path / "wds").returncode == 0
+    shards = sorted(map(str, (tmp_path / "wds").glob("train-*.tar")))
+    assert [Path(one).name for one in shards] == [f"train-{k:06d}.tar" for k in range(3)]
+    samples = list(webdataset.WebDataset(shards, shardshuffle=False).decode("pil"))
+    assert [one["__key__"] for one in samples] == [f"{k:06d}" for k in range(FRAMES)]
+    for number, one in enumerate(samples):
+        np.testing.assert_array_equal(np.asarray(one["png"].convert("L")), to_uint8(frames.image[number]))
+        assert one["json"]["time_s"] == frames.time_s[number]
+        np.testing.assert_allclose(one["json"]["heading_deg"], np.degrees(0.2 * number))
+        assert one["json"]["regions"]["name"] == ["sand", "wall", "barrels", "barrels"]
+    import io
+    import tarfile
+
+    with tarfile.open(shards[0]) as tar:
+        entry = tar.extractfile("000000.shape.png")
+        assert entry is not None
+        shape = np.asarray(Image.open(io.BytesIO(entry.read())))
+    np.testing.assert_array_equal(shape, frames.shape_id[0] + 1)  # type: ignore[index]
+
+
+@pytest.mark.e2e
+@pytest.mark.thorough
+def test_hugging_face_loads_pictures_and_metadata(
+    mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    datasets = pytest.importorskip("datasets")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    out = tmp_path / "hf"
+    assert mitsonar("frames", "export", run, "--to", "huggingface", "-o", out).returncode == 0
+    data = datasets.load_dataset(str(out), split="train", cache_dir=str(tmp_path / "cache"))
+    assert len(data) == FRAMES
+    for number, row in enumerate(data):
+        np.testing.assert_array_equal(np.asarray(row["image"].convert("L")), to_uint8(frames.image[number]))
+        np.testing.assert_allclose([row["x_m"], row["pitch_deg"]], [0.3 * number, np.degrees(0.4)])
+        assert row["objects"]["name"] == ["sand", "wall", "barrels", "barrels"]
+        assert row["objects"]["bbox"][1] == [2, 30, 18, 1]
+
+
+@pytest.mark.e2e
+@pytest.mark.thorough
+def test_croissant_reads_the_records(mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path) -> None:
+    croissant = pytest.importorskip("mlcroissant")
+    out = tmp_path / "hf"
+    assert mitsonar("frames", "export", run, "--to", "huggingface", "-o", out).returncode == 0
+    data = croissant.Dataset(jsonld=str(out / "croissant.json"))
+    records = list(data.records("train"))
+    assert not data.metadata.ctx.issues.errors
+    assert len(records) == FRAMES
+    np.testing.assert_allclose([one["train/heading_deg"] for one in records], np.degrees(0.2 * np.arange(FRAMES)))
+    assert [one["train/file_name"] for one in records] == [f"{k:06d}.png".encode() for k in range(FRAMES)]
+
+
+# ---------------------------------------------------------------- KITTI and neusis
+
+
+@pytest.mark.e2e
+def test_kitti_poses_are_relative_to_the_first_frame(
+    mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path
+) -> None:
+    files = pytest.importorskip("evo.tools.file_interface")
+    assert mitsonar("frames", "export", run, "--to", "kitti", "-o", tmp_path / "kitti").returncode == 0
+    path = files.read_kitti_poses_file(str(tmp_path / "kitti" / "poses" / "00.txt"))
+    assert path.num_poses == FRAMES
+    assert path.check()[0]
+    np.testing.assert_allclose(path.poses_se3[0], np.eye(4), atol=1e-12)
+    poses = frames.poses
+    assert poses is not None
+    starboard, forward, up = axes(Pose(*poses[0]))
+    for number, matrix in enumerate(path.poses_se3):
+        step = poses[number, :3] - poses[0, :3]
+        np.testing.assert_allclose(matrix[:3, 3], [step @ starboard, -step @ up, step @ forward], atol=1e-9)
+        ahead = axes(Pose(*poses[number]))[1]
+        np.testing.assert_allclose(matrix[:3, 2], [ahead @ starboard, -ahead @ up, ahead @ forward], atol=1e-9)
+    times = np.loadtxt(tmp_path / "kitti" / "sequences" / "00" / "times.txt")
+    np.testing.assert_allclose(times, np.arange(FRAMES) / 10, atol=1e-6)
+
+
+@pytest.mark.e2e
+def test_points_of_neusis_lie_where_ours_do(mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path) -> None:
+    """A pixel's point by the formulas of neusis (x forward, bearing growing with the column), against ours."""
+    assert mitsonar("frames", "export", run, "--to", "neusis", "-o", tmp_path / "views").returncode == 0
+    told = json.loads((tmp_path / "views" / "Config.json").read_text())["agents"][0]["sensors"][0]
+    assert told["sensor_type"] == "ImagingSonar"
+    angles = told["configuration"]
+    across = np.radians(angles["Azimuth"])
+    for number in range(FRAMES):
+        state = pickle.loads((tmp_path / "views" / "Data" / f"{number:06d}.pkl").read_bytes())
+        image, to_world = state["ImagingSonar"], state["PoseSensor"]
+        assert image.shape == (BINS, BEAMS)
+        for row, column in ((3, 0), (17, BEAMS - 1), (39, 7)):
+            radius = angles["RangeMin"] + (row + 0.5) * (angles["RangeMax"] - angles["RangeMin"]) / BINS
+            theta, phi = -across / 2 + (column + 0.5) * across / BEAMS, 0.07
+            local = [radius * np.cos(theta) * np.cos(phi), radius * np.sin(theta) * np.cos(phi), radius * np.sin(phi), 1]
+            theirs = (to_world @ local)[:3]
+            beam = BEAMS - 1 - column
+            assert image[row, column] == frames.image[number, row, beam]
+            ours = frames.range_m[row] * direction(frames.sonar, frames.bearing_rad[beam], phi)
+            turned = vehicle_rotation(frames.poses[number]).apply(ours)[0] + frames.poses[number, :3]  # type: ignore[index]
+            np.testing.assert_allclose(theirs, turned, atol=1e-6)
+
+
+# ---------------------------------------------------------------- sources, and the folder
+
+
+@pytest.mark.e2e
+def test_a_data_set_is_exported_by_its_split(mitsonar: Command, tmp_path: Path, variant: str) -> None:
+    from mitsonar.datasets.generation import make_dataset
+    from mitsonar.datasets.store import DataStore
+
+    recipe = tiny_recipe(labels=["shape_id"], split={"by": "sequence", "train": 0.5, "validation": 0.5})
+    make_dataset(recipe, str(tmp_path / "tiny.zarr"), sequences=4)
+    store = DataStore.open(str(tmp_path / "tiny.zarr"))
+    out = tmp_path / "wds"
+    done = mitsonar("dataset", "export", tmp_path / "tiny.zarr", "--to", "webdataset", "-o", out)
+    assert done.returncode == 0, done.stderr
+    counts = json.loads((out / "about.json").read_text())["samples"]
+    assert counts == {"train": len(store) // 2, "validation": len(store) // 2}
+    assert mitsonar("dataset", "export", tmp_path / "tiny.zarr", "--to", "kitti", "-o", tmp_path / "kitti").returncode == 0
+    assert sorted(path.name for path in (tmp_path / "kitti" / "poses").iterdir()) == [f"{k:02d}.txt" for k in range(4)]
+    refused(mitsonar("frames", "export", tmp_path / "tiny.zarr", "--to", "coco", "-o", out), "is a data set")
+    refused(mitsonar("dataset", "export", tmp_path / "none", "--to", "coco", "-o", out), "no data set")
+
+
+def test_a_long_run_on_disk_gives_the_same_files(frames: SonarFrames, run: Path, tmp_path: Path) -> None:
+    store = FrameStore.create(tmp_path / "frames.zarr", FRAMES, frames)
+    store.write(0, frames)
+    export_to("coco", open_export(tmp_path / "frames.zarr"), tmp_path / "of_zarr")
+    export_to("coco", open_export(run), tmp_path / "of_npz")
+    ours, theirs = files_of(tmp_path / "of_zarr"), files_of(tmp_path / "of_npz")
+    for table in (ours, theirs):
+        told = json.loads(table.pop("annotations.json"))
+        table["annotations"] = json.dumps([told["images"], told["annotations"], told["categories"]]).encode()
+    assert ours == theirs
+
+
+@pytest.mark.e2e
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
+    mitsonar: Command, run: Path, frames: SonarFrames, tmp_path: Path
+) -> None:
+    (tmp_path / "there").mkdir()
+    words = ("frames", "export", run, "-o")
+    refused(mitsonar(*words, tmp_path / "there", "--to", "coco"), "exists and is kept")
+    refused(mitsonar(*words, tmp_path / "new", "--to", "cocoa"), "unknown layout", "coco")
+    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--picture", "round"), "polar or fan")
+    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--without", "sandy"), "no shape is named", "sand")
+    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--polygons"), "--polygons")
+    bare = SonarFrames(frames.image, frames.range_m, frames.bearing_rad, frames.time_s, SONAR)
+    bare.save(tmp_path / "bare.npz")
+    refused(mitsonar("frames", "export", tmp_path / "bare.npz", "--to", "yolo", "-o", tmp_path / "new"), "--labels")
+    refused(mitsonar("frames", "export", tmp_path / "bare.npz", "--to", "kitti", "-o", tmp_path / "new"), "no poses")
+    assert {path.name for path in tmp_path.iterdir()} == {"there", "bare.npz"}
+    assert mitsonar("frames", "export", tmp_path / "bare.npz", "--to", "webdataset", "-o", tmp_path / "new").returncode == 0
+
+
+def test_an_export_that_breaks_off_leaves_nothing_and_a_killed_one_is_replaced(run: Path, tmp_path: Path) -> None:
+    source, out = open_export(run), tmp_path / "out"
+
+    def full(done: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match="No space"):
+        export_to("coco", source, out, progress=full)
+    assert not list(tmp_path.iterdir())
+    part = tmp_path / ".out.part"
+    part.mkdir()
+    with pytest.raises(MitsonarError, match="no export of mitsonar made it"):
+        export_to("coco", source, out)
+    (part / ".mitsonar-export").touch()
+    (part / "half").touch()
+    export_to("coco", source, out)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert {path.name for path in out.iterdir()} == {"annotations.json", "images"}
+
+
+def test_few_frames_are_read_at_a_time(frames: SonarFrames, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mitsonar.exports import export_source
+
+    monkeypatch.setattr(export_source, "AT_ONCE_BYTES", 2 * BINS * BEAMS * 12)
+    sizes = [len(piece) for _, piece in open_export(run).pieces()]
+    assert sizes == [2, 2, 1]
+
+
+def test_small_regions_are_left_out(frames: SonarFrames) -> None:
+    few = LabelledPictures(frames, least=19)
+    assert [(one.kind, one.number) for one in few.regions(frames, 0)] == [(0, 0), (2, 1), (2, 2)]
+    found: list[Any] = LabelledPictures(frames).regions(frames, 0)
+    assert len(found) == 4
