@@ -13,6 +13,7 @@ from PIL import Image
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
+from scipy import ndimage
 
 from mitsonar.recordings.ros_messages import ros1_types, ros2_types
 
@@ -167,3 +168,29 @@ def decoded(path: Path) -> dict[str, list[RosObject]]:
         for _, channel, _, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             found[channel.topic].append(message)
     return dict(found)
+
+
+# ---------------------------------------------------------------- pings
+
+BEARING = np.radians(np.linspace(-30, 28, 24)) + 0.01 * np.sin(np.arange(24))
+RANGE: NDArray[np.float64] = 1.0 + 0.05 * np.arange(40, dtype=np.float64)
+TIME = 1_700_000_000 + np.array([0.1, 0.35, 0.5, 0.7, 1.0, 1.1])
+KINDS = ["one.bag", "two", "three_mcap"]
+"""A bag of ROS 1, one of ROS 2 in SQLite, one of ROS 2 in MCAP."""
+
+
+def smooth(count: int = len(TIME), kind: type[np.generic] = np.uint8) -> NDArray[Any]:
+    """Images whose neighbours resemble each other, as those of a sonar do ``(count, bins, beams)``."""
+    noise = np.random.default_rng(5).normal(size=(count, len(RANGE), len(BEARING)))
+    drawn = ndimage.gaussian_filter(noise, (0, 1.5, 1.5))
+    level = (drawn - drawn.min()) / np.ptp(drawn)
+    letters = np.dtype(kind)
+    return np.asarray(level if letters.kind == "f" else level * np.iinfo(letters.name).max, dtype=letters)
+
+
+def pings(maker: Maker, images: NDArray[Any], topic: str = "/sonar", **options: Any) -> list[Sent]:
+    bearing, distance = options.pop("bearing_rad", BEARING), options.pop("range_m", RANGE)
+    return [
+        (topic, time + 0.02, maker.ping(image, time, bearing, distance, **options))
+        for time, image in zip(TIME, images, strict=True)
+    ]
