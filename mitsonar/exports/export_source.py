@@ -89,7 +89,7 @@ def open_export(where: str | Path, *, view: str | None = None) -> ExportSource:
     def read(part: slice) -> SonarFrames:
         index = np.arange(part.start, part.stop)
         frames = source.read(index)
-        labels = {name: np.asarray(array[part]) for name, array in stored.items()}
+        labels: dict[str, Any] = {name: np.asarray(array[part]) for name, array in stored.items()}
         poses = None if source.poses is None else source.poses[part]
         return replace(frames, poses=poses, **like, **labels)
 
@@ -139,6 +139,7 @@ def _of_data_set(url: str, view: str | None) -> ExportSource:
     scale = float(store.about["level_scale"])
 
     def read(part: slice) -> SonarFrames:
+        told: dict[str, Any] = {label: store.read(array, part) for label, array in labels.items()}
         return SonarFrames(
             image=store.read(stored[name], part),
             range_m=one.sonar.range_m,
@@ -147,8 +148,9 @@ def _of_data_set(url: str, view: str | None) -> ExportSource:
             sonar=one.sonar,
             poses=store.read("pose", part),
             height_m=store.read("height_m", part),
+            level=one.sonar.value_coding,
             level_scale=scale,
-            **{label: store.read(array, part) for label, array in labels.items()},
+            **told,
         )
 
     sequence = np.asarray(store.read("sequence"), dtype=np.int64)
