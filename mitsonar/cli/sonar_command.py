@@ -8,17 +8,18 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, changes_of, command_line, say, warn
+from mitsonar.cli.odometry_command import Geometry
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
 
-__all__ = ["fit", "sonars"]
+__all__ = ["fit", "from_recording", "sonars"]
 
 
 def sonars() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Make a sonar's file from what a real sonar recorded.", no_args_is_help=True)
     app.command()(fit)
-    app.callback()(lambda: None)  # a group stays a group with one command
+    app.command("from-recording")(from_recording)
     return app
 
 
@@ -58,3 +59,57 @@ def fit(
     for note in found.notes:
         warn(note)
     say(f"{out}: {command_line('render', 'SCENE', '--sonar', out)}")
+
+
+@answered
+def from_recording(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording of a real sonar, or frames.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="YAML file to write, for --sonar.")],
+    noise: Annotated[
+        Path | None, typer.Option(help="YAML file to write noise, water and grain to; default: they stand in OUT too.")
+    ] = None,
+    sonar: Annotated[
+        str | None, typer.Option(help="Preset or YAML file of what the file does not tell: beam width, patterns.")
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A field that is known, frequency_hz=1.8e6 for one."),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames from the middle that are read.")] = 12,
+    part: Annotated[int | None, typer.Option(min=0, help="Part of the recording (default: the longest).")] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of a ROS bag (default: the only one).")] = None,
+    geometry: Geometry = None,
+    measure_coding: Annotated[
+        bool, typer.Option("--measure-coding", help="Take span [dB] or gamma from the grain, not from the frames.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
+) -> None:
+    """Make a sonar that records like the one of a recording: its window, bins and beams, and its fitted noise.
+
+    `mitsonar render` and recipes of data sets take it by --sonar. With --noise the files are laid over one another:
+    --sonar sonar.yaml,noise.yaml.
+    """
+    from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
+    from mitsonar.estimation.sonar_fit import fit_sonar
+    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.mapping.open_frames import open_frames
+
+    for path in (out, noise):
+        if path is not None:
+            refuse_to_replace(path, overwrite=overwrite)
+    known = changes_of(changes or [], None)
+    base = None if sonar is None else load_sonar(sonar)
+    source = open_frames(file, sequence=part, view=topic, geometry=geometry)
+    first = max(0, (len(source) - frames) // 2)
+    chosen, notes = as_instrument(source.read(range(first, min(first + frames, len(source)))))
+    found = fit_sonar(chosen, base, measure_coding=measure_coding, **known)
+    if noise is None:
+        write_whole(out, found.yaml().encode())
+    else:
+        write_whole(out, found.yaml(leave=NOISE_FIELDS).encode())
+        write_whole(noise, found.yaml(only=NOISE_FIELDS).encode())
+    for line in found.lines():
+        say(line)
+    for note in (*notes, *found.notes):
+        warn(note)
+    say(f"{out}: {command_line('render', 'SCENE', '--sonar', out if noise is None else f'{out},{noise}')}")

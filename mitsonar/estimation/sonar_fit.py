@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Container
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -114,10 +115,19 @@ class SonarFit:
             f"volume_db               {drifting}",
         ]
 
-    def yaml(self) -> str:
-        """Return the sonar's file: the fields that differ from their defaults."""
-        default = Sonar()
-        fields = {k: v for k, v in self.sonar.model_dump().items() if v != getattr(default, k) and k in _written(self.sonar)}
+    def yaml(self, *, only: Container[str] | None = None, leave: Container[str] = ()) -> str:
+        """Return the sonar's file: the fields that differ from their defaults.
+
+        Args:
+            only: fields that it holds, also those that have their defaults; None: all that differ.
+            leave: fields that it does not hold.
+        """
+        default, dumped = Sonar(), self.sonar.model_dump()
+        if only is None:
+            fields = {k: v for k, v in dumped.items() if v != getattr(default, k) and k in _written(self.sonar)}
+        else:
+            fields = {k: v for k, v in dumped.items() if k in only}
+        fields = {k: v for k, v in fields.items() if k not in leave}
         about = "".join(f"# {line}\n" for line in [*self.lines(), *self.notes])
         return about + yaml.safe_dump(fields, sort_keys=False, allow_unicode=True)
 

@@ -63,14 +63,29 @@ def preset(name: str) -> Sonar:
 def load_sonar(name_or_file: str | Path) -> Sonar:
     """Load a preset by its name, or a sonar from a YAML file (keys: the fields of :class:`Sonar`, and ``preset``).
 
+    Files after a comma are laid over it: ``didson300,noise.yaml`` is the preset with the fields of ``noise.yaml`` replaced.
+
     Raises:
         MitsonarError: unknown preset (with the nearest names), unreadable file, unknown key, value out of limits.
     """
     text = str(name_or_file)
+    if "," in text and not Path(text).exists():
+        first, *over = (part.strip() for part in text.split(","))
+        sonar = load_sonar(first)
+        for one in over:
+            sonar = sonar.replace(**{key: value for key, value in _fields_in(one).items() if key != "name"})
+        return sonar
     if not text.lower().endswith((".yaml", ".yml")):
         if text in named_sonars() or not Path(text).exists():
             return preset(text)
         raise MitsonarError(f"a sonar's file ends in .yaml: got {text}; rename it, or name a preset")
+    fields = _fields_in(text)
+    fields.setdefault("name", Path(text).stem)
+    return sonar_from(fields)
+
+
+def _fields_in(text: str) -> dict[str, Any]:
+    """Return the fields in a sonar's YAML file."""
     try:
         fields = read_yaml(text, "sonar file")
     except MitsonarError as error:
@@ -78,8 +93,7 @@ def load_sonar(name_or_file: str | Path) -> Sonar:
         raise MitsonarError(f"{error}{more}") from None
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MitsonarError(f"{text} must hold `key: value` lines of a sonar; see docs/guides/sonars.md")
-    fields.setdefault("name", Path(text).stem)
-    return sonar_from(fields)
+    return fields
 
 
 def sonar_from(fields: dict[str, Any]) -> Sonar:
