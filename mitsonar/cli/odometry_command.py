@@ -64,14 +64,14 @@ def odometry(
         str | None,
         typer.Option(
             help="What is matched: levels, local (contrast) or moving (local, less the mean of the run). Default: local for "
-            "recordings of real sonars, levels for all others."
+            "recordings that tell no height, levels for all others."
         ),
     ] = None,
     closure: Annotated[
         int | None,
         typer.Option(
             help="Motions over which loops are closed; covariances are raised to what they leave over. 0: none. Default: 8 "
-            "for recordings of real sonars, else 0."
+            "with contrast, else 0."
         ),
     ] = None,
     sequence: Annotated[
@@ -101,7 +101,6 @@ def odometry(
     """
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
-    from mitsonar.mapping.open_frames import is_recording
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at
     from mitsonar.motion.pose import Pose
     from mitsonar.records.sonar_frames import SonarFrames
@@ -110,7 +109,7 @@ def odometry(
     first = numbers(start, 6, "--from")
     pitch = None if pitch_deg is None else math.radians(pitch_deg)
     reading = Reading(sequence, view, noise, seed, height, pitch, height_by, geometry, contrast)
-    images, recorded = record_at(frames) is SonarFrames, is_recording(frames)
+    images = record_at(frames) is SonarFrames
     estimator = estimator or ("direct" if images else "likelihood")
     try:
         method = estimator_from(estimator)
@@ -134,7 +133,7 @@ def odometry(
             start=None if first is None else Pose.from_degrees(first),
             frame=frame,
             every=every,
-            closure=(LOOP if recorded else 0) if closure is None else closure,
+            closure=(0 if getattr(source, "contrast", None) is None else LOOP) if closure is None else closure,
             workers=processes,
             overwrite=overwrite,
             resume=resume,

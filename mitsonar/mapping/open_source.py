@@ -65,7 +65,7 @@ class Reading:
         height_by: measures the height in each frame: ``direct`` or a checkpoint.
         geometry: file that tells how the pictures of a recording are laid out.
         contrast: what is matched: ``levels``; ``local`` contrast; ``moving``: the same, less the pattern that moves with the
-            sonar. None: local for recordings of real sonars, levels for all others.
+            sonar. None: local for recordings that tell no height, levels for all others.
     """
 
     sequence: int | None = None
@@ -100,9 +100,9 @@ def open_source(where: str, estimator: AnyEstimator, reading: Reading) -> Source
         raise MitsonarError("--height gives the height and --height-by measures it: give one of them")
     source = frames_for(where, reading)
     _check_consumed(where, there, wanted)
-    if is_recording(where):
-        source = with_assumed_plane(source)
-    return _with_contrast(_with_heights(source, reading), reading, recorded=is_recording(where))
+    source = _with_heights(source, reading)
+    bare = is_recording(where) and not _tells_height(source)
+    return _with_contrast(with_assumed_plane(source) if bare else source, reading, bare=bare)
 
 
 def frames_for(where: str, reading: Reading) -> FrameSource:
@@ -145,13 +145,18 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
     return open_responses(where).with_noise(reading.noise, reading.seed).with_height(reading.height_m)
 
 
-def _with_contrast(source: FrameSource, reading: Reading, *, recorded: bool) -> FrameSource:
+def _tells_height(source: FrameSource) -> bool:
+    """Return whether all frames have a height, told or measured."""
+    return source.altimeter is not None or (source.height_m is not None and bool(np.isfinite(source.height_m).all()))
+
+
+def _with_contrast(source: FrameSource, reading: Reading, *, bare: bool) -> FrameSource:
     """Return the same frames, as levels or as contrast.
 
     Raises:
         MitsonarError: an unknown word.
     """
-    contrast = reading.contrast or ("local" if recorded else "levels")
+    contrast = reading.contrast or ("local" if bare else "levels")
     if contrast not in CONTRASTS:
         raise MitsonarError(f"unknown contrast {contrast!r}: {nearest_names(contrast, CONTRASTS)}")
     return source if contrast == "levels" else source.with_contrast(moving=contrast == "moving")
@@ -163,7 +168,7 @@ def with_assumed_plane(source: FrameSource) -> FrameSource:
     The plane is seen over the whole window within the opening of the beams. Motions hardly depend on it: they are scaled by
     the cosine of the angle at which the sonar looks at the ground.
     """
-    if source.altimeter is not None or (source.height_m is not None and np.isfinite(source.height_m).all()):
+    if _tells_height(source):
         return source
     far = float(source.like.range_m[-1])
     near = max(float(source.like.range_m[0]), NEAREST * far)
