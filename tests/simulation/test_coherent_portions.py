@@ -30,7 +30,7 @@ DOWN = Pose(0, 0, 0, np.radians(90), 0, np.radians(-90))
 
 def pose_at(x: float = 0.0) -> Array:
     """The sonar 2 m above the ground."""
-    return np.asarray(mounted(Pose(x, 0, 2), DOWN)[0], dtype=np.float64)
+    return np.asarray(mounted(Pose(x, 0, 2), DOWN)[0])
 
 
 def simulator(loaded: object, names: Sequence[str], sonar: Sonar = SONAR) -> Simulator:
