@@ -122,11 +122,14 @@ def live_pings(
         except MitsonarError as error:
             publisher.complain(f"this pose cannot be rendered: {error}")
             continue
-        taken = time.perf_counter() - begun
-        mark, dropped = delivered.asked.mark, delivered.dropped
-        ping = LivePing(frames, next(numbers), delivered.came_ns, source, mark, dropped, taken)
+        ping = _ping(frames, next(numbers), delivered, source, time.perf_counter() - begun)
         publisher.publish(ping)
         yield ping
+
+
+def _ping(frames: SonarFrames, number: int, delivered: Delivered, source: str, render_s: float) -> LivePing:
+    """Return a ping with what is known of its pose."""
+    return LivePing(frames, number, delivered.came_ns, source, delivered.asked.mark, delivered.dropped, render_s)
 
 
 def _played(path: Trajectory, number: int) -> Delivered:
