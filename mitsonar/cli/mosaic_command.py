@@ -65,7 +65,8 @@ def mosaic(
     from mitsonar.mapping.geotiff import save_geotiff
     from mitsonar.mapping.illumination import illumination
     from mitsonar.mapping.mosaic import Mosaic, build_mosaic
-    from mitsonar.mapping.open_source import Reading, frames_for
+    from mitsonar.mapping.open_frames import is_recording
+    from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
 
     quality = _checked_out(out, true, overwrite)
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
@@ -76,6 +77,8 @@ def mosaic(
         say(source.note)
     if source.height_m is None and path_height is not None:
         source = source.with_geometry(path_height)
+    if source.height_m is None and is_recording(frames):
+        source = with_assumed_plane(source)
     if source.height_m is None:
         raise MitsonarError(f"{source.name} holds no height over the ground: give --height")
     if trajectory == "true":

@@ -100,6 +100,7 @@ def odometry(
     run.json, and estimates.jsonl, from which --resume continues.
     """
     from mitsonar.estimation.named_estimators import estimator_from
+    from mitsonar.mapping.closure import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at
     from mitsonar.motion.pose import Pose
@@ -122,7 +123,9 @@ def odometry(
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
     processes = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
-    with progress_bar("estimating", pairs, "pairs") as progress:
+    steps = (0 if getattr(source, "contrast", None) is None else LOOP) if closure is None else closure
+    loops = len(loop_starts(pairs, steps)) if steps > 1 else 0
+    with progress_bar("estimating", pairs + loops, "pairs") as progress:
         found = run_odometry(
             source,
             estimator,
@@ -133,7 +136,7 @@ def odometry(
             start=None if first is None else Pose.from_degrees(first),
             frame=frame,
             every=every,
-            closure=(0 if getattr(source, "contrast", None) is None else LOOP) if closure is None else closure,
+            closure=steps,
             workers=processes,
             overwrite=overwrite,
             resume=resume,

@@ -12,7 +12,7 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.pair_estimation import estimate_motions
 
-__all__ = ["Closure", "closure_of"]
+__all__ = ["Closure", "closure_of", "loop_starts"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -77,15 +77,17 @@ def closure_of(
         numbers: of the frames used ``(frames,)``.
         estimates: of the single steps ``(frames - 1,)``.
         steps: motions of a loop.
-        progress: called with the number of motions that were added.
+        progress: called with the number of loops that were added, also of those left out.
 
     Returns:
         The closure; None where fewer than two loops have valid motions throughout.
     """
     valid = np.array([one.valid for one in estimates], dtype=bool)
-    starts = [int(one) for one in _starts(len(estimates), steps) if valid[one : one + steps].all()]
     residuals, explained = [], []
-    for start in starts:
+    for start in (int(one) for one in loop_starts(len(estimates), steps)):
+        if not valid[start : start + steps].all():
+            progress(1)
+            continue
         ends = np.array([numbers[start], numbers[start + steps]])
         whole = estimate_motions(source, estimator, ends)[0]
         progress(1)
@@ -104,8 +106,8 @@ def closure_of(
     return Closure(steps, np.array(residuals), factor)
 
 
-def _starts(motions: int, steps: int) -> Index:
-    """Return the first motions of the loops."""
+def loop_starts(motions: int, steps: int) -> Index:
+    """Return the first motion of each loop over ``steps`` of so many motions."""
     stride = max(1, min(steps, (motions - steps) // 15 if motions > steps else 1))
     return np.arange(0, motions - steps + 1, stride, dtype=np.intp)
 
