@@ -23,7 +23,7 @@ Images = NDArray[np.float32]
 SPREAD = 8.0
 """Standard deviations over the range of the values, 0 to 1."""
 
-SMOOTHINGS = ((4.0, 1.0), (8.0, 1.4), (16.0, 2.0))
+SMOOTHINGS = ((1.0, 0.5), (2.0, 0.7), (4.0, 1.0), (8.0, 1.4), (16.0, 2.0))
 """Smoothings that are tried, least first: standard deviations of Gaussians [bins, beams]."""
 
 ENOUGH = 0.75
