@@ -236,7 +236,7 @@ def test_an_encrypted_log_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_log_of_viewpoint_2_is_refused(tmp_path: Path) -> None:
-    for name, reason in (("a.oculus", "ViewPoint 2"), ("a.db3", "is no recording")):
+    for name, reason in (("a.oculus", "ViewPoint 2"), ("a.db3", "not a database")):
         (tmp_path / name).write_bytes(b"SQLite format 3\0".ljust(4096, b"\0"))
         with pytest.raises(MitsonarError, match=reason):
             open_recording(tmp_path / name)

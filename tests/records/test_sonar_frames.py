@@ -112,7 +112,7 @@ def test_pitch_is_known_where_poses_are() -> None:
         ),
         ({"image": np.zeros((10, 6), np.float32)}, r"image must be .* got \(10, 6\)"),
         ({"time_s": np.zeros(3)}, r"image must be .*\(3, 10, 6\) after time_s"),
-        ({"level": "log"}, "level must be linear, dB or gamma: got 'log'"),
+        ({"level": "log"}, "level must be one of linear, dB, gamma, contrast: got 'log'"),
         ({"poses": np.zeros((3, 6))}, "poses must hold 4 frames: got 3"),
         ({"height_m": np.zeros(5)}, "height_m must hold 4 frames: got 5"),
         ({"shadow": np.zeros((1, 10, 6), np.uint8)}, "shadow must hold 4 frames: got 1"),
