@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar, FieldOfView, Maths
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.plugins.surfaces import Surfaces
-from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
+from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables, padded
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.scatterers import Scatterers
 from mitsonar.simulation.tracing import height_below, hidden
@@ -82,12 +82,14 @@ class ChannelTracer:
             self.launches[receiver, wanted] = self._compile(receiver, wanted)
         table = mi.Float64(link_table(self.sonar, receiver, pose, velocity))
         with garbage_stays():
-            received = self.launches[receiver, wanted](mi.UInt32(asked), self.scene, table, self.source.tables(receiver))
+            received = self.launches[receiver, wanted](
+                mi.UInt32(padded(asked)), self.scene, table, self.source.tables(receiver)
+            )
         return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height of each pose over what is straight below it ``(pings,)`` [m]; nan where there is nothing."""
-        place = mi.Point3f(*(mi.Float(axis.astype(np.float32)) for axis in poses[:, :3].T))
+        place = mi.Point3f(*(mi.Float(padded(axis.astype(np.float32))) for axis in poses[:, :3].T))
         return np.array(height_below(self.scene, place), dtype=float)
 
     def _compile(self, receiver: int, wanted: tuple[str, ...]) -> _Launch:

@@ -1,10 +1,13 @@
-"""The type of Dr.Jit arrays in signatures."""
+"""The type of Dr.Jit arrays in signatures, and arrays of NumPy as Dr.Jit may read them."""
 
 from __future__ import annotations
 
 from typing import Any, TypeAlias
 
-__all__ = ["DeviceArray", "LaunchTables"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["DeviceArray", "LaunchTables", "padded"]
 
 DeviceArray: TypeAlias = Any
 """A Dr.Jit array of any type and depth, such as ``mi.Float``, ``mi.Float64`` or ``mi.Vector3f``.
@@ -15,3 +18,17 @@ too widely for a narrower name. Functions that also accept NumPy arrays say so.
 
 LaunchTables: TypeAlias = dict[str, DeviceArray]
 """Arrays by name that a frozen launch takes as inputs."""
+
+MOST_LANES = 64
+"""More than a processor computes side by side."""
+
+
+def padded(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy of values ``(n,)`` behind whose end memory goes on, for a launch over all of them.
+
+    Dr.Jit 1.5 borrows the memory of NumPy and reads whole packets of 16 values: past the end of an array of another length.
+    Where no memory follows, the process dies.
+    """
+    room = np.zeros(len(values) + MOST_LANES, dtype=values.dtype)
+    room[: len(values)] = values
+    return room[: len(values)]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
 from mitsonar.plugins.surfaces import Hit, Surfaces
-from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.hashed_points import lattice_key, nearest_axis, patch_weight, pick, place_in_cell, weight_of
 
 __all__ = ["Patches", "SurfacePoints", "lattice_points", "lattice_size"]
@@ -118,7 +118,7 @@ class _Search:
 
     def on_rays(self, cells: _Cells, side: int, key: DeviceArray, numbers: NDArray[np.uint32]) -> list[SurfacePoints]:
         """Return the points on the rays through some cells: those of first hits, of second ones, and so on."""
-        cell = mi.UInt32(numbers)
+        cell = mi.UInt32(padded(numbers))
         i = mi.Int32(cell % cells.wide) + cells.low[0]
         j = mi.Int32(cell // cells.wide) + cells.low[1]
         p, q, bits = place_in_cell(i, j, key, self.pitch)
@@ -136,7 +136,7 @@ class _Search:
             going = np.flatnonzero(np.array(hit.valid))
             if not len(going):
                 return made
-            kept = mi.UInt32(going.astype(np.uint32))
+            kept = mi.UInt32(padded(going.astype(np.uint32)))
             p, q, amplitude, turn, at = (dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at))
             a = at + skip
             dr.eval(p, q, amplitude, turn, a)

@@ -40,7 +40,7 @@ from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.simulation.beam_former import BeamFormer, CommonFan
 from mitsonar.simulation.coherent_tracing import STRIP, FanRays, add_waves, elevation_gain
-from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.mirror_parts import Mirrors, parts_at, smooth_share
 from mitsonar.simulation.variant import garbage_stays
 
@@ -120,7 +120,7 @@ class MirrorTracer:
             return
         parts = self._parts(np.abs(wanted[cell]))
         self._tell(wanted[cell], parts)
-        inputs = tuple(mi.UInt32(part) for part in _expanded(cell, parts))
+        inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
         with garbage_stays():
             real, imag = self.launch(inputs, self.scene, rows, self.surfaces.arrays(), self.table)
         field.real += np.array(real, copy=False).reshape(field.shape)

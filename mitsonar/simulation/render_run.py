@@ -25,6 +25,7 @@ from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.simulation.device_arrays import padded
 from mitsonar.simulation.labels import labels_above
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
@@ -284,7 +285,7 @@ class StoredEchoes:
         beam = pixel % self.traced.columns // self.traced.across
         for number in range(first, first + len(np.atleast_2d(poses))):
             stored = self.film_echoes(poses, number)
-            echoes = Echoes(**{name: mi.Float(value) for name, value in vars(stored).items()})
+            echoes = Echoes(**{name: mi.Float(padded(value)) for name, value in vars(stored).items()})
             sums = accumulate(ViewEchoes(echoes, beam, True, None), mi.UInt32(0), 1, tracer)
             levels, counts = fetch(*develop(sums, 1, tracer), 1, tracer.view)
             yield RenderedPings(number, levels, counts, self.height_m[number : number + 1])
