@@ -45,6 +45,9 @@ CENTIDEGREE = math.pi / 18_000
 FORWARD_LEFT_UP: Array = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 """Starboard, forward and up in axes forward, left, up (REP 103), as columns."""
 
+LONGEST = 1e6
+"""Length of a direction, at most: drivers write unit vectors."""
+
 CLEARLY = 0.05
 """By how much a correlation must exceed the other one to decide on the order of samples."""
 
@@ -193,7 +196,7 @@ def _bearings(vectors: Array) -> tuple[Array, Array]:
     Forward is the axis z, as the definition says, or the axis x, as in Gazebo. To port is the axis y in both: so write the
     driver of the Oculus (y = -sin) and Gazebo (REP 103), and so does ``sonar_image_proc`` draw.
     """
-    if not len(vectors) or not np.isfinite(vectors).all() or not (np.linalg.norm(vectors, axis=1) > 0).all():
+    if not len(vectors) or not (np.abs(vectors) < LONGEST).all() or not (np.abs(vectors).max(axis=1) > 0).all():
         raise ValueError("directions of beams are none, or not finite")
     forward = 0 if np.abs(vectors[:, 0]).mean() > np.abs(vectors[:, 2]).mean() else 2
     axis = np.eye(3)

@@ -82,6 +82,7 @@ class Link:
         """Return positions ``(n, 3)`` and rotations at these times; None where a time lies beyond what is known."""
         table = np.array(self.numbers).reshape(-1, 8)
         table = table[np.isfinite(table).all(axis=1) & (np.abs(table[:, 1:4]) < FARTHEST_M).all(axis=1)]
+        table = table[(np.abs(table[:, 4:]) < 2).all(axis=1)]
         table = table[np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) < NOT_UNIT]
         table = table[np.unique(table[:, 0], return_index=True)[1]]
         if not len(table):

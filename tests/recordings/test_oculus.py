@@ -59,7 +59,7 @@ def test_the_layout_of_the_beams_follows_the_sample() -> None:
 @with_sample
 def test_the_sonar_of_the_sample_is_estimated_to_stand_still() -> None:
     with pytest.warns(MitsonarWarning, match="no times in a known unit"):
-        source = open_frames(SAMPLE).with_geometry(height_m=0.6, pitch_rad=np.radians(25))
+        source = open_frames(SAMPLE).with_geometry(height_m=0.6, pitch_rad=np.radians(25)).with_contrast()
     for pair in ([0, 1], [1, 2]):
         found = Direct().estimate(source.read(pair))
         assert found.valid
