@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -20,14 +21,14 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.scene_triangles import Triangles
 
-__all__ = ["Shown", "wedge_lines", "write_recording"]
+__all__ = ["Shown", "first_eye", "wedge_lines", "write_recording"]
 
 AT_ONCE = 16
 """Frames that are read at once."""
 
 GREY, BOXED, TRUE, ESTIMATED, BEAMS = (150, 150, 145), (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
-BACK, EYE_UP = np.array([[1.0, -1.2, 0.0]]), 0.6
-"""Where the eye is at first: behind the sonar and at its starboard side [of its axes], and how far above."""
+BEHIND = np.array([0.64, -0.77, 0.6])
+"""Direction of the eye at first, to starboard, forward and up of a sonar that is level, in sizes of what is seen."""
 
 LINE = rr.Radius.ui_points(1.5)
 
@@ -98,7 +99,9 @@ def write_recording(shown: Shown, path: Path | None, progress: Callable[[int], N
 
 def _blueprint(shown: Shown) -> rrb.Blueprint:
     """Arrange the views: the world beside fan, polar image and levels, of what there is."""
-    world = [rrb.Spatial3DView(origin="world", name="world", eye_controls=_eye(shown))]
+    places = first_eye(shown)
+    eye = None if places is None else rrb.EyeControls3D(position=places[0], look_target=places[1], eye_up=(0, 0, 1))
+    world = [rrb.Spatial3DView(origin="world", name="world", eye_controls=eye)]
     if shown.source is None:
         return rrb.Blueprint(*world, collapse_panels=True)
     has_world = bool(shown.shapes or shown.estimated or shown.path is not None or shown.source.poses is not None)
@@ -111,24 +114,28 @@ def _blueprint(shown: Shown) -> rrb.Blueprint:
     return rrb.Blueprint(rrb.Horizontal(*(world if has_world else []), images), collapse_panels=True)
 
 
-def _eye(shown: Shown) -> rrb.EyeControls3D | None:
-    """Look at path and beams from behind and above: a scene may be many times as large. None: at the whole scene."""
-    known = [] if shown.source is None or shown.source.poses is None else [shown.source.poses]
-    known = [*([] if shown.path is None else [shown.path.poses]), *known, *(one.poses for one in shown.estimated.values())]
-    poses = np.concatenate(known) if known else np.empty((0, 6))
-    poses = poses[np.isfinite(poses).all(axis=1)]
+def first_eye(shown: Shown) -> NDArray[np.float64] | None:
+    """Return where the eye is at first and at what it looks ``(2, 3)`` [m]; None: there is no pose to look at.
+
+    It sees path and beams from behind and above: the scene may be many times as large.
+    """
+    known = [] if shown.path is None else [shown.path.poses]
+    if shown.source is not None and shown.source.poses is not None:
+        known.append(shown.source.poses)
+    poses = np.concatenate([*known, *(one.poses for one in shown.estimated.values()), np.empty((0, 6))])
+    poses = poses[np.isfinite(poses).all(axis=1)]  # a recording may lack depth or attitude
     if not len(poses):
         return None
     edges = np.zeros((1, 3)) if shown.sonar is None else np.concatenate(wedge_lines(shown.sonar))
-    turns = [vehicle_rotation(pose).apply(edges) + pose[:3] for pose in poses[[0, len(poses) // 2, -1]]]
-    points = np.concatenate([poses[:, :3], *turns])
+    seen = [vehicle_rotation(pose).apply(edges) + pose[:3] for pose in poses[[0, len(poses) // 2, -1]]]
+    points = np.concatenate([poses[:, :3], *seen])
     low, high = points.min(axis=0), points.max(axis=0)
-    centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
+    size = float(np.linalg.norm(high - low))
     if size == 0:
         return None
-    back = vehicle_rotation(poses[len(poses) // 2]).apply(BACK)[0]
-    from_there = np.array([*(back[:2] / max(float(np.linalg.norm(back[:2])), 1e-9)), EYE_UP])
-    return rrb.EyeControls3D(position=centre + size * from_there, look_target=centre, eye_up=(0, 0, 1))
+    turn = float(poses[len(poses) // 2, 5])
+    away = Rotation.from_rotvec([0, 0, -turn]).apply(BEHIND)
+    return np.stack([(low + high) / 2 + size * away, (low + high) / 2])
 
 
 def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
