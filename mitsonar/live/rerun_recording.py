@@ -21,14 +21,20 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.scene_triangles import Triangles
 
-__all__ = ["Shown", "first_eye", "wedge_lines", "write_recording"]
+__all__ = ["Shown", "first_eye", "lit_corners", "wedge_lines", "write_recording"]
 
 AT_ONCE = 16
 """Frames that are read at once."""
 
-GREY, BOXED, TRUE, ESTIMATED, BEAMS = (150, 150, 145), (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
-BEHIND = np.array([0.64, -0.77, 0.6])
-"""Direction of the eye at first, to starboard, forward and up of a sonar that is level, in sizes of what is seen."""
+BOXED, TRUE, ESTIMATED, BEAMS = (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
+WHOLE = ((168, 158, 132), (128, 132, 138), (160, 118, 92))
+"""Colours of the shapes in turn: one colour for all hides a wreck on its seabed."""
+
+BEHIND = np.array([0.54, -0.64, 0.54])
+"""Direction of the eye at first, to starboard, forward and up of a sonar that is level."""
+
+HALF_VIEW_RAD = np.radians(27.5)
+"""Half of the viewer's field of view."""
 
 LINE = rr.Radius.ui_points(1.5)
 
@@ -129,13 +135,12 @@ def first_eye(shown: Shown) -> NDArray[np.float64] | None:
     edges = np.zeros((1, 3)) if shown.sonar is None else np.concatenate(wedge_lines(shown.sonar))
     seen = [vehicle_rotation(pose).apply(edges) + pose[:3] for pose in poses[[0, len(poses) // 2, -1]]]
     points = np.concatenate([poses[:, :3], *seen])
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = float(np.linalg.norm(high - low))
-    if size == 0:
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    if radius == 0:
         return None
-    turn = float(poses[len(poses) // 2, 5])
-    away = Rotation.from_rotvec([0, 0, -turn]).apply(BEHIND)
-    return np.stack([(low + high) / 2 + size * away, (low + high) / 2])
+    away = Rotation.from_rotvec([0, 0, -float(poses[len(poses) // 2, 5])]).apply(BEHIND / np.linalg.norm(BEHIND))
+    return np.stack([centre + radius / np.sin(HALF_VIEW_RAD) * away, centre])
 
 
 def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
@@ -159,12 +164,25 @@ def _direction(sonar: Sonar, b: NDArray[np.float64], e: NDArray[np.float64]) -> 
     return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], -1)
 
 
+def lit_corners(shape: Triangles) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return three corners of each face ``(3 faces, 3)`` [m] and the unit normal of the face at each of them.
+
+    Without normals the viewer draws all faces in one colour, so that no relief shows. A face without area has none: zero.
+    """
+    corners = shape.vertices[shape.faces.astype(np.intp)]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    return corners.reshape(-1, 3), np.repeat(unit, 3, axis=0)
+
+
 def _log_still(recording: rr.RecordingStream, shown: Shown) -> None:
     """Log what does not move: scene, wedge in the sonar's axes, paths."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for number, one in enumerate(shown.shapes):
-        colour = GREY if one.whole else BOXED
-        mesh = rr.Mesh3D(vertex_positions=one.vertices, triangle_indices=one.faces, albedo_factor=colour)
+        colour = WHOLE[number % len(WHOLE)] if one.whole else BOXED
+        corners, normals = lit_corners(one)
+        mesh = rr.Mesh3D(vertex_positions=corners, vertex_normals=normals, albedo_factor=colour)
         recording.log(["world", "scene", f"{number:03d} {one.name}"], mesh, static=True)
     if shown.sonar is not None:
         wedge = rr.LineStrips3D(wedge_lines(shown.sonar), colors=BEAMS, radii=LINE)

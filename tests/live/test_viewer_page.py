@@ -18,7 +18,7 @@ pytest.importorskip("websockets")
 from browser import CHROMIUM, Page, opened, served
 
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.live.rerun_recording import BEAMS, ESTIMATED, TRUE
+from mitsonar.live.rerun_recording import BEAMS, ESTIMATED, TRUE, WHOLE
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -46,12 +46,11 @@ def fan_of(picture: Picture) -> Picture:
 def shown_in(picture: Picture) -> dict[str, int]:
     """Pixels of each thing to show: lines in the left half, the fan in the upper part of the right half."""
     world, fan = picture[:, : picture.shape[1] // 2], fan_of(picture)
-    shaded = world[(np.ptp(world, axis=-1) <= 8) & (np.abs(world.mean(axis=-1) - 145) < 40)]
     return {
         "true": int(near(world, TRUE).sum()),
         "estimated": int(near(world, ESTIMATED).sum()),
         "beams": int(near(world, BEAMS).sum()),
-        "scene": len(shaded),
+        "scene": int(near(world, WHOLE[0]).sum()),
         "near": int(near(fan, (NEAR,) * 3, 4).sum()),
         "far": int(near(fan, (FAR,) * 3, 4).sum()),
     }
@@ -96,7 +95,7 @@ REFUSED = """new Promise(answer => {
 
 
 @pytest.mark.e2e
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium, chromium-browser or google-chrome")
 def test_a_browser_shows_fan_scene_and_paths_and_asks_nobody_else(folder: Path, tmp_path: Path) -> None:
     with served(folder) as address, opened(address + "?theme=dark", tmp_path / "profile", WIDTH, HEIGHT) as page:
