@@ -113,8 +113,8 @@ def _blueprint(shown: Shown) -> rrb.Blueprint:
     has_world = bool(shown.shapes or shown.estimated or shown.path is not None or shown.source.poses is not None)
     below = rrb.Horizontal(
         rrb.Spatial2DView(origin="polar", name="polar"),
-        rrb.TimeSeriesView(origin="levels", name="levels, part of full scale"),
-        rrb.BarChartView(origin="levels_by_range", name="mean level by range"),
+        rrb.TimeSeriesView(origin="levels", name="levels", axis_y=rrb.ScalarAxis(range=(0, 1.02))),
+        rrb.BarChartView(origin="levels_by_range", name="mean by range"),
     )
     images = rrb.Vertical(rrb.Spatial2DView(origin="fan", name="fan"), below, row_shares=[2, 1])
     return rrb.Blueprint(rrb.Horizontal(*(world if has_world else []), images), collapse_panels=True)
