@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -20,12 +21,21 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 from mitsonar.simulation.scene_triangles import Triangles
 
-__all__ = ["Shown", "wedge_lines", "write_recording"]
+__all__ = ["Shown", "first_eye", "lit_corners", "wedge_lines", "write_recording"]
 
 AT_ONCE = 16
 """Frames that are read at once."""
 
-GREY, BOXED, TRUE, ESTIMATED, BEAMS = (150, 150, 145), (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
+BOXED, TRUE, ESTIMATED, BEAMS = (110, 110, 140), (90, 200, 90), (240, 140, 40), (80, 170, 250)
+WHOLE = ((168, 158, 132), (128, 132, 138), (160, 118, 92))
+"""Colours of the shapes in turn: one colour for all hides a wreck on its seabed."""
+
+BEHIND = np.array([0.54, -0.64, 0.54])
+"""Direction of the eye at first, to starboard, forward and up of a sonar that is level."""
+
+HALF_VIEW_RAD = np.radians(27.5)
+"""Half of the viewer's field of view."""
+
 LINE = rr.Radius.ui_points(1.5)
 
 
@@ -95,17 +105,42 @@ def write_recording(shown: Shown, path: Path | None, progress: Callable[[int], N
 
 def _blueprint(shown: Shown) -> rrb.Blueprint:
     """Arrange the views: the world beside fan, polar image and levels, of what there is."""
-    world = [rrb.Spatial3DView(origin="world", name="world")]
+    places = first_eye(shown)
+    eye = None if places is None else rrb.EyeControls3D(position=places[0], look_target=places[1], eye_up=(0, 0, 1))
+    world = [rrb.Spatial3DView(origin="world", name="world", eye_controls=eye)]
     if shown.source is None:
         return rrb.Blueprint(*world, collapse_panels=True)
     has_world = bool(shown.shapes or shown.estimated or shown.path is not None or shown.source.poses is not None)
     below = rrb.Horizontal(
         rrb.Spatial2DView(origin="polar", name="polar"),
-        rrb.TimeSeriesView(origin="levels", name="levels, part of full scale"),
-        rrb.BarChartView(origin="levels_by_range", name="mean level by range"),
+        rrb.TimeSeriesView(origin="levels", name="levels", axis_y=rrb.ScalarAxis(range=(0, 1.02))),
+        rrb.BarChartView(origin="levels_by_range", name="mean by range"),
     )
     images = rrb.Vertical(rrb.Spatial2DView(origin="fan", name="fan"), below, row_shares=[2, 1])
     return rrb.Blueprint(rrb.Horizontal(*(world if has_world else []), images), collapse_panels=True)
+
+
+def first_eye(shown: Shown) -> NDArray[np.float64] | None:
+    """Return where the eye is at first and at what it looks ``(2, 3)`` [m]; None: there is no pose to look at.
+
+    It sees path and beams from behind and above: the scene may be many times as large.
+    """
+    known = [] if shown.path is None else [shown.path.poses]
+    if shown.source is not None and shown.source.poses is not None:
+        known.append(shown.source.poses)
+    poses = np.concatenate([*known, *(one.poses for one in shown.estimated.values()), np.empty((0, 6))])
+    poses = poses[np.isfinite(poses).all(axis=1)]  # a recording may lack depth or attitude
+    if not len(poses):
+        return None
+    edges = np.zeros((1, 3)) if shown.sonar is None else np.concatenate(wedge_lines(shown.sonar))
+    seen = [vehicle_rotation(pose).apply(edges) + pose[:3] for pose in poses[[0, len(poses) // 2, -1]]]
+    points = np.concatenate([poses[:, :3], *seen])
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    if radius == 0:
+        return None
+    away = Rotation.from_rotvec([0, 0, -float(poses[len(poses) // 2, 5])]).apply(BEHIND / np.linalg.norm(BEHIND))
+    return np.stack([centre + radius / np.sin(HALF_VIEW_RAD) * away, centre])
 
 
 def wedge_lines(sonar: Sonar, steps: int = 16) -> list[NDArray[np.float64]]:
@@ -129,12 +164,25 @@ def _direction(sonar: Sonar, b: NDArray[np.float64], e: NDArray[np.float64]) -> 
     return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], -1)
 
 
+def lit_corners(shape: Triangles) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return three corners of each face ``(3 faces, 3)`` [m] and the unit normal of the face at each of them.
+
+    Without normals the viewer draws all faces in one colour, so that no relief shows. A face without area has none: zero.
+    """
+    corners = shape.vertices[shape.faces.astype(np.intp)]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    return corners.reshape(-1, 3), np.repeat(unit, 3, axis=0)
+
+
 def _log_still(recording: rr.RecordingStream, shown: Shown) -> None:
     """Log what does not move: scene, wedge in the sonar's axes, paths."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for number, one in enumerate(shown.shapes):
-        colour = GREY if one.whole else BOXED
-        mesh = rr.Mesh3D(vertex_positions=one.vertices, triangle_indices=one.faces, albedo_factor=colour)
+        colour = WHOLE[number % len(WHOLE)] if one.whole else BOXED
+        corners, normals = lit_corners(one)
+        mesh = rr.Mesh3D(vertex_positions=corners, vertex_normals=normals, albedo_factor=colour)
         recording.log(["world", "scene", f"{number:03d} {one.name}"], mesh, static=True)
     if shown.sonar is not None:
         wedge = rr.LineStrips3D(wedge_lines(shown.sonar), colors=BEAMS, radii=LINE)

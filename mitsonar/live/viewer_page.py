@@ -20,6 +20,23 @@ VIEWER = ("index.html", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 
 SERVE = "import sys, time, rerun; rerun.serve_web_viewer(web_port=int(sys.argv[1]), open_browser=False); time.sleep(600)"
 
+ONLY_HERE = """    <meta
+      http-equiv="Content-Security-Policy"
+      content="default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
+    />
+    <script>
+      const load = window.fetch;
+      window.fetch = (what, ...how) =>
+        new URL(what.url ?? what, window.location).origin === window.location.origin
+          ? load(what, ...how)
+          : Promise.resolve(new Response("this page loads nothing from elsewhere", { status: 403 }));
+    </script>
+"""
+"""Keeps the viewer from other hosts: it asks one for its newest version and reports its use to another.
+
+The browser holds the policy. The answer 403 keeps the refusals out of the console.
+"""
+
 OPEN = f"""    <script>
       const asked = new URL(window.location);
       if (!asked.searchParams.has("url")) {{
@@ -36,6 +53,7 @@ LONGEST_S = 60.0
 def write_page(folder: Path) -> None:
     """Write the web viewer of the installed rerun-sdk beside ``recording.rrd`` into a folder, and make it open that.
 
+    The page reaches no other host: neither the fonts nor the viewer's search for updates and its reports of use.
     The viewer is inside the package and is read from its own server on this machine. A page cannot read files of a disk:
     it needs a web server, such as ``python -m http.server``.
 
@@ -53,11 +71,11 @@ def write_page(folder: Path) -> None:
     finally:
         process.kill()
         process.wait()
-    page, script = files["index.html"].decode(), '<script src="re_viewer.js"></script>'
-    if page.count(script) != 1 or not files["re_viewer_bg.wasm"].startswith(b"\0asm"):
+    page, head, script = files["index.html"].decode(), "<head>\n", '<script src="re_viewer.js"></script>'
+    if page.count(head) != 1 or page.count(script) != 1 or not files["re_viewer_bg.wasm"].startswith(b"\0asm"):
         raise MitsonarError("the web viewer of this rerun-sdk has another form than known: use --save, and `rerun FILE.rrd`")
     lines = [line for line in page.splitlines(keepends=True) if "fonts.g" not in line]
-    page = _without_fonts("".join(lines))
+    page = _without_fonts("".join(lines)).replace(head, head + ONLY_HERE)
     files["index.html"] = page.replace(script, f"{OPEN.strip()}\n    {script}").encode()
     for name, content in files.items():
         write_whole(folder / name, content)

@@ -15,12 +15,12 @@ from PIL import Image
 pytest.importorskip("rerun")
 
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.live.rerun_recording import wedge_lines
+from mitsonar.live.rerun_recording import Shown, first_eye, lit_corners, wedge_lines
 from mitsonar.live.sonar_messages import FanEncoder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.simulation.scene_triangles import triangles_in
+from mitsonar.simulation.scene_triangles import Triangles, triangles_in
 
 FRAMES = 20
 SONAR = Sonar(beams=12, range_bins=30)
@@ -112,6 +112,8 @@ def test_a_page_loads_nothing_from_elsewhere(mitsonar: Command, tmp_path: Path, 
     reader.feed(text)
     assert "re_viewer.js" in reader.loaded
     assert not [address for address in reader.loaded if "//" in address]
+    assert text.index("Content-Security-Policy") < min(text.index("<script"), text.index("<link"))
+    assert text.index("window.fetch =") < text.index('src="re_viewer.js"')
     assert text.index('new URL("recording.rrd"') < text.index('src="re_viewer.js"')
     refused(mitsonar("view", tmp_path / "frames.npz", "--html", page), "--html", "--overwrite")
 
@@ -127,6 +129,35 @@ def test_the_wedge_is_the_edge_of_what_the_beams_see(bearing: str) -> None:
     assert np.linalg.norm(points - corner, axis=1).min() < 1e-9
     starboard, _, _ = axes(Pose(0, 0, 0))
     assert np.allclose(starboard, [1, 0, 0])  # the axes of the wedge
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.9])
+def test_the_eye_sees_path_and_beams_at_first_however_large_the_scene(heading: float) -> None:
+    starboard, forward, _ = axes(Pose(0, 0, 0, heading=heading))
+    poses = np.array([[*(5 + 0.1 * k * forward), 0.4, 0, heading] for k in range(30)])
+    flown = Trajectory(poses, np.arange(30.0))
+    edges = np.array([[-1e3, -1e3, 0], [1e3, 0, 0], [0, 1e3, 0]], np.float32)
+    sand = Triangles("sand", edges, np.array([[0, 1, 2]], np.uint32), True)
+    eye = first_eye(Shown("a", sonar=SONAR, path=flown, shapes=[sand]))
+    assert eye is not None
+    place, target = eye
+    assert place[2] > poses[:, 2].max()
+    assert (place - target) @ forward < 0 < (place - target) @ starboard  # behind, to starboard
+    ahead = (target - place) / np.linalg.norm(target - place)
+    first, last = axes(Pose(0, 0, 0, pitch=0.4, heading=heading)), np.concatenate(wedge_lines(SONAR))
+    seen = np.concatenate([poses[:, :3], *(last @ np.array(first) + pose[:3] for pose in poses)]) - place
+    angle = np.degrees(np.arccos(seen @ ahead / np.linalg.norm(seen, axis=1)))
+    assert 15 < angle.max() < 27.5  # half of the 55 deg of the viewer
+    assert first_eye(Shown("b", path=Trajectory(poses[:1], np.zeros(1)))) is None
+    assert first_eye(Shown("c", shapes=[sand])) is None
+
+
+def test_faces_are_lit_by_their_own_normals() -> None:
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 4]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 3, 1], [0, 1, 1]], np.uint32)  # up, forward, no area
+    corners, normals = lit_corners(Triangles("a", vertices, faces, True))
+    np.testing.assert_array_equal(corners, vertices[faces.ravel()])
+    np.testing.assert_array_equal(normals, np.repeat([[0, 0, 1], [0, 1, 0], [0, 0, 0]], 3, axis=0))
 
 
 def test_shapes_become_triangles_that_fill_their_boxes(variant: str) -> None:
