@@ -122,7 +122,7 @@ class Recipe(RecipePart):
             return
         if self.world or self.channel is not None or self.receivers or self.segments or self.store != "images":
             raise MitsonarError(
-                "recorded frames are images of one sonar: leave world, channel, receivers, segments, store out"
+                "recorded frames are images of one sonar: leave out world, channel, receivers, segments and store"
             )
         if len(self.scenes) != len(self.recorded.sources) or any(group.count != 1 for group in self.scenes):
             raise MitsonarError("each source of recorded frames is one scene")

@@ -54,14 +54,18 @@ class Axes:
     bearing_rad: Array | None
     level: str
 
+    @property
+    def bearings(self) -> Array:
+        """Return the axes of the beams ``(beams,)`` [rad]."""
+        return self.sonar.bearing_rad if self.bearing_rad is None else self.bearing_rad
+
     def other(self, than: Axes) -> list[str]:
         """List what differs from another sonar, with both values: ``range_bins 128, not 256``."""
         mine, its = ({**one.sonar.model_dump(), "level": one.level} for one in (self, than))
         keys = [key for key in mine if key not in (*OTHER, *AXES) and not _same(mine[key], its[key])]
         if self.sonar.range_bins == than.sonar.range_bins and not _near(self.sonar.range_m, than.sonar.range_m, TENTH):
             keys += ["range_min", "range_max"]
-        beams = [one.sonar.bearing_rad if one.bearing_rad is None else one.bearing_rad for one in (self, than)]
-        if len(beams[0]) == len(beams[1]) and not _near(*beams, TENTH):
+        if self.sonar.beams == than.sonar.beams and not _near(self.bearings, than.bearings, TENTH):
             keys += ["azimuth_fov_deg", "bearings"]
         mine, its = ({**table, "bearings": "of other beams"} for table in (mine, its))
         return [f"{key} {shown(mine[key])}, not {shown(its[key])}" for key in keys]
@@ -209,7 +213,8 @@ def _stretches_of(part: Part, name: str, path: Trajectory | None, height_m: floa
             "by `mitsonar odometry`"
         )
     else:
-        poses, known = np.asarray(part.poses, dtype=float), np.isfinite(part.poses).all(axis=1)
+        poses = np.asarray(part.poses, dtype=float)
+        known = np.asarray(np.isfinite(poses).all(axis=1))
     height = np.full(len(time), np.nan) if part.height_m is None else np.array(part.height_m, dtype=float)
     height = np.where(np.isfinite(height) | (height_m is None), height, np.nan if height_m is None else height_m)
     found = []
