@@ -325,10 +325,9 @@ def test_hostile_recipes_are_refused(places: dict[str, Path], tmp_path: Path, ch
 @pytest.mark.learn
 def test_rendered_runs_are_compared_and_fine_tuned_on(mitsonar: Command, variant: str, tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    for name, end in (("one", "0.07,0.09,2.5,35,0,2"), ("two", "-0.08,0.05,2.5,35,0,-1")):
-        path = ("--from", "0,0,2.5,35,0,0", "--to", end, "--frames", 8)
-        kind = ("--quality", "draft", "--model", "physical")
-        done = mitsonar("render", "pattern", *path, *kind, "-o", tmp_path / name)
+    for name, end in (("one", "-0.43,-4.76,2.5,35,0,2"), ("two", "-0.58,-4.8,2.5,35,0,-1")):
+        path = ("--from", "-0.5,-4.85,2.5,35,0,0", "--to", end, "--frames", 8)
+        done = mitsonar("render", "pattern", *path, "--model", "physical", "-o", tmp_path / name)
         assert done.returncode == 0, done
     out = tmp_path / "both.zarr"
     done = mitsonar("dataset", "from-frames", tmp_path / "one", tmp_path / "two", "-o", out)
