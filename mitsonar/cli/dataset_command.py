@@ -12,6 +12,8 @@ import typer
 
 from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
 from mitsonar.cli.frames_command import Least, Out, Picture, Polygons, To, Without, exported
+from mitsonar.cli.odometry_command import Geometry
+from mitsonar.cli.render_command import Frame
 from mitsonar.errors import MitsonarError
 
 __all__ = ["datasets"]
@@ -24,6 +26,7 @@ def datasets() -> typer.Typer:
     app = typer.Typer(help="Make, show and check labelled data sets.", no_args_is_help=True)
     for command in (make, info, show, check, recipes, export):
         app.command()(command)
+    app.command("from-frames")(from_frames)
     return app
 
 
@@ -197,3 +200,46 @@ def export(
     if not is_data_set(data):
         raise MitsonarError(f"no data set at {data}: {command_line('frames', 'export')} exports runs and recordings")
     exported(data, to, out, picture, without or [], least, polygons, view)
+
+
+@answered
+def from_frames(
+    files: Annotated[
+        list[str],
+        typer.Argument(metavar="RUN|FILE...", help="Folders of runs, frames.npz, frames.zarr or recordings, of one sonar."),
+    ],
+    out: Annotated[str, typer.Option("-o", "--out", help="Folder of the data set, whole or absent.")],
+    poses: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--poses",
+            help="TUM or CSV file of the sonar's path: one for all, or one a file (default: the frames' own poses).",
+        ),
+    ] = None,
+    frame: Frame = "mitsonar",
+    height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
+    cut: Annotated[
+        int | None, typer.Option(min=2, help="Cut each file into sequences of so many frames, so that one can be split.")
+    ] = None,
+    geometry: Geometry = None,
+) -> None:
+    """Make a data set of frames with known poses, of runs and of recordings: to compare, to evaluate, to train on."""
+    from mitsonar.exports.recorded_data_set import write_recorded
+    from mitsonar.exports.recorded_frames import frames_with_poses
+
+    paths: list[Path | None] = [*(poses or [None])]
+    if len(paths) not in (1, len(files)):
+        raise MitsonarError(f"--poses must be given once, or once for each of {len(files)} files: got {len(paths)}")
+    if height is not None and not 0 < height < float("inf"):
+        raise MitsonarError(f"--height must be above 0 m: got {height:g}")
+    words = {"frame": frame, "height_m": height, "cut": cut, "geometry": geometry}
+    each = zip(files, paths if len(paths) > 1 else paths * len(files), strict=True)
+    sources = [frames_with_poses(file, path=path, **words) for file, path in each]  # type: ignore[arg-type]
+    bar = LaterBar("copying", "frames")
+    with bar:
+        made = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
+    for sentence in made.notes:
+        warn(sentence)
+    say(f"{made.frames:,} frames in {made.sequences:,} sequences in {made.path}")
+    part = ["--part", "all"] if made.sequences == 1 else []
+    say(f"compare estimators on it: {command_line('compare', made.path, *part)}")

@@ -7,20 +7,20 @@ import math
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Literal, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
 
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
+from mitsonar.config.recipe_parts import Flight, Mount, ReceiverSpec, RecipePart, Recorded, Scenes, Split
 from mitsonar.errors import MitsonarError, complaint, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
 from mitsonar.io.provenance import digest
-from mitsonar.motion.pose import Pose
 from mitsonar.worlds.families import create_family
-from mitsonar.worlds.world import Family, Interval
+from mitsonar.worlds.world import Family
 
 __all__ = [
     "Flight",
@@ -34,121 +34,10 @@ __all__ = [
     "split_from",
 ]
 
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+_Made = TypeVar("_Made", bound=RecipePart)
 
 
-_Made = TypeVar("_Made", bound=_Part)
-
-
-class Scenes(_Part):
-    """A group of scenes of one kind; each has its own seed."""
-
-    count: int = Field(1, ge=1, le=100_000, description="how many scenes")
-    sequences: int = Field(ge=1, le=10**7, description="sequences in each")
-    world: Keys = Field(default_factory=dict, description="numbers of the world that differ in these scenes")
-
-
-class Mount(_Part):
-    """Pose of the sonar in the vehicle's axes (starboard, forward, up); the vehicle itself is level."""
-
-    starboard_m: float = Field(0.0, allow_inf_nan=False)
-    forward_m: float = Field(0.0, allow_inf_nan=False)
-    up_m: float = Field(0.0, allow_inf_nan=False)
-    pitch_deg: float = Field(0.0, ge=-90, le=90, description="> 0 looks down")
-    roll_deg: float = Field(0.0, ge=-180, le=180, description="> 0 puts starboard down")
-    heading_deg: float = Field(0.0, ge=-360, le=360, description="> 0 looks to starboard")
-
-    @property
-    def pose(self) -> Pose:
-        """Return the pose in metres and radians."""
-        return Pose(
-            self.starboard_m,
-            self.forward_m,
-            self.up_m,
-            *(math.radians(angle) for angle in (self.pitch_deg, self.roll_deg, self.heading_deg)),
-        )
-
-
-RESERVED = ("frames", "label")
-"""Names that samples use beside those of their views."""
-
-
-def _fits_name(name: str) -> str:
-    if not name.isidentifier():
-        raise ValueError(f"a name is letters, digits and _ : got {shortened(name)}")
-    if name in RESERVED or name.startswith("nonzero"):
-        raise ValueError(f"{name} means something else in a data set: choose another name")
-    return name
-
-
-class ReceiverSpec(Mount):
-    """A receiver beside the transmitter: its pose in the transmitter's axes, and keys of its sonar that differ."""
-
-    name: Annotated[str, AfterValidator(_fits_name)]
-    sonar: Keys = Field(default_factory=dict, description="keys of the receiver's sonar that differ")
-
-
-def _from_0(pair: tuple[float, float]) -> tuple[float, float]:
-    if pair[0] < 0:
-        raise ValueError(f"a jump goes either way, give its size low,high with 0 <= low: got {pair[0]:g},{pair[1]:g}")
-    return pair
-
-
-_NotBelow0 = Annotated[Interval, AfterValidator(_from_0)]
-_Angle = Annotated[float, Field(gt=0, le=180)]
-
-
-class Flight(_Part):
-    """Motion of the vehicle: sequences of pings at a constant rate with jumps between them, or named runs."""
-
-    kind: Literal["random", "runs"] = Field("random", description="random sequences, or the runs of chapters 2 and 4")
-    height_m: Interval | float = Field(2.5, description="over z = 0 [m]; low,high: drawn for each sequence")
-    pings: int = Field(5, ge=1, le=10**6, description="pings of a sequence")
-    sideways_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion to either side between pings [mm]")
-    forward_mm: float = Field(20.0, ge=0, le=1e6, description="largest motion ahead or back between pings [mm]")
-    yaw_deg: float = Field(0.45, ge=0, le=180, description="largest turn between pings [deg]")
-    jump_m: _NotBelow0 | None = Field((3.0, 4.0), description="jump between sequences, in x and in y [m]; null: anywhere")
-    footprint_fov_deg: tuple[_Angle, _Angle] | None = Field(
-        None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
-    )
-    runs: list[Literal["legs", "diagonal", "turn", "sideways_50", "sideways_54"]] = Field(
-        default=["legs", "diagonal", "turn"], min_length=1, description="runs of each scene"
-    )
-
-    @property
-    def heights(self) -> tuple[float, float]:
-        """Return lowest and highest height [m]."""
-        return (self.height_m, self.height_m) if isinstance(self.height_m, float | int) else self.height_m
-
-
-class Split(_Part):
-    """Division of the frames into training, validation and test, unless a reader asks for another."""
-
-    by: Literal["sequence", "scene", "sample"] = Field(
-        "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks: to show it only"
-    )
-    train: float = Field(0.95, ge=0, le=1)
-    validation: float = Field(0.05, ge=0, le=1)
-    test: float = Field(0.0, ge=0, le=1)
-    seed: int = Field(0, ge=0, lt=2**31, description="of the draw; readers of one data set must agree on it")
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        if abs(self.train + self.validation + self.test - 1) > 1e-9:
-            raise ValueError(
-                f"train, validation and test must add up to 1: got {self.train + self.validation + self.test:g}"
-            )
-        return self
-
-    @property
-    def unseen(self) -> str:
-        """Return the part for evaluation: test where there is one, else validation."""
-        return "test" if self.test > 0 else "validation"
-
-
-class Recipe(_Part):
+class Recipe(RecipePart):
     """A data set. Angles are in degrees and motions in millimetres; all other values are SI.
 
     The keys are documented in docs/guides/data-sets.md.
@@ -160,7 +49,7 @@ class Recipe(_Part):
     name: str = Field("custom", description="what the data set is called")
     about: str = Field("", description="a sentence on it")
     seed: int = Field(0, ge=0, lt=2**31, description="of worlds, flights and jitter")
-    world: Keys = Field(description="family of the world, and numbers of it")
+    world: Keys = Field(default_factory=dict, description="family of the world, and numbers of it; of recorded frames none")
     scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
     sonar: Keys | None = Field(None, description="preset and keys of docs/guides/sonars.md")
     channel: Keys | None = Field(None, description="for responses: keys of docs/guides/impulse-responses.md")
@@ -180,6 +69,12 @@ class Recipe(_Part):
         default_factory=list, description="per-pixel truth to store"
     )
     split: Split = Field(default_factory=Split, description="which frames are for what")
+    recorded: Recorded | None = Field(None, description="where frames come from that no scene was rendered for")
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
+        """Leave ``recorded`` out where frames are rendered: stores and checkpoints keep the digests of their recipes."""
+        return {key: value for key, value in handler(self).items() if key != "recorded" or value is not None}
 
     @model_validator(mode="before")
     @classmethod
@@ -196,7 +91,8 @@ class Recipe(_Part):
             raise ValueError(f"a data set is of a sonar (images) or a channel (impulse responses), one of them: got {got}")
         try:
             self._check_images() if self.channel is None else self._check_responses()
-            families = [self.family(group) for group in range(len(self.scenes))]
+            self._check_recorded()
+            families = [self.family(group) for group in range(len(self.scenes))] if self.recorded is None else []
         except MitsonarError as error:
             raise ValueError(str(error)) from None
         low, high = self.flight.heights
@@ -211,6 +107,27 @@ class Recipe(_Part):
         if not all(family.half_m > 0 for family in families):
             raise ValueError("a scene must have a size")
         return self
+
+    def _check_recorded(self) -> None:
+        """Check the keys of recorded frames.
+
+        Raises:
+            MitsonarError: they contradict each other.
+        """
+        if (self.recorded is None) != (self.flight.kind != "recorded"):
+            raise MitsonarError(
+                "recorded and flight.kind recorded belong together: `mitsonar dataset from-frames` writes them"
+            )
+        if self.recorded is None:
+            return
+        if self.world or self.channel is not None or self.receivers or self.segments or self.store != "images":
+            raise MitsonarError(
+                "recorded frames are images of one sonar: leave out world, channel, receivers, segments and store"
+            )
+        if len(self.scenes) != len(self.recorded.sources) or any(group.count != 1 for group in self.scenes):
+            raise MitsonarError("each source of recorded frames is one scene")
+        if self.recorded.bearings is not None and len(self.recorded.bearings) != self.instrument.beams:
+            raise MitsonarError(f"recorded.bearings has {len(self.recorded.bearings):,} of {self.instrument.beams:,} beams")
 
     def _check_images(self) -> None:
         """Check the keys of images.
@@ -291,7 +208,7 @@ class Recipe(_Part):
         for spec in self.receivers:
             own = {**(self.sonar or {}), "beams": sonar.beams, "jitter": None, **spec.sonar}
             made.append(Receiver(sonar, sonar_from({k: v for k, v in own.items() if v is not None}), spec.pose, spec.name))
-        return made or [Whole(sonar)]
+        return made or [Whole(sonar, None if self.recorded is None else self.recorded.bearing_rad)]
 
     def digest(self, *more: object) -> str:
         """Return a digest of all values that are not defaults, and of more values: 16 hexadecimal digits.
@@ -314,12 +231,21 @@ class Recipe(_Part):
         """Return the family of a group of scenes.
 
         Raises:
-            MitsonarError: the family is missing or unknown, or a number is outside its limits.
+            MitsonarError: the family is missing or unknown, or a number is outside its limits; frames were recorded.
         """
+        if self.recorded is not None:
+            raise MitsonarError(
+                f"the data set {self.name} holds recorded frames and no worlds, so nothing can be rendered: give one that "
+                "`mitsonar dataset make` made"
+            )
         fields = {**self.world, **self.scenes[group].world}
         if "family" not in fields:
             raise MitsonarError("world lacks family: give rocky-field, ship-hull, pattern, flat-objects or scene")
         return create_family(str(fields.pop("family")), **fields)
+
+    def level_of(self, view: View) -> str:
+        """Return how pixels of a view stand for levels: that of recorded frames, or of its sonar."""
+        return view.sonar.value_coding if self.recorded is None else self.recorded.level
 
     @property
     def sequences(self) -> int:

@@ -76,6 +76,8 @@ def _files(store: DataStore, progress: Callable[[int], None]) -> list[str]:
 
 def _plan(store: DataStore) -> list[str]:
     """Check the planned arrays against a plan that is made anew from recipe and seed."""
+    if store.recipe.recorded is not None:  # its poses were given
+        return []
     plan = Plan.of(store.recipe, int(store.about["sequences"]))
     return [f"{name} is not what recipe and seed give" for name in store.unplanned(plan)]
 

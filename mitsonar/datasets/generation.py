@@ -77,6 +77,8 @@ def make_dataset(
     Raises:
         MitsonarError: the store is another data set, another process writes it, or it was begun with other versions.
     """
+    if recipe.recorded is not None:
+        raise MitsonarError(f"the recipe {recipe.name} is of recorded frames: `mitsonar dataset from-frames` copies them")
     storage = Storage(url)
     _refuse_other_files(storage)
     with storage.locked() as still_ours:

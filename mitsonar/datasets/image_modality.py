@@ -81,7 +81,11 @@ class ImageModality:
     def attributes(self) -> Fields:
         """Return the sonar, and that of each view."""
         views = {view.name: view.sonar.model_dump() for view in self.recipe.views}
-        return {"sonar": self.sonar.model_dump(), "views": views, "level": "linear"}
+        return {
+            "sonar": self.sonar.model_dump(),
+            "views": views,
+            "level": "linear" if self.recipe.recorded is None else self.recipe.recorded.level,
+        }
 
     @property
     def ping_bytes(self) -> int:

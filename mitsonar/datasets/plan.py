@@ -152,9 +152,11 @@ def sequences_of(recipe: Recipe, scene: Scene) -> Iterator[Sequence]:
     """Yield the sequences of a scene, one after the other; random flights have no end.
 
     Raises:
-        MitsonarError: the footprint does not fit the scene.
+        MitsonarError: the footprint does not fit the scene, or frames were recorded.
     """
     flight = recipe.flight
+    if flight.kind == "recorded":
+        recipe.family(scene.group)  # refuses
     if flight.kind == "runs":
         for name in flight.runs:
             yield Sequence(run_poses(name, flight.heights[0]))

@@ -133,7 +133,7 @@ class Samples(Batches):
             poses=poses,
             height_m=height_m,
             time_s=time_s,
-            level=view.sonar.value_coding,
+            level=self.recipe.level_of(view),
             level_scale=level_scale,
         )
 

@@ -166,9 +166,11 @@ def _bench(data: str, asked: Asked) -> Bench:
         )
     if not modality.variations and (asked.perturb or asked.jitter or asked.prior):
         raise MitsonarError("--perturb, --jitter and --prior are for data sets of images: leave them out")
+    if recipe.recorded is not None and (asked.perturb or asked.jitter):
+        raise MitsonarError("--perturb and --jitter render anew, and recorded frames have no world: leave them out")
     words = list(dict.fromkeys(asked.noise.split(";" if ";" in asked.noise else ",")))
     levels = {word: modality.noise_model(word) for word in words}
-    options = {"part": asked.part or recipe.split.unseen, "one_a_sequence": True, "seed": asked.seed}
+    options = {"part": asked.part or recipe.split.unseen, "one_a_sequence": recipe.recorded is None, "seed": asked.seed}
     samples = {level: samples_of(modality, data, noise=level, **options) for level in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
@@ -211,9 +213,9 @@ def _key(level: str, model: NoiseModel | None) -> str:
 
 
 def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Begin) -> dict[str, Array]:
-    """Return the bound by model of the noise, over some pairs; empty if not asked for, and for responses."""
+    """Return the bound by model of the noise, over some pairs; empty if not asked for, for responses and recorded frames."""
     model, samples = bench.levels[level], bench.samples[level]
-    if not limit or model is None or isinstance(samples, ImpulseSamples):
+    if not limit or model is None or isinstance(samples, ImpulseSamples) or samples.recipe.recorded is not None:
         return {}
     found = kept.load_bounds(_key(level, model), limit)
     if found is None:

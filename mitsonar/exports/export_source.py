@@ -148,7 +148,7 @@ def _of_data_set(url: str, view: str | None) -> ExportSource:
             sonar=one.sonar,
             poses=store.read("pose", part),
             height_m=store.read("height_m", part),
-            level=one.sonar.value_coding,
+            level=store.recipe.level_of(one),
             level_scale=scale,
             **told,
         )

@@ -61,13 +61,13 @@ class View(Protocol):
 
 
 class Whole:
-    """The whole field of view, in the sonar's own beams."""
+    """The whole field of view, in the sonar's own beams, or at measured bearings ``(beams,)`` [rad]."""
 
     name = "image"
 
-    def __init__(self, sonar: Sonar) -> None:
+    def __init__(self, sonar: Sonar, bearing_rad: NDArray[np.float64] | None = None) -> None:
         self.sonar = sonar
-        self.bearing_rad = sonar.bearing_rad
+        self.bearing_rad = sonar.bearing_rad if bearing_rad is None else bearing_rad
         self.rays_a_beam: NDArray[np.int64] | None = np.full(sonar.beams, sonar.rays // sonar.beams)
 
 

@@ -159,7 +159,7 @@ def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSourc
         bearing_rad=views[name].bearing_rad,
         time_s=np.zeros(0),
         sonar=views[name].sonar,
-        level=views[name].sonar.value_coding,
+        level=store.recipe.level_of(views[name]),
         level_scale=float(store.about["level_scale"]),
     )
     return FrameSource.of_arrays(

@@ -201,14 +201,15 @@ def samples_for(
     noise: str = "none",
     seed: int = 0,
 ) -> SonarPairs | ImpulsePairs:
-    """Return one sample of each sequence of a data set, arranged for a network.
+    """Return one sample of each sequence of a data set, of recorded frames all, arranged for a network.
 
     Raises:
         MitsonarError: the data set lacks an input of the network, or has no samples in that part.
     """
-    words = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": True}
+    recipe = DataStore.open(data).recipe
+    words = {"noise": noise, "labels": checkpoint.labels["kind"], "seed": seed, "one_a_sequence": recipe.recorded is None}
     if part is None:
-        part = split_for(split, DataStore.open(data).recipe).unseen
+        part = split_for(split, recipe).unseen
     if checkpoint.channel is not None:
         return ImpulsePairs(data, part=part, split=split, frames=checkpoint.arrangement["frames"], **words)
     return SonarPairs(data, part=part, split=split, **checkpoint.arrangement, **words)
