@@ -227,7 +227,7 @@ def from_frames(
     from mitsonar.exports.recorded_data_set import write_recorded
     from mitsonar.exports.recorded_frames import frames_with_poses
 
-    paths: list[Path | None] = [*(poses or [None])]
+    paths: list[Path | None] = list(poses) if poses else [None]
     if len(paths) not in (1, len(files)):
         raise MitsonarError(f"--poses must be given once, or once for each of {len(files)} files: got {len(paths)}")
     if height is not None and not 0 < height < float("inf"):

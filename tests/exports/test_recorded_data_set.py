@@ -78,6 +78,7 @@ def test_pixels_axes_and_poses_are_those_of_the_file(places: dict[str, Path], tm
     assert store.recipe.pixel == pixel
     assert np.array_equal(store.read("image"), there.image)
     assert np.array_equal(store.read("pose"), true_poses(there))
+    assert there.height_m is not None
     assert np.array_equal(store.read("height_m"), there.height_m)
     assert np.allclose(store.read("range_m"), there.range_m, atol=1e-9)
     assert np.allclose(store.read("bearing_rad"), there.bearing_rad, atol=1e-9)
