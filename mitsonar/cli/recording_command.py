@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -43,17 +44,34 @@ def info(
     file: File,
     topic: TopicName = None,
     geometry: Geometry = None,
+    handedness: Annotated[
+        bool,
+        typer.Option("--handedness", help="Tell whether pictures are mirrored, by the compass or poses."),
+    ] = False,
+    turn_deg: Annotated[
+        float | None,
+        typer.Option(help="Turn from the first to the last frame [deg], > 0 to starboard, without a compass."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print what a recording holds: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
+    from mitsonar.recordings.handedness import handedness_of
     from mitsonar.recordings.recording_summary import summary_lines, summary_of
 
-    summary = summary_of(_opened(file, topic, geometry))
+    recording = _opened(file, topic, geometry)
+    summary = summary_of(recording)
+    found = None
+    if handedness or turn_deg is not None:
+        found = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
     if as_json:
-        say(json.dumps(summary, indent=2))
+        told = {} if found is None else {"handedness": found._asdict()}
+        say(json.dumps({**summary, **told}, indent=2))
         return
     for line in summary_lines(summary):
         say(line)
+    if found is not None:
+        why = f" ({found.reason})" if found.reason else ""
+        say(f"handedness             {found.verdict}{why}: correlation {found.correlation:.2f} over {found.pairs} pairs")
 
 
 @answered

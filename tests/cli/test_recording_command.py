@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import Maker, write_bag
-from drawn_frames import as_zarr, over_ground, sway
+from drawn_frames import START, as_zarr, over_ground, sway
 from helpers import Command, refused
 from PIL import Image
 
 from mitsonar import SonarFrames
 from mitsonar.mapping.any_recording import recording_at
+from mitsonar.mapping.motion_series import path_of
 from mitsonar.recordings.mcap_writer import write_mcap
 
 
@@ -154,3 +155,15 @@ def test_mistakes_are_one_sentence(
     given = [str(places["npz"]) if word == "FRAMES" else word for word in words]
     refused(mitsonar("recording", *given, cwd=tmp_path), reason)
     assert not list(tmp_path.iterdir())
+
+
+def test_handedness_is_told_on_request(mitsonar: Command, tmp_path: Path) -> None:
+    """A drawn floor under a sonar that turns by 9 deg to starboard agrees, and its mirror image does not."""
+    turning = path_of(np.tile([0.0, 0.0, np.radians(0.6)], (15, 1)), START, np.arange(16) / 10)
+    frames = over_ground(turning)
+    frames.save(tmp_path / "right.npz")
+    replace(frames, image=frames.image[:, :, ::-1].copy()).save(tmp_path / "wrong.npz")
+    for name, verdict in (("right", "agree"), ("wrong", "mirrored")):
+        done = mitsonar("recording", "info", tmp_path / f"{name}.npz", "--handedness")
+        assert done.returncode == 0, done.stderr
+        assert f"handedness             {verdict}: correlation" in done.stdout
