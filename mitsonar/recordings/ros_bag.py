@@ -39,6 +39,7 @@ LATER_S = 86_400.0
 """Largest delay between a message's own time and its reception that counts as one [s]."""
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: str | None = None) -> Recording:
     """Open the recording of a sonar in a ROS bag; pixels are read on demand.
 
@@ -184,6 +185,7 @@ class _Frames:
     layout: PingLayout
     coding: Coding
 
+    @np.errstate(over="ignore", invalid="ignore")
     def __call__(self, index: Index) -> Pixels:
         """Return ``(n, bins, beams)``, uint8 or float32."""
         wanted = self.places[index]

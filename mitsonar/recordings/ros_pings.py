@@ -99,6 +99,7 @@ class PingLayout:
         )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def layout_of(message: Message, kind: str) -> PingLayout:
     """Return the layout of a message.
 
@@ -114,6 +115,7 @@ def layout_of(message: Message, kind: str) -> PingLayout:
     return layout
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: bool = False) -> Samples:
     """Return the samples of a message as they are stored ``(bins, beams)``, column 0 most to port.
 
@@ -229,6 +231,7 @@ def _oculus(message: Message) -> PingLayout:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def picture_of(picture: Message) -> NDArray[np.uint8]:
     """Return the grey values ``(rows, columns)`` of a ``sensor_msgs/Image`` or ``CompressedImage``.
 
