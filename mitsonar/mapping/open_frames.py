@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.mapping.frame_source import FrameSource, Pixels
-from mitsonar.recordings.open_recording import format_of, open_recording
+from mitsonar.recordings.open_recording import format_of, known_formats, open_recording
 from mitsonar.records.columns import check_column, open_group
 from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
 
@@ -57,7 +59,7 @@ def open_frames(
         if not found:
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
         path = found[0]
-    return _of_zarr(path, str(where)) if path.is_dir() else FrameSource.of(SonarFrames.load(path), str(where))
+    return _of_zarr(path, str(where)) if path.is_dir() else _of_npz(path, str(where))
 
 
 def load_frames(
@@ -102,6 +104,21 @@ def _of_recording(path: Path, number: int | None, view: str | None, geometry: st
         chosen = recording.longest if number is None else number
         which = f"part {chosen} of {len(recording.parts):,}{', the longest' if number is None else ''}: {len(part):,} frames"
     return FrameSource.of_part(part, str(path), which)
+
+
+def _of_npz(path: Path, name: str) -> FrameSource:
+    """Take the frames of ``frames.npz``.
+
+    Raises:
+        MitsonarError: nothing there, a file of another kind, or a damaged one.
+    """
+    if not path.exists():
+        raise MitsonarError(f"there are no frames at {path}: {FINDING}")
+    if path.is_file() and os.access(path, os.R_OK) and not is_zipfile(path):
+        empty = path.stat().st_size == 0
+        reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
+        raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")
+    return FrameSource.of(SonarFrames.load(path), name)
 
 
 def _of_zarr(path: Path, name: str) -> FrameSource:

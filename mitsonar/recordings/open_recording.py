@@ -21,7 +21,7 @@ from mitsonar.recordings.recording import Recording
 from mitsonar.recordings.ros_bag import read_ros_bag
 from mitsonar.recordings.uxo import is_uxo, read_uxo
 
-__all__ = ["FORMATS", "Format", "format_of", "open_recording"]
+__all__ = ["FORMATS", "Format", "format_of", "known_formats", "open_recording"]
 
 FIRST_BYTES = 16
 """Bytes by which formats are told from each other."""
@@ -90,6 +90,11 @@ def format_of(path: str | Path) -> Format | None:
     return next((one for one in FORMATS if one.fits(path, first)), None)
 
 
+def known_formats() -> str:
+    """Return all formats in words, for messages."""
+    return ", ".join(one.words for one in FORMATS)
+
+
 def open_recording(path: str | Path, geometry: str | Path | None = None, topic: str | None = None) -> Recording:
     """Open a recording of a real sonar; pixels are read on demand.
 
@@ -105,6 +110,5 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     if found is None:
         if not Path(path).exists():
             raise MitsonarError(f"no such file: {path}")
-        known = ", ".join(one.words for one in FORMATS)
-        raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known}")
+        raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known_formats()}")
     return found.read(Path(path), None if geometry is None else Path(geometry), topic)

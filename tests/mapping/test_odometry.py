@@ -443,14 +443,16 @@ def test_a_data_set_s_sequences_are_runs(tmp_path: Path) -> None:
 def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "wrong.npz").write_bytes(b"no zip")
+    (tmp_path / "empty.aris").touch()
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     as_zarr(numbered(sway(4)), tmp_path / "damaged.zarr")
     (tmp_path / "damaged.zarr" / "zarr.json").write_text("{")
     numbered(sway(4)).save(tmp_path / "frames.npz")
     for name, message in (
         ("empty", "holds no frames.npz"),
-        ("none.npz", "there are no frames"),
-        ("wrong.npz", "cannot read frames"),
+        ("none.aris", r"there are no frames at .*none\.aris: give frames\.npz, .* or a recording"),
+        ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
+        ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),
         ("other.npz", "lacks image"),
         ("damaged.zarr", "cannot read frames"),
     ):
