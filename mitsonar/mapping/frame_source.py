@@ -175,6 +175,11 @@ class FrameSource:
             )
         if height_m is not None and not 0 < height_m < np.inf:
             raise MitsonarError(f"the height must be above 0: got {height_m:g} m")
+        if height_m is not None and height_m > self.like.range_m[-1]:
+            raise MitsonarError(
+                f"{self.name}: the window ends at {self.like.range_m[-1]:g} m, and no ground is seen from a height of "
+                f"{height_m:g} m: give heights in metres, below that"
+            )
         if pitch_rad is not None and not abs(pitch_rad) <= np.pi / 2:
             raise MitsonarError(f"the pitch must lie in -90..90 deg: got {np.degrees(pitch_rad):g} deg")
         heights = self.height_m
