@@ -93,14 +93,14 @@ class FrameSource:
         nothing: dict[str, Any] = dict.fromkeys(LABELS)
         frames = replace(frames, **nothing)
         like, images = frames.select(slice(0)), frames.image.__getitem__
-        source = cls.of_arrays(like, frames.time_s, frames.poses, frames.height_m, images, name)
-        return replace(source, attitude_rad=frames.attitude_rad)
+        known = frames.poses, frames.height_m
+        return cls.of_arrays(like, frames.time_s, *known, images, name, attitude_rad=frames.attitude_rad)
 
     @classmethod
     def of_part(cls, part: Part, name: str, note: str = "") -> Self:
         """Take a part of a recording."""
-        source = cls.of_arrays(part.like, part.time_s, part.poses, part.height_m, part.images, name, note=note)
-        return replace(source, attitude_rad=part.attitude_rad)
+        known, attitude = (part.poses, part.height_m), part.attitude_rad
+        return cls.of_arrays(part.like, part.time_s, *known, part.images, name, attitude_rad=attitude, note=note)
 
     @classmethod
     def of_arrays(
@@ -112,13 +112,14 @@ class FrameSource:
         images: Callable[[Index], Pixels],
         name: str,
         *,
+        attitude_rad: Array | None = None,
         first_number: int = 0,
         note: str = "",
     ) -> Self:
-        """Take frames whose times, poses and heights are in memory, and whose images are read on demand."""
+        """Take frames whose times, poses, attitudes and heights are in memory, and whose images are read on demand."""
         time = np.asarray(time_s, dtype=float)
         time = time.mean(axis=1) if time.ndim == 2 else time
-        return cls(name, like, time, images, poses, None, height_m, first_number=first_number, note=note)
+        return cls(name, like, time, images, poses, attitude_rad, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:
         """Return the same frames with noise: a function of the seed and the number of each frame."""
@@ -304,6 +305,7 @@ class FrameSource:
         digest = hashlib.sha256(self.like.sonar.model_dump_json().encode())
         for values in (self.like.range_m, self.like.bearing_rad, self.time_s, self.poses, self.height_m):
             digest.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
+        digest.update(b"" if self.attitude_rad is None else np.ascontiguousarray(self.attitude_rad, dtype=float).tobytes())
         digest.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
         digest.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
         digest.update(b"" if self.contrast is None else repr(self.contrast).encode())

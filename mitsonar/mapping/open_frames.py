@@ -137,23 +137,23 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
     except Exception as error:
         raise MitsonarError(f"cannot read frames {path}: {' '.join(str(error).split())[:160]}; {FINDING}") from None
     like = SonarFrames.from_arrays(table | none_of | {"image": nothing}, str(path))
-    for known in ("poses", "height_m"):
+    for known in ("poses", "attitude_rad", "height_m"):
         if known in table:
-            check_column(table[known], known, COLUMNS[known], {"frames": done, "six": 6}, str(path))
+            check_column(table[known], known, COLUMNS[known], {"frames": done, "six": 6, "three": 3}, str(path))
     times = table["time_s"]
     if times.ndim == 1:
         check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
     if done < image.shape[0]:
         message = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
         warnings.warn(message, MitsonarWarning, stacklevel=3)
-    poses, height = table.get("poses"), table.get("height_m")
+    poses, attitude, height = table.get("poses"), table.get("attitude_rad"), table.get("height_m")
 
     def images(index: Index) -> Pixels:
         picked = _picked(image, index)
         check_column(picked, "image", COLUMNS["image"], {}, str(path))
         return picked
 
-    return FrameSource.of_arrays(like, table["time_s"], poses, height, images, name)
+    return FrameSource.of_arrays(like, table["time_s"], poses, height, images, name, attitude_rad=attitude)
 
 
 def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:

@@ -362,6 +362,24 @@ def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
     assert FrameSource.of(frames).digest() != digests[0]
 
 
+def test_the_attitude_of_a_long_recording_is_its_own(tmp_path: Path) -> None:
+    """By which its motions are estimated where it has no poses: as of the same frames in memory."""
+    frames = numbered(sway(12))
+    frames.poses, frames.attitude_rad = None, np.column_stack([np.linspace(0.4, 0.6, 12), np.zeros(12), np.full(12, np.nan)])
+    as_zarr(frames, tmp_path / "frames.zarr")
+    source = open_frames(tmp_path)
+    read = source.read([2, 7])
+    assert read.poses is not None
+    np.testing.assert_array_equal(read.poses[:, 3], frames.attitude_rad[[2, 7], 0])
+    assert source.digest() == FrameSource.of(frames).digest()
+    frames.attitude_rad[0, 0] = 0.3
+    assert source.digest() != FrameSource.of(frames).digest()
+    frames.attitude_rad[0, 0] = 99.0
+    as_zarr(frames, tmp_path / "frames.zarr")
+    with pytest.raises(MitsonarError, match=r"attitude_rad must lie in -7\.\.7"):
+        open_frames(tmp_path)
+
+
 def test_a_run_that_goes_on_gives_what_is_there(tmp_path: Path) -> None:
     as_zarr(numbered(sway(12)), tmp_path / "frames.zarr", done=7)
     with pytest.warns(MitsonarWarning, match="7 of 12 frames are there"):
