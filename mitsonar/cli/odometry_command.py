@@ -27,9 +27,6 @@ Geometry = Annotated[
 PAIRS_A_WORKER = 50
 """Smallest number of pairs that is worth a process."""
 
-LOOP = 8
-"""Motions over which loops of a recording are closed."""
-
 
 @answered
 def odometry(
@@ -102,7 +99,7 @@ def odometry(
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.closure import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
-    from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at
+    from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at, usual_loop
     from mitsonar.motion.pose import Pose
     from mitsonar.records.sonar_frames import SonarFrames
 
@@ -123,7 +120,7 @@ def odometry(
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
     processes = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
-    steps = (0 if getattr(source, "contrast", None) is None else LOOP) if closure is None else closure
+    steps = usual_loop(source) if closure is None else closure
     loops = len(loop_starts(pairs, steps)) if steps > 1 else 0
     with progress_bar("estimating", pairs + loops, "pairs") as progress:
         found = run_odometry(

@@ -22,7 +22,16 @@ from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
-__all__ = ["Reading", "Source", "frames_for", "open_source", "record_at", "views_for", "with_assumed_plane"]
+__all__ = [
+    "Reading",
+    "Source",
+    "frames_for",
+    "open_source",
+    "record_at",
+    "usual_loop",
+    "views_for",
+    "with_assumed_plane",
+]
 
 Source = FrameSource | ResponseSource | ViewSource
 
@@ -49,6 +58,9 @@ ASSUMED_HEIGHT = 0.15
 
 NEAREST = 0.25
 """Least range at which the assumed ground is looked for, as part of the far end: windows may begin at 0."""
+
+LOOP = 8
+"""Motions over which loops of contrast are closed, where nothing else is told."""
 
 
 @dataclass(frozen=True)
@@ -125,6 +137,11 @@ def views_for(where: str, views: tuple[str, ...], kind: str, reading: Reading) -
         MitsonarError: none there.
     """
     return open_views(where, views, kind, sequence=reading.sequence).with_noise(load_noise(reading.noise), reading.seed)
+
+
+def usual_loop(source: Source) -> int:
+    """Return over how many motions loops are closed where the user does not tell it; 0: none."""
+    return 0 if source.contrast is None else LOOP
 
 
 def _views_of(where: str, estimator: ViewReader, reading: Reading) -> ViewSource:

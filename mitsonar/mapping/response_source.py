@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +41,7 @@ class ResponseSource:
         noise: added to the pings that are read.
         seed: of the noise.
         note: empty; data sets are read by their samples.
+        contrast: none, as of all impulse responses.
     """
 
     name: str
@@ -50,6 +51,7 @@ class ResponseSource:
     seed: int = 0
     note: str = ""
     pitch_rad: float | None = None
+    contrast: ClassVar[None] = None
 
     def __len__(self) -> int:
         """Return the number of pings."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +42,7 @@ class ViewSource:
         seed: of the noise.
         note: which sequence this is.
         altimeter: measures the height of each ping that is read, in place of ``height_m``.
+        contrast: none: networks of data sets are trained on levels.
     """
 
     name: str
@@ -59,6 +60,7 @@ class ViewSource:
     told_height_m: float | None = None
     pitch_rad: float | None = None
     altimeter: HeightEstimator | None = None
+    contrast: ClassVar[None] = None
 
     def __len__(self) -> int:
         """Return the number of pings."""

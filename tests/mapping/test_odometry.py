@@ -17,6 +17,7 @@ from helpers import files_of, tiny_recipe
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.local_contrast import LocalContrast
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
@@ -28,6 +29,7 @@ from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import bridged, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
 from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.open_source import usual_loop
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
@@ -360,6 +362,12 @@ def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
     assert len(set(digests)) == 1
     frames.image[5] += 0.001  # of the first, the middle and the last frame
     assert FrameSource.of(frames).digest() != digests[0]
+
+
+def test_loops_are_closed_of_contrast_unless_told() -> None:
+    source = FrameSource.of(over_ground(sway(12)))
+    assert usual_loop(source) == 0
+    assert usual_loop(source.with_contrast(LocalContrast())) == 8
 
 
 def test_the_attitude_of_a_long_recording_is_its_own(tmp_path: Path) -> None:
