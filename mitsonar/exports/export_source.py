@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import array_names
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
-from mitsonar.mapping.open_frames import is_data_set, open_frames
+from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.mapping.open_frames import is_data_set, open_frames, view_in
 from mitsonar.records.columns import open_group
 from mitsonar.records.sonar_frames import COLUMNS, LABELS, SonarFrames
 
@@ -127,29 +126,17 @@ def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def _of_data_set(url: str, view: str | None) -> ExportSource:
     """Take all frames of one view of a data set."""
     store = DataStore.open(url)
-    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
-    if not stored:
-        raise MitsonarError(f"{url} holds vectors, no images: give a data set of images")
-    views = {one.name: one for one in store.recipe.views}
-    name = next(iter(stored)) if view is None else view
-    if name not in stored:
-        raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
-    one = views[name]
-    labels = {label: f"{label}{store.recipe.suffix(name)}" for label in store.recipe.labels}
-    scale = float(store.about["level_scale"])
+    chosen = view_in(store, view)
+    labels = {label: f"{label}{store.recipe.suffix(chosen.name)}" for label in store.recipe.labels}
 
     def read(part: slice) -> SonarFrames:
         told: dict[str, Any] = {label: store.read(array, part) for label, array in labels.items()}
-        return SonarFrames(
-            image=store.read(stored[name], part),
-            range_m=one.sonar.range_m,
-            bearing_rad=one.bearing_rad,
+        return replace(
+            chosen.like,
+            image=store.read(chosen.array, part),
             time_s=store.read("time_s", part),
-            sonar=one.sonar,
             poses=store.read("pose", part),
             height_m=store.read("height_m", part),
-            level=store.recipe.level_of(one),
-            level_scale=scale,
             **told,
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import is_zipfile
 
 import numpy as np
@@ -20,7 +20,7 @@ from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrame
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore
 
-__all__ = ["is_data_set", "is_recording", "load_frames", "open_frames", "sequence_in"]
+__all__ = ["StoredView", "is_data_set", "is_recording", "load_frames", "open_frames", "sequence_in", "view_in"]
 
 Index = NDArray[np.intp]
 
@@ -157,38 +157,59 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
 
 
 def _of_data_set(url: str, sequence: int | None, view: str | None) -> FrameSource:
-    from mitsonar.config.data_recipe import array_names
     from mitsonar.datasets.store import DataStore  # its import takes half a second
 
     store = DataStore.open(url)
-    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
-    if not stored:
-        raise MitsonarError(f"{url} holds vectors, no images: give a data set of images")
-    views = {one.name: one for one in store.recipe.views}
-    name = next(iter(stored)) if view is None else view
-    if name not in stored:
-        raise MitsonarError(f"{url} has no view {name!r}: {nearest_names(name, stored)}")
+    chosen = view_in(store, view)
     here, number, which = sequence_in(store, sequence)
-    image = store.array(stored[name])
-    like = SonarFrames(
-        image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
-        range_m=views[name].sonar.range_m,
-        bearing_rad=views[name].bearing_rad,
-        time_s=np.zeros(0),
-        sonar=views[name].sonar,
-        level=store.recipe.level_of(views[name]),
-        level_scale=float(store.about["level_scale"]),
-    )
+    image = store.array(chosen.array)
     return FrameSource.of_arrays(
-        like,
+        chosen.like,
         store.read("time_s", here),
         store.read("pose", here),
         store.read("height_m", here),
         lambda index: _picked(image, index + here.start),
         f"{url}, sequence {number}",
         first_number=here.start,
-        note=which + (f", view {name}" if len(stored) > 1 else ""),
+        note=which + (f", view {chosen.name}" if chosen.several else ""),
     )
+
+
+class StoredView(NamedTuple):
+    """A view of a data set: its name, its array of images, frames like them without images, and whether there are others."""
+
+    name: str
+    array: str
+    like: SonarFrames
+    several: bool
+
+
+def view_in(store: DataStore, view: str | None = None) -> StoredView:
+    """Return a view of a data set whose images are stored; default: the first.
+
+    Raises:
+        MitsonarError: no images, or no such view.
+    """
+    from mitsonar.config.data_recipe import array_names
+
+    stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
+    if not stored:
+        raise MitsonarError(f"{store.place.url} holds vectors, no images: give a data set of images")
+    name = next(iter(stored)) if view is None else view
+    if name not in stored:
+        raise MitsonarError(f"{store.place.url} has no view {name!r}: {nearest_names(name, stored)}")
+    known = {one.name: one for one in store.recipe.views}[name]
+    image = store.array(stored[name])
+    like = SonarFrames(
+        image=np.zeros((0, *image.shape[1:]), dtype=image.dtype),
+        range_m=known.sonar.range_m,
+        bearing_rad=known.bearing_rad,
+        time_s=np.zeros(0),
+        sonar=known.sonar,
+        level=store.recipe.level_of(known),
+        level_scale=float(store.about["level_scale"]),
+    )
+    return StoredView(name, stored[name], like, len(stored) > 1)
 
 
 def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, int, str]:
