@@ -16,22 +16,16 @@ from mitsonar.errors import MitsonarError
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import associated
-from mitsonar.recordings.recording import Part
+from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels
 from mitsonar.records.sonar_frames import LABELS, SonarFrames
 
 if TYPE_CHECKING:
     from mitsonar.estimation.height.direct_height import HeightEstimator
 
-__all__ = ["FrameSource", "Pixels"]
+__all__ = ["FrameSource"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-
-Pixels = NDArray[np.generic]
-"""Images ``(n, bins, beams)``: uint8 in 0..255, or float32 in 0..1."""
-
-CHUNK_BYTES = 8 * 2**20
-"""Approximate size of the pixels that are read at a time [bytes]."""
 
 PATTERN_FRAMES = 64
 """Frames of which a static pattern is the mean, at most."""

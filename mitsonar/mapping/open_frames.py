@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
-from mitsonar.mapping.frame_source import FrameSource, Pixels
+from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.recordings.open_recording import format_of, known_formats, open_recording
+from mitsonar.recordings.recording import Pixels
 from mitsonar.records.columns import check_column, open_group
 from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["Facts", "Part", "Pixels", "Recording", "in_time_order", "runs_of"]
+__all__ = ["CHUNK_BYTES", "Facts", "Part", "Pixels", "Recording", "in_time_order", "runs_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
