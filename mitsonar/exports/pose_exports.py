@@ -18,6 +18,7 @@ from mitsonar.exports.shots import as_json, refuse_unposed, shots
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.records.sonar_frames import to_float32
 
 __all__ = ["export_kitti", "export_neusis"]
 
@@ -77,8 +78,7 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
     (folder / "Data").mkdir()
     for shot in shots(source):
         assert shot.frames.poses is not None
-        image = shot.frames.image[shot.index]
-        values = image.astype(np.float32) * np.float32(1 / 255 if image.dtype == np.uint8 else 1)
+        values = to_float32(shot.frames.image[shot.index])
         state = {"ImagingSonar": values[:, ::-1].copy(), "PoseSensor": port_matrix(shot.frames.poses[shot.index])}
         write_whole(folder / "Data" / f"{shot.name}.pkl", pickle.dumps(state, protocol=4))
         yield 1

@@ -18,7 +18,7 @@ from mitsonar.mapping.known_poses import poses_at, stretches
 from mitsonar.mapping.open_frames import is_data_set
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import Part
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.sonar_frames import SonarFrames, to_float32
 
 __all__ = ["Axes", "FramesWithPoses", "Stretch", "as_pixels", "axes_of", "frames_with_poses"]
 
@@ -234,7 +234,7 @@ def as_pixels(image: NDArray[np.generic], pixel: str, name: str) -> NDArray[np.g
     """
     if pixel == "uint8" and image.dtype == np.uint8:
         return image
-    values = np.asarray(image, dtype=np.float32) * np.float32(1 / 255 if image.dtype == np.uint8 else 1)
+    values = to_float32(image)
     if not (values.size and values.min() >= 0 and values.max() <= 1):  # also of nan
         raise MitsonarError(f"{name} has pixels {values.min():g}..{values.max():g}, allowed 0..1: it is damaged")
     return values

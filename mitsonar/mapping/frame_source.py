@@ -17,7 +17,7 @@ from mitsonar.mapping.measured_heights import measured
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import associated
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels
-from mitsonar.records.sonar_frames import LABELS, SonarFrames
+from mitsonar.records.sonar_frames import LABELS, SonarFrames, to_float32
 
 if TYPE_CHECKING:
     from mitsonar.estimation.height.direct_height import HeightEstimator
@@ -228,10 +228,8 @@ class FrameSource:
             reason = " ".join(str(error).split())[:160]
             raise MitsonarError(f"{self.name}: frames {chosen[0]}..{chosen[-1]} cannot be read: {reason}") from None
         if self.noise is not None:
-            scale = np.float32(1 / 255 if image.dtype == np.uint8 else 1)
-            image = self.noise.apply(
-                image.astype(np.float32) * scale, seed=self.seed, frames=chosen.astype(np.int64) + self.first_number
-            )
+            numbers = chosen.astype(np.int64) + self.first_number
+            image = self.noise.apply(to_float32(image), seed=self.seed, frames=numbers)
         frames = replace(
             self.like,
             image=image,

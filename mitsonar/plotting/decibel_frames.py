@@ -8,7 +8,7 @@ import numpy as np
 
 from mitsonar.acoustics.coding import decoded
 from mitsonar.errors import MitsonarError
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.sonar_frames import SonarFrames, to_float32
 
 __all__ = ["in_decibels"]
 
@@ -21,7 +21,7 @@ def in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
     """
     if not 0 < span_db <= 300:
         raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
-    values = np.asarray(frames.image, dtype=np.float32) * np.float32(1 / 255 if frames.image.dtype == np.uint8 else 1)
+    values = to_float32(frames.image)
     if frames.level == "dB":
         shown = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db)
         shown[values <= 0] = 0

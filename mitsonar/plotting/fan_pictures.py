@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map, nearest_cells
 from mitsonar.io.whole_files import write_json, write_whole
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.sonar_frames import SonarFrames, to_float32, to_uint8
 
 __all__ = ["FanPictures"]
 
@@ -44,8 +44,7 @@ class FanPictures:
 
     def picture(self, image: NDArray[Any]) -> NDArray[np.uint8]:
         """Return the levels of one frame ``(bins, beams)``, 0..1 or 0..255, as ``(rows, columns)``; 0 outside the fan."""
-        scale = np.float32(1 / 255 if image.dtype == np.uint8 else 1)
-        return to_uint8(np.asarray(self.fan.apply(image.astype(np.float32) * scale)))
+        return to_uint8(np.asarray(self.fan.apply(to_float32(image))))
 
     def labels(self, frames: SonarFrames, index: int) -> dict[str, NDArray[Any]]:
         """Return the label pictures of one frame by name, each pixel the label of the nearest cell."""

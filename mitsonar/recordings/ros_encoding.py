@@ -27,7 +27,7 @@ from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.recordings.mcap_metadata import WRITTEN
 from mitsonar.recordings.ros_messages import PROJECTED, ros2_types
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.sonar_frames import SonarFrames, to_float32, to_uint8
 
 __all__ = ["BODY", "SENSOR", "TOPICS", "WORLD", "Encoded", "FrameEncoder", "nanoseconds"]
 
@@ -189,9 +189,7 @@ class FrameEncoder:
 
     def _fan(self, frames: SonarFrames, index: int, time: int) -> RosObject:
         """Return a picture of a fan: forward up, starboard right, 0 outside."""
-        image = frames.image[index]
-        scale = np.float32(1 / 255 if image.dtype == np.uint8 else 1)
-        fan = to_uint8(np.asarray(self._map.apply(image.astype(np.float32) * scale)))
+        fan = to_uint8(np.asarray(self._map.apply(to_float32(frames.image[index]))))
         buffer = io.BytesIO()
         name, options = PICTURES[self.picture]
         Image.fromarray(fan).save(buffer, format=name, **options)
@@ -209,7 +207,7 @@ class FrameEncoder:
         rows, columns = np.nonzero(np.isfinite(elevation) & (image > 0))
         ways = directions(frames.sonar.bearing, frames.bearing_rad[columns], elevation[rows, columns])
         starboard, forward, up = (ways * frames.range_m[rows, None]).T
-        value = image[rows, columns].astype(np.float32) / np.float32(255 if image.dtype == np.uint8 else 1)
+        value = to_float32(image[rows, columns])
         table: dict[str, NDArray[Any]] = {"x": forward, "y": -starboard, "z": up, "intensity": value}
         table = {name: one.astype(np.float32) for name, one in table.items()}
         labels = {"shape_id": frames.shape_id, "object_id": frames.object_id}

@@ -17,7 +17,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_npz, refuse_beyond_memory
 from mitsonar.records.columns import Column, check_column, number_of, open_group, table_in, text_of
 
-__all__ = ["LABELS", "LEVELS", "SonarFrames", "to_uint8"]
+__all__ = ["LABELS", "LEVELS", "SonarFrames", "to_float32", "to_uint8"]
 
 LEVELS = ("linear", "dB", "gamma", "contrast")
 """How image values stand for level; ``contrast`` is :class:`~mitsonar.acoustics.local_contrast.LocalContrast`'s."""
@@ -142,7 +142,7 @@ class SonarFrames:
         """
         if self.level == "contrast":
             raise MitsonarError("images of contrast hold no levels: take the frames before their contrast")
-        values = self._values()
+        values = to_float32(self.image)
         if self.level == "linear":
             return values
         return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level), dtype=np.float32)
@@ -156,10 +156,6 @@ class SonarFrames:
         level = np.maximum(self.linear_values(), np.float32(10 ** (FLOOR_DB / 10)))
         return np.asarray(10 * np.log10(level), dtype=np.float32)
 
-    def _values(self) -> NDArray[np.float32]:
-        """Return the image as float32 in 0..1."""
-        return np.asarray(self.image, dtype=np.float32) * np.float32(1 / 255 if self.image.dtype == np.uint8 else 1)
-
     def matching_values(self) -> NDArray[np.float32]:
         """Return the images as float32 in 0..1, as estimators and mosaics match them, like ``image``.
 
@@ -168,7 +164,7 @@ class SonarFrames:
         estimators.
         """
         if self.level == "contrast":
-            return self._values()
+            return to_float32(self.image)
         return self.linear_values() if self.level == "linear" else self.linear_values() ** np.float32(0.25)
 
     def select(self, index: slice | NDArray[Any]) -> SonarFrames:
@@ -288,6 +284,11 @@ def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:
     image = values["image"]
     if image.dtype.kind == "f" and image.size and image.max() > 1 + 1e-5:
         raise MitsonarError(f"{source}: image must lie in 0..1, or be uint8: got up to {image.max():.6g}")
+
+
+def to_float32(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Return 0..255 of uint8, or 0..1, as float32 in 0..1: always a copy."""
+    return np.asarray(image, dtype=np.float32) * np.float32(1 / 255 if image.dtype == np.uint8 else 1)
 
 
 def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:

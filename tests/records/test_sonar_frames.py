@@ -10,7 +10,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.records.sonar_frames import LABELS, SonarFrames, to_uint8
+from mitsonar.records.sonar_frames import LABELS, SonarFrames, to_float32, to_uint8
 
 SONAR = Sonar(name="small", beams=6, range_bins=10, bearing="cone", beam_width_deg=0.3)
 FRAMES = 4
@@ -178,6 +178,9 @@ def test_bytes_never_map_an_echo_to_zero() -> None:
     image = np.array([0, 1e-30, 1e-6, 0.4 / 255, 1 / 255, 0.5, 0.9999, 1, 1.5, -0.2])
     assert to_uint8(image).tolist() == [0, 1, 1, 1, 1, 128, 255, 255, 255, 0]
     assert to_uint8(image.astype(np.float32)).dtype == np.uint8
+    levels = np.arange(256, dtype=np.uint8)
+    assert (to_uint8(to_float32(levels)) == levels).all()
+    assert to_float32(levels)[[0, 255]].tolist() == [0, 1]
 
 
 def test_bytes_are_the_nearest_level() -> None:
