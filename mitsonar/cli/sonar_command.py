@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +12,9 @@ from mitsonar.cli.console import answered, changes_of, command_line, say, warn
 from mitsonar.cli.odometry_command import Geometry
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
+
+if TYPE_CHECKING:
+    from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["fit", "from_recording", "sonars"]
 
@@ -45,20 +49,10 @@ def fit(
     Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. Bright speckle
     that is new in every frame counts as volume scattering: that holds for a sonar that rests.
     """
-    from mitsonar.estimation.sonar_fit import fit_sonar
-    from mitsonar.instruments.named_sonars import load_sonar
     from mitsonar.records.sonar_frames import SonarFrames
 
     refuse_to_replace(out, overwrite=overwrite)
-    known = changes_of(changes or [], None)
-    base = None if sonar is None else load_sonar(sonar)
-    found = fit_sonar(SonarFrames.load(frames), base, measure_coding=measure_coding, **known)
-    write_whole(out, found.yaml().encode())
-    for line in found.lines():
-        say(line)
-    for note in found.notes:
-        warn(note)
-    say(f"{out}: {command_line('render', 'SCENE', '--sonar', out)}")
+    _fit_and_write(SonarFrames.load(frames), sonar, changes, out, measure_coding=measure_coding)
 
 
 @answered
@@ -89,20 +83,35 @@ def from_recording(
     `mitsonar render` and recipes of data sets take it by --sonar. With --noise the files are laid over one another:
     --sonar sonar.yaml,noise.yaml.
     """
-    from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
-    from mitsonar.estimation.sonar_fit import fit_sonar
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.estimation.recorded_sonar import as_instrument
     from mitsonar.mapping.open_frames import open_frames
 
     for path in (out, noise):
         if path is not None:
             refuse_to_replace(path, overwrite=overwrite)
-    known = changes_of(changes or [], None)
-    base = None if sonar is None else load_sonar(sonar)
     source = open_frames(file, sequence=part, view=topic, geometry=geometry)
     first = max(0, (len(source) - frames) // 2)
     chosen, notes = as_instrument(source.read(range(first, min(first + frames, len(source)))))
-    found = fit_sonar(chosen, base, measure_coding=measure_coding, **known)
+    _fit_and_write(chosen, sonar, changes, out, noise, notes, measure_coding=measure_coding)
+
+
+def _fit_and_write(
+    frames: SonarFrames,
+    sonar: str | None,
+    changes: list[str] | None,
+    out: Path,
+    noise: Path | None = None,
+    notes: Sequence[str] = (),
+    *,
+    measure_coding: bool,
+) -> None:
+    """Fit a sonar to frames, write it to OUT, or its noise to another file, and say what was found."""
+    from mitsonar.estimation.recorded_sonar import NOISE_FIELDS
+    from mitsonar.estimation.sonar_fit import fit_sonar
+    from mitsonar.instruments.named_sonars import load_sonar
+
+    base = None if sonar is None else load_sonar(sonar)
+    found = fit_sonar(frames, base, measure_coding=measure_coding, **changes_of(changes or [], None))
     if noise is None:
         write_whole(out, found.yaml().encode())
     else:
