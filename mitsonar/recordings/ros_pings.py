@@ -99,7 +99,6 @@ class PingLayout:
         )
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def layout_of(message: Message, kind: str) -> PingLayout:
     """Return the layout of a message.
 
@@ -115,7 +114,6 @@ def layout_of(message: Message, kind: str) -> PingLayout:
     return layout
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def samples_of(message: Message, kind: str, layout: PingLayout, *, beam_major: bool = False) -> Samples:
     """Return the samples of a message as they are stored ``(bins, beams)``, column 0 most to port.
 
