@@ -114,7 +114,9 @@ class DataStore:
             check_plain(attributes, "its zarr.json")
         except Exception as error:  # a damaged file, or a storage that does not answer, may raise anything
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise MitsonarError(f"no data set at {storage.url}: {reason}; give what `mitsonar dataset make` wrote") from None
+            raise MitsonarError(
+                f"no data set at {storage.url}: {reason}; give what `mitsonar dataset make` or `dataset from-frames` wrote"
+            ) from None
         if not ours:
             raise MitsonarError(f"{storage.url} is a Zarr group but no data set of mitsonar")
         if known != FORMAT:
