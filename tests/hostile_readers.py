@@ -413,6 +413,31 @@ def read_model(folder: Path) -> None:
     mesh_world(folder / (chosen.read_text() if chosen.exists() else "model.ply"), floor=False)
 
 
+# ---------------------------------------------------------------- recordings
+
+
+def read_recording(path: Path) -> None:
+    """Read all frames of a recording, and check that they can be."""
+    from mitsonar import open_recording
+
+    recording = open_recording(path)
+    assert all("\n" not in note for note in recording.notes)
+    for part in recording.parts:
+        assert (np.diff(part.time_s) > 0).all()
+        assert np.isfinite(part.time_s).all()
+        for axis in (part.like.range_m, part.like.bearing_rad):
+            assert np.isfinite(axis).all()
+            assert (np.diff(axis) > 0).all()
+        for frames in part.chunks():
+            assert frames.image.dtype in (np.uint8, np.float32)
+            if frames.image.dtype != np.uint8:
+                assert np.isfinite(frames.image).all()
+                assert frames.image.min() >= 0
+                assert frames.image.max() <= 1
+            assert np.isfinite(frames.to_linear().image).all()
+            assert frames.poses is None or np.isfinite(frames.poses).all()
+
+
 # ---------------------------------------------------------------- trajectories and echoes
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from bags import Maker, Sent, write_bag
 from drawn_frames import over_ground, sway
-from hostile_readers import Reader, attack
+from hostile_readers import Reader, attack, read_recording
 from mutations import Rng, changed_bytes, changed_text, outcome
 from recording_files import aris_file, didson_file, oculus_log, oculus_ping, some_pings
 
@@ -129,7 +129,7 @@ def read(folder: Path) -> None:
     try:
         with np.errstate(over="warn", divide="warn", invalid="warn"), warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
-            _read(path)
+            read_recording(path)
     except MitsonarError as error:
         said = str(error)
         assert "\n" not in said, f"a refusal is not one line: {said[:300]}"
@@ -139,25 +139,6 @@ def read(folder: Path) -> None:
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert most < MEMORY_FLOOR + MEMORY_FACTOR * size, f"{most:,} bytes of memory for {size:,} of a recording"
-
-
-def _read(path: Path) -> None:
-    recording = open_recording(path)
-    assert all("\n" not in note for note in recording.notes)
-    for part in recording.parts:
-        assert (np.diff(part.time_s) > 0).all()
-        assert np.isfinite(part.time_s).all()
-        for axis in (part.like.range_m, part.like.bearing_rad):
-            assert np.isfinite(axis).all()
-            assert (np.diff(axis) > 0).all()
-        for frames in part.chunks():
-            assert frames.image.dtype in (np.uint8, np.float32)
-            if frames.image.dtype != np.uint8:
-                assert np.isfinite(frames.image).all()
-                assert frames.image.min() >= 0
-                assert frames.image.max() <= 1
-            assert np.isfinite(frames.to_linear().image).all()
-            assert frames.poses is None or np.isfinite(frames.poses).all()
 
 
 READERS = {name: Reader(lambda folder, write=write: write(folder), spoil, read) for name, write in RECORDINGS.items()}  # type: ignore[misc]
