@@ -86,12 +86,12 @@ def show(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw one frame as a fan with axes in metres and a colour bar in dB."""
-    from mitsonar.plotting.decibel_frames import in_decibels
+    from mitsonar.plotting.decibel_frames import coded_in_decibels
     from mitsonar.plotting.fan_figure import save_fan
 
     refuse_to_replace(out, overwrite=overwrite)
     recording = _opened(file, topic, geometry)
-    frames = in_decibels(recording.part(part).read([frame]), span_db)
+    frames = coded_in_decibels(recording.part(part).read([frame]), span_db)
     save_fan(out, frames, title=f"{Path(file).name}, frame {frame}")
     say(f"picture: {out}")
 

@@ -10,10 +10,10 @@ from mitsonar.acoustics.coding import decoded
 from mitsonar.errors import MitsonarError
 from mitsonar.records.sonar_frames import SonarFrames, to_float32
 
-__all__ = ["in_decibels"]
+__all__ = ["coded_in_decibels"]
 
 
-def in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
+def coded_in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
     """Return frames whose values 0..1, float32, are the ``span_db`` decibels below full scale; what is lower is 0.
 
     Raises:

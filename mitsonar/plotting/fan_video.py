@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.geometry.scan_conversion import cartesian_map
 from mitsonar.io.run_directory import refuse_to_replace
-from mitsonar.plotting.decibel_frames import in_decibels
+from mitsonar.plotting.decibel_frames import coded_in_decibels
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["CODECS", "write_fan_video"]
@@ -80,7 +80,7 @@ def _write(
         for frames in chunks:
             if fan is None:
                 fan = cartesian_map(frames.range_m, frames.bearing_rad, rows=2 * (rows // 2))
-            shown = in_decibels(frames, span_db).image
+            shown = coded_in_decibels(frames, span_db).image
             for image, time in zip(shown, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
                 values = np.asarray(fan.apply(np.asarray(image, np.float32)))
                 picture = _even(colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)])
