@@ -86,7 +86,8 @@ class FanSampler:
         values = np.ravel(picture).astype(np.float32)
         if picture.dtype == np.uint8:
             values *= np.float32(1 / 255)
-        return np.asarray(self.weights @ values, dtype=np.float32).reshape(self.bins, self.beams)
+        sampled = np.minimum(self.weights @ values, np.float32(1))  # weights of 1 in all are rounded
+        return np.asarray(sampled, dtype=np.float32).reshape(self.bins, self.beams)
 
 
 def cell_counts(geometry: PictureGeometry) -> tuple[int, int]:

@@ -92,6 +92,12 @@ def test_bytes_and_floats_agree() -> None:
     assert np.abs(sampler.apply(as_bytes) - sampler.apply(picture)).max() <= 0.5 / 255 + 1e-6
 
 
+def test_nothing_exceeds_full_scale() -> None:
+    """Weights that add up to 1 are rounded, and so is 255 of them."""
+    sampler = FanSampler.of(PictureGeometry.create(**FAN, range_max=10), 200, 240)
+    assert sampler.apply(np.full((200, 240), 255, np.uint8)).max() == 1
+
+
 def test_fans_outside_and_too_large_ones_are_refused() -> None:
     away = PictureGeometry.create(**{**FAN, "apex_px": (9000, 9000)}, range_max=10)
     with pytest.raises(MitsonarError, match="lies outside the pictures of 240 x 200"):
