@@ -19,6 +19,9 @@ from mitsonar.recordings.safe_pickle import read_pickled_arrays
 
 CONFIG = {"Azimuth": 60, "Elevation": 12, "RangeMin": 0.5, "RangeMax": 4.5}
 
+USUAL, MANY = 300, 10_000
+"""Mutants of a pickle in the test that is always run, and in the slow one."""
+
 
 def written(path: Path, protocol: int = 4, scale: float = 1.0) -> NDArray[np.float32]:
     (path / "Data").mkdir(parents=True)
@@ -129,12 +132,22 @@ def test_faults_of_a_folder_are_one_sentence(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
-def test_mutants_are_read_or_refused(tmp_path: Path) -> None:
-    written(tmp_path)
-    path = tmp_path / "Data/5.pkl"
+def attacked(folder: Path, seeds: range) -> dict[str, int]:
+    """How many mutants of a pickle are read and refused."""
+    written(folder)
+    path = folder / "Data/5.pkl"
     good = path.read_bytes()
     found = {"read": 0, "refused": 0}
-    for seed in range(300):
+    for seed in seeds:
         path.write_bytes(changed_bytes(np.random.default_rng(seed), good))
         found[outcome(lambda: read_pickled_arrays(path))] += 1
-    assert min(found.values()) > 0
+    return found
+
+
+def test_mutants_are_read_or_refused(tmp_path: Path) -> None:
+    assert min(attacked(tmp_path, range(USUAL)).values()) > 0
+
+
+@pytest.mark.slow
+def test_ten_thousand_mutants(tmp_path: Path) -> None:
+    assert min(attacked(tmp_path, range(USUAL, MANY)).values()) > 0
