@@ -6,11 +6,12 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
+import pytest
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
@@ -200,6 +201,12 @@ class Block:
             raise ModuleNotFoundError(f"{{name}} is blocked", name=name)
 sys.meta_path.insert(0, Block)
 """
+
+
+def essence(values: Iterable[Any], *quick: Any) -> list[Any]:
+    """Values of a test's parameter, or tuples of several: all but the quick ones are marked ``thorough``."""
+    parts = [(value, value if isinstance(value, tuple) else (value,)) for value in values]
+    return [pytest.param(*one, marks=() if value in quick else pytest.mark.thorough) for value, one in parts]
 
 
 def run_python(script: str, *, block: tuple[str, ...] = (), **environment: str) -> str:

@@ -27,7 +27,7 @@ DOCS = ROOT / "docs"
 BLOCK = re.compile(r"(?:<!-- notest: *(?P<reason>[^\n]*?) *-->\n)?```(?P<kind>sh|python|xml)\n(?P<text>.*?)```", re.DOTALL)
 USES = re.compile(r"<!-- uses: *(.+?) *-->")
 
-QUICK = ("guides/scenes.md", "guides/sonars.md")
+QUICK = ("guides/scenes.md",)
 """Pages that `make test` runs; the others are marked `docs`."""
 
 WITH_TORCH = ("guides/data-sets.md", "guides/networks.md")

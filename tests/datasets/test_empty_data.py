@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from helpers import HEARD, TINY, Command, refused, tiny_recipe
+from helpers import HEARD, TINY, Command, essence, refused, tiny_recipe
 
 from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.data_check import check
@@ -60,7 +60,7 @@ def test_impulse_responses_are_refused_likewise(tmp_path: Path) -> None:
         make_dataset(recipe_from({**HEARD, "world": world}), str(tmp_path / "x.zarr"))
 
 
-@pytest.mark.parametrize("kind", ["images", "vectors", "both"])
+@pytest.mark.parametrize("kind", essence(["images", "vectors", "both"], "both"))
 def test_empty_frames_are_warned_of_and_are_faults(tmp_path: Path, kind: str) -> None:
     """Two balls far away: that the ground between them is small is not known before it is rendered."""
     recipe = own_scene(scene_file(tmp_path, 3.0, -20.0, 20.0), 40.0, gain=1.0, store=kind)

@@ -71,6 +71,7 @@ def test_responses_are_what_the_simulator_hears(made: Path, tmp_path: Path) -> N
     assert np.abs(response).max(axis=2).min() > 0
 
 
+@pytest.mark.thorough
 def test_the_same_recipe_gives_the_same_bytes_and_a_lost_shard_comes_back(made: Path, tmp_path: Path) -> None:
     url = tmp_path / "again.zarr"
     make_dataset(impulse_recipe(), str(url))

@@ -243,6 +243,7 @@ def test_no_image_and_by_scene_no_world_is_in_two_parts(made: Path, by: str) -> 
         assert [len(pairs) for pairs in parts.values()] == [15 * 4, 9 * 4, 6 * 4]
 
 
+@pytest.mark.thorough
 def test_scenes_of_one_world_stay_together(tmp_path: Path) -> None:
     """A scene file, or a picture as seabed, is the same world whatever the seed."""
     world = {"family": "pattern", "texture": "photo_sand"}

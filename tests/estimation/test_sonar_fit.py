@@ -79,6 +79,7 @@ def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str
     assert found.notes == []
 
 
+@pytest.mark.thorough
 def test_the_grain_tells_the_coding(recordings: dict[str, SonarFrames]) -> None:
     """Frames that state another coding than theirs."""
     frames = recordings["70 dB"].select(slice(None))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from helpers import Array, diffuse, floor, scene
+from helpers import Array, diffuse, essence, floor, scene
 
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.sonar_fit import fit_sonar
@@ -41,7 +41,7 @@ def recorded(deep: mi.Scene, height: float, step: tuple[float, float] = (0, 0), 
     return frames
 
 
-@pytest.mark.parametrize(("glow", "gone"), [(60.0, 1.8), (40.0, 2.2)])
+@pytest.mark.parametrize(("glow", "gone"), essence([(60.0, 1.8), (40.0, 2.2)], (60.0, 1.8)))
 def test_a_glow_comes_back(deep: mi.Scene, glow: float, gone: float) -> None:
     sonar = fit_sonar(recorded(deep, 3.0, near_glow_db=glow, near_glow_m=gone)).sonar
     assert sonar.near_glow_m == pytest.approx(gone, rel=0.05)
@@ -105,6 +105,7 @@ def test_volume_comes_back(deep: mi.Scene) -> None:
     assert any("new in every frame" in note for note in found.notes)
 
 
+@pytest.mark.thorough
 def test_a_bottom_is_no_volume_even_when_the_sonar_moves(deep: mi.Scene) -> None:
     """Its speckle is still, or found again at a shift, or its profile is another."""
     for step in ((0.0, 0.0), (0.0, 0.1), (0.06, 0.02)):

@@ -338,6 +338,7 @@ def test_hostile_recipes_are_refused(places: dict[str, Path], tmp_path: Path, ch
 
 
 @pytest.mark.learn
+@pytest.mark.thorough
 def test_rendered_runs_are_compared_and_fine_tuned_on(mitsonar: Command, variant: str, tmp_path: Path) -> None:
     pytest.importorskip("torch")
     for name, end in (("one", "-0.43,-4.76,2.5,35,0,2"), ("two", "-0.58,-4.8,2.5,35,0,-1")):

@@ -17,7 +17,7 @@ from mutations import Rng, changed_bytes, changed_text, outcome
 from numpy.typing import NDArray
 from PIL import Image
 
-USUAL, MANY = 120, 10_000
+USUAL, MANY = 40, 10_000
 """Mutants of each format in the test that is always run, and in the slow one."""
 
 GEOMETRY = (

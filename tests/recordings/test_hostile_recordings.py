@@ -24,7 +24,7 @@ from mitsonar import MitsonarError, open_recording
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.mcap_writer import write_mcap
 
-USUAL, FEWER, MANY = 200, 25, 10_000
+USUAL, FEWER, MANY = 100, 10, 10_000
 """Mutants of each format in the test that is always run, of bags, which take 0.1 s each, and in the slow one."""
 
 MEMORY_FLOOR, MEMORY_FACTOR = 4 * 2**20, 40

@@ -131,6 +131,7 @@ def correlations(
     return np.asarray(product / np.sqrt(energy[0] * energy[1:]).T)
 
 
+@pytest.mark.thorough
 def test_correlation_from_ping_to_ping_is_that_of_the_points() -> None:
     """On a rough floor, 0.1 to 5 mm apart: phase within 2 % of a direct sum over the anchored points, written down here."""
     sonar = ChannelSonar(range_max=20.0)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from coherent_scenes import POSE, SONAR, imager
-from helpers import Array, diffuse, floor, scene
+from helpers import Array, diffuse, essence, floor, scene
 from scipy import special
 from scipy.ndimage import uniform_filter
 
@@ -63,9 +63,7 @@ QUICK = ("blueview-p900-45", "didson300")
 """The widest window, and the shortest."""
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.thorough) for name in PRESETS]
-)
+@pytest.mark.parametrize("name", essence(PRESETS, *QUICK))
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 def test_the_sonar_equation_holds_for_every_preset(flat: mi.Scene, name: str) -> None:
     """Values of frames, read as dB re 1 uPa, less the gain: 0.5 dB in each of up to ten parts of the lit ranges, 1 to 40 m.
@@ -99,7 +97,7 @@ def test_the_sonar_equation_holds_for_every_preset(flat: mi.Scene, name: str) ->
 # ---------------------------------------------------------------- noise and grain
 
 
-@pytest.mark.parametrize("above_db", [20.0, 10.0, 0.0])
+@pytest.mark.parametrize("above_db", essence([20.0, 10.0, 0.0], 10.0))
 def test_detrended_correlation_by_level(flat: mi.Scene, above_db: float) -> None:
     """A still sonar's pings, less the local mean of 31 x 9 cells: bright grain stays, grain at the noise's level goes.
 

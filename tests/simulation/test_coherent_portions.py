@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from helpers import Array, box, diffuse, floor, scene
+from helpers import Array, box, diffuse, essence, floor, scene
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
@@ -70,7 +70,10 @@ def test_quadrants_are_the_beams_of_a_side() -> None:
     np.testing.assert_array_equal(np.concatenate([aft_port, fore_port], axis=2), port)
 
 
-@pytest.mark.parametrize(("name", "x", "y"), [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1)])
+QUADRANTS = [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1)]
+
+
+@pytest.mark.parametrize(("name", "x", "y"), essence(QUADRANTS, ("q1", 1, 1), ("q2", 1, -1)))
 def test_a_quadrant_holds_what_lies_there(name: str, x: int, y: int) -> None:
     """Starboard is +x and ahead +y: only the quadrant above a plate shows it, but for the side lobes beside its beams."""
     plate = box([0.55 * x, 0.55 * y, 0], [0.2, 0.2, 0.01], bsdf=diffuse(0.8))

@@ -24,6 +24,7 @@ NOISY = SONAR.replace(
 )  # fmt: skip
 
 
+@pytest.mark.thorough
 def test_a_run_that_is_broken_off_and_resumed_has_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """25 frames, broken off after the 22nd: the gain is that of the first 20; noise goes by the number of the ping."""
     loaded = scene(floor=floor(diffuse(0.1)), ball=sphere((0, 3.4, 0.2), 0.15, diffuse(0.3)))

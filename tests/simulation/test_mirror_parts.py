@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from helpers import Array, box, diffuse, floor, plate, scene, sphere
+from helpers import Array, box, diffuse, essence, floor, plate, scene, sphere
 
 from mitsonar.acoustics.backscatter import Material, material, mirror_amplitude
 from mitsonar.errors import MitsonarError, MitsonarWarning
@@ -116,9 +116,10 @@ def ball_echo(radius: float, centre: Array, k: float = K) -> complex:
     return complex(radius / (2 * away * (away + radius)) * np.exp(-2j * k * away))
 
 
-@pytest.mark.parametrize(
-    ("radius", "range_m"), [(0.01, 4.0), (0.05, 3.0), (0.05, 10.0), (0.1, 5.0), (0.25, 3.0), (0.25, 10.0)]
-)
+SPHERES = [(0.01, 4.0), (0.05, 3.0), (0.05, 10.0), (0.1, 5.0), (0.25, 3.0), (0.25, 10.0)]
+
+
+@pytest.mark.parametrize(("radius", "range_m"), essence(SPHERES, (0.01, 4.0), (0.25, 3.0)))
 def test_spheres_have_a_quarter_of_their_square(radius: float, range_m: float) -> None:
     """0.5 dB, on the axis of the fan and beside it."""
     sonar = SONAR.replace(range_min=range_m - 0.5, range_max=range_m + 0.5)
@@ -129,7 +130,7 @@ def test_spheres_have_a_quarter_of_their_square(radius: float, range_m: float) -
         assert np.angle(ratio) == pytest.approx(0, abs=0.1)
 
 
-@pytest.mark.parametrize("words", [{}, {"pulse_m": 0.012, "beam_width_deg": 0.9, "pattern": "receive"}])
+@pytest.mark.parametrize("words", essence([{}, {"pulse_m": 0.012, "beam_width_deg": 0.9, "pattern": "receive"}], {}))
 def test_target_strength_is_read_from_an_image(words: dict[str, float | str]) -> None:
     """The sum of the levels over bins and beams, times spacing over width, times R^4: a^2 / 4 within 0.5 dB."""
     sonar = SONAR.replace(**words)

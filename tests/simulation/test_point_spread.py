@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 from coherent_scenes import SONAR, imager, one_point
-from helpers import Array
+from helpers import Array, essence
 
 from mitsonar.instruments.aperture import Pattern
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -20,7 +20,10 @@ pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ig
 Shape: TypeAlias = Callable[[Array], Array]
 
 
-@pytest.mark.parametrize(("shading", "pattern"), [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")])
+SHADED = [("uniform", "receive"), ("hann", "two_way"), ("taylor", "receive")]
+
+
+@pytest.mark.parametrize(("shading", "pattern"), essence(SHADED, ("hann", "two_way")))
 def test_point_spread(shading: str, pattern: str) -> None:
     """Across beams and over range: 0.5 dB down to -35 dB, and the tops of the first two side lobes."""
     narrow = {"beams": 256, "azimuth_fov_deg": 10.0, "beam_width_deg": 0.4, "range_min": 4.2, "range_max": 4.6}
@@ -149,7 +152,7 @@ INSTRUMENTS = {
 }
 
 
-QUICK = (("DIDSON", 2.0), ("DIDSON", 12.0), ("ARIS", 3.0), ("ARIS", 4.4))
+QUICK = (("DIDSON", 2.0), ("ARIS", 3.0))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from channel_scenes import CELLS, LEVEL, C, cells_floor, points, received_from, scatterers_of, simulator
-from helpers import box, diffuse, floor, scene, sphere
+from helpers import box, diffuse, essence, floor, scene, sphere
 
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
@@ -34,7 +34,7 @@ def test_every_cell_has_one_point_inside_it_whoever_looks() -> None:
     assert not np.array_equal(points(different), place)
 
 
-@pytest.mark.parametrize("shape", ["rectangle", "mesh", "sphere"])
+@pytest.mark.parametrize("shape", essence(["rectangle", "mesh", "sphere"], "rectangle", "mesh"))
 def test_strengths_add_up_to_reflectivity_times_area(shape: str) -> None:
     kinds = {
         "rectangle": (floor(diffuse(0.3), 2.0), 16.0),
@@ -132,7 +132,7 @@ SURFACES = {
 }
 """Points a square metre, or a texture of cells, whose reflectivity is 0.5 in the mean, of a floor of 12 x 12 m."""
 
-ESSENCE = ("1700 points", "cells of 15 mm")
+ESSENCE = ("cells of 15 mm",)
 
 
 def incoherent(field: FieldOfView) -> float:
@@ -145,9 +145,7 @@ def incoherent(field: FieldOfView) -> float:
     return float((gain**2 * 0.5 * (HEIGHT / far) ** 2 / far**4).sum() * 0.004**2)
 
 
-@pytest.mark.parametrize(
-    "surface", [name if name in ESSENCE else pytest.param(name, marks=pytest.mark.thorough) for name in SURFACES]
-)
+@pytest.mark.parametrize("surface", essence(SURFACES, *ESSENCE))
 def test_a_level_floor_returns_the_incoherent_level_and_rayleigh_statistics(surface: str) -> None:
     """Whatever the density of points: within 0.3 dB, 600 poses, some 2,000 independent taps. Without phases of their own
     the points straight below return 0.7, 2.3 and 6.1 dB more, cells of 15 mm 3.6 dB more, and aside 1.7 dB less."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers import axes, box, diffuse, direction, floor, plate, scene
+from helpers import axes, box, diffuse, direction, essence, floor, plate, scene
 from numpy.typing import ArrayLike
 
 from mitsonar.errors import MitsonarError
@@ -54,9 +54,12 @@ def test_segments_add_up_to_the_whole(model: str) -> None:
         assert 0.4 < cone.sum() / whole.sum() < 0.8  # a circle in a square holds 0.79 of it
 
 
+PLACES = [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1), ("c1", 1, 1), ("c3", -1, -1)]
+
+
 @pytest.mark.parametrize(
     ("name", "starboard", "forward"),
-    [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1), ("c1", 1, 1), ("c3", -1, -1)],
+    essence(PLACES, ("q1", 1, 1), ("q2", 1, -1), ("c3", -1, -1)),
 )
 def test_quadrants_look_where_their_names_say(name: str, starboard: int, forward: int) -> None:
     """Fore-starboard is the first, then clockwise: a ball off to one side of the vehicle is in that one alone."""

@@ -436,6 +436,7 @@ def test_an_oracle_reaches_the_bound_of_gaussian_noise() -> None:
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.thorough
 def test_an_oracle_reaches_the_bound_of_the_pixel_law() -> None:
     """Least squares reaches the matched bound; the exact one takes the likelihood."""
     who = oracle(24, 96, 6)
@@ -545,6 +546,7 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.thorough
 def test_the_command_reads_data_sets(tmp_path: Path) -> None:
     from helpers import tiny_recipe
 

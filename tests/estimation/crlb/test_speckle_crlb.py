@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from helpers import Array, Command, diffuse, floor, scene, tiny_recipe
+from helpers import Array, Command, diffuse, essence, floor, scene, tiny_recipe
 from scipy import ndimage, special, stats
 from scipy.sparse import csr_array
 
@@ -153,7 +153,7 @@ def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("noise_db", [-90.0, -75.0])
+@pytest.mark.parametrize("noise_db", essence([-90.0, -75.0], -90.0))
 def test_an_oracle_of_the_scatterers_reaches_the_grain_bound(noise_db: float) -> None:
     """At a high and at a low ratio of echo to noise."""
     value = grain_oracle(limits(noise_db, even=True), 12)
@@ -178,6 +178,7 @@ def ground_oracle(bounds: SpeckleBounds, draws: int) -> float:
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.thorough
 def test_an_oracle_of_the_level_reaches_the_ground_bound() -> None:
     value = ground_oracle(limits(-75.0), 10)
     assert reaches(value, 10), value
@@ -187,6 +188,7 @@ def test_an_oracle_of_the_level_reaches_the_ground_bound() -> None:
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.thorough
 def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
     quiet, loud = (next(limits(noise_db).at(np.array(POSE))) for noise_db in (-90.0, -75.0))
     assert (quiet["grain"].std(2) < 0.05 * quiet["ground"].std(2)).all()

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import DOWN, Command, floor, floor_levels, refused, scene, tiny_recipe
+from helpers import DOWN, Command, essence, floor, floor_levels, refused, scene, tiny_recipe
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -73,8 +73,8 @@ def test_ranges_are_proportional_to_the_height() -> None:
 # ---------------------------------------------------------------- the direct way
 
 
-@pytest.mark.parametrize("height", [1.6, 2.5, 3.2])
-@pytest.mark.parametrize("noise", ["none", "high"])
+@pytest.mark.parametrize("height", essence([1.6, 2.5, 3.2], 1.6, 3.2))
+@pytest.mark.parametrize("noise", essence(["none", "high"], "high"))
 @pytest.mark.parametrize(("model", "pitch"), [("thesis", 35), ("physical", 35), ("thesis", 90)])
 def test_the_height_over_a_rendered_floor(model: str, pitch: int, noise: str, height: float) -> None:
     if pitch == 90:
@@ -210,6 +210,7 @@ class Told:
         return Estimate(Motion(0.0, 0.0, 0.0))
 
 
+@pytest.mark.thorough
 def test_portions_as_images_know_their_rays(tmp_path: Path, mitsonar: Command) -> None:
     """An image of a cone, read as that of the whole view, would tell 3 % too much."""
     url = tmp_path / "cones.zarr"
@@ -289,6 +290,7 @@ class TestNetworks:
         with pytest.raises(MitsonarError, match="estimates motions of 2 frames, not heights"):
             HeightNetwork(motions)
 
+    @pytest.mark.thorough
     def test_the_network_trained_nearest_to_the_height_answers(
         self, heights: Path, tmp_path: Path, mitsonar: Command
     ) -> None:

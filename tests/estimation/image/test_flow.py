@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from helpers import essence
 from numpy.typing import NDArray
 from scipy import ndimage, special
 
@@ -62,13 +63,12 @@ def noisy(frames: SonarFrames, noise: str, seed: int = 1) -> SonarFrames:
     return changed(frames, image=NOISE_MODELS[noise].apply(frames.image, seed=seed, frames=np.arange(2)))
 
 
-@pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("size", [0.3, 1.0, 5.0])
-def test_sign_and_size_of_each_axis(axis: int, sign: int, size: float) -> None:
+@pytest.mark.parametrize("size", essence([-5.0, -1.0, -0.3, 0.3, 1.0, 5.0], -0.3, 5.0))
+def test_sign_and_size_of_each_axis(axis: int, size: float) -> None:
     """Motions of 6 to 100 mm and 0.12 to 2 deg along one axis."""
     motion = np.zeros(3)
-    motion[axis] = sign * size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
+    motion[axis] = size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
     found = Flow(relief_m=0).estimate(painted(Motion(*motion), Sonar()))
     error = (np.array(found.motion) - motion) * UNITS
     assert found.valid, found.reason
@@ -77,7 +77,7 @@ def test_sign_and_size_of_each_axis(axis: int, sign: int, size: float) -> None:
 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 @pytest.mark.parametrize("match", ["map", "vector"])
-@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, -1), (1, -1, -1)])
+@pytest.mark.parametrize("signs", essence([((1, 1, 1),), ((-1, 1, -1),), ((1, -1, -1),)], ((-1, 1, -1),)))
 def test_all_three_at_once_for_both_bearings_and_matches(
     bearing: str, match: Literal["map", "vector"], signs: tuple[int, int, int]
 ) -> None:
@@ -89,6 +89,7 @@ def test_all_three_at_once_for_both_bearings_and_matches(
     assert (np.abs(error) < [1.0, 0.3, 0.03]).all(), f"mm, mm, deg: {error}"
 
 
+@pytest.mark.thorough
 def test_covariance_says_the_errors_that_noise_makes() -> None:
     """The errors of ten noisy pairs, over the stated deviations, are of order one on each axis."""
     motion = np.array([0.012, -0.015, np.radians(0.3)])
@@ -118,6 +119,7 @@ def test_height_is_a_further_unknown() -> None:
     assert free.covariance[1, 1] > held.covariance[1, 1]
 
 
+@pytest.mark.thorough
 def test_nothing_to_match_is_not_believed() -> None:
     """Blank frames, even frames, noise alone, frames of two places, one object on black: no confident wrong answer."""
     frames = painted(Motion(0.01, 0.01, 0.0), Sonar())

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import DOWN, Command, tiny_recipe
+from helpers import DOWN, Command, essence, tiny_recipe
 
 from mitsonar.acoustics.noise import load_noise
 from mitsonar.config.data_recipe import load_recipe
@@ -181,6 +181,7 @@ def test_what_a_profile_net_says_turns_with_the_world() -> None:
     torch.testing.assert_close(told(0.1 * pair), plain, rtol=1e-3, atol=1e-5)  # another gain
 
 
+@pytest.mark.thorough
 def test_a_profile_net_learns_shifts_of_a_part_of_a_level() -> None:
     """Profiles of white ground, moved by up to half a level: unseen ones are told to a sixth of always answering nothing."""
     rng = np.random.default_rng(5)
@@ -353,7 +354,7 @@ def learnt(portions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-@pytest.mark.parametrize("noise", ["none", "high"])
+@pytest.mark.parametrize("noise", essence(["none", "high"], "high"))
 def test_a_network_of_views_drives_a_path(
     portions: Path, learnt: Path, tmp_path: Path, mitsonar: Command, noise: str
 ) -> None:
@@ -419,7 +420,7 @@ def test_a_network_of_views_needs_a_data_set_that_holds_them(
 # ---------------------------------------------------------------- the shipped one
 
 
-@pytest.mark.parametrize("model", ["coherent", "physical"])
+@pytest.mark.parametrize("model", essence(["coherent", "physical"], "physical"))
 def test_the_shipped_profilenet_knows_unseen_fields(tmp_path: Path, model: str) -> None:
     """Twelve pairs of a field that training has not seen: far better than no motion in both models."""
     scenes = [{"count": 1, "sequences": 12, "world": {"size_m": 30}}]
