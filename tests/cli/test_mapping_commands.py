@@ -112,6 +112,7 @@ def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered
     assert alike["d"][0] < 0.7, alike
 
 
+@pytest.mark.thorough
 def test_the_pictures_are_pictures(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     out = tmp_path / "odometry"
     assert mitsonar("odometry", drawn, "-o", out, "--estimator", "zero").returncode == 0

@@ -345,6 +345,7 @@ def test_texture_parameter_of_the_pattern() -> None:
         load_scene("pattern", texture="mud")
 
 
+@pytest.mark.thorough
 def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

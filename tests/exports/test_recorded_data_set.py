@@ -202,6 +202,7 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
         compare(str(tmp_path / "data.zarr"), Asked("zero", part="all", perturb=True))
 
 
+@pytest.mark.thorough
 def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "dive.zarr"
     done = mitsonar("dataset", "from-frames", places["aris"], "--poses", places["path"], "--cut", 6, "-o", out)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from helpers import Command, refused
+from helpers import Command, essence, refused
 from PIL import Image
 
 pytest.importorskip("foxglove")
@@ -58,9 +58,14 @@ class Live(NamedTuple):
     pings: list[Any]
 
 
+@pytest.fixture(scope="module")
+def simulator(variant: str) -> Simulator:
+    """Compiled once."""
+    return Simulator(load_scene("objects"), small_sonar())
+
+
 @pytest.fixture
-def live(variant: str) -> Iterator[Live]:
-    simulator = Simulator(load_scene("objects"), small_sonar())
+def live(simulator: Simulator) -> Iterator[Live]:
     mailbox, pings, ends = PoseMailbox(), list[Any](), threading.Event()
     server = FoxgloveServer(mailbox, port=0)
     path = Trajectory(np.array([START]), np.zeros(1))
@@ -204,7 +209,7 @@ def started(*words: str) -> tuple[subprocess.Popen[str], int]:
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
 def test_a_path_is_played_and_a_signal_ends_the_server_cleanly(number: signal.Signals) -> None:
     process, port = started("--trajectory", "shipped", "--rate", "20")
     client = client_of(port, ["/sonar/timing"])

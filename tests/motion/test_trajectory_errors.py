@@ -322,8 +322,8 @@ def test_errors_aligned_in_the_plane_are_those_of_evo(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("delta", "unit", "overlapping", "options"),
     [
-        (1, "frames", False, []),
-        (7, "frames", True, ["--delta", "7", "--all_pairs"]),
+        pytest.param(1, "frames", False, [], marks=pytest.mark.thorough),
+        pytest.param(7, "frames", True, ["--delta", "7", "--all_pairs"], marks=pytest.mark.thorough),
         (0.5, "metres", False, ["--delta", "0.5", "--delta_unit", "m", "--pairs_from_reference"]),
     ],
     ids=["each frame", "every 7 frames", "each half metre"],

@@ -191,6 +191,7 @@ def test_levels_do_not_matter_and_covariances_are_covariances() -> None:
     assert (torch.linalg.eigvalsh(one.covariance.double()) > 0).all()
 
 
+@pytest.mark.thorough
 def test_it_learns() -> None:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)

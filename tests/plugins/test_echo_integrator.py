@@ -176,6 +176,7 @@ def test_flat_cells_join_without_gap_or_overlap(jitter: bool) -> None:
     assert (far - near)[:-1][flat].max() > 0.1 * radius[:-1][flat].min()
 
 
+@pytest.mark.thorough
 def test_bodies_do_not_reach_farther_beyond_their_horizon() -> None:
     """Where the edge of a cell misses, the slope is held: nothing lies R de / 0.02 beyond a ray, and little beyond."""
     radius, distance = 0.1, 4.0
@@ -202,6 +203,7 @@ def test_an_edge_on_another_surface_is_not_followed() -> None:
     assert 30 < behind < 30 + 30 * np.radians(14) / 700 / 0.02
 
 
+@pytest.mark.thorough
 def test_a_receiver_hears_a_whole_floor_too() -> None:
     """Half of the path by way of the edge: against ten times the rays, no gaps beyond R = 50 h."""
     found = []

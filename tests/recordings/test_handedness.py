@@ -107,6 +107,7 @@ def test_headings_must_be_one_a_frame() -> None:
         handedness_of(part, np.full(10, np.nan))
 
 
+@pytest.mark.thorough
 def test_simulated_frames_of_a_real_sonar() -> None:
     """Coherent pings with speckle of the preset, on the scene with objects: the sonar turns and sails."""
     sonar = load_sonar("didson300").replace(range_bins=128)

@@ -168,6 +168,7 @@ def test_rays_of_the_vehicle_do_not_feel_its_motion() -> None:
     assert phases["scatterers"][-1] > 0.5
 
 
+@pytest.mark.thorough
 def test_doppler_of_every_echo() -> None:
     """2 v cos / lambda, against the phase of the same points from a place that is really farther on."""
     sonar = ChannelSonar(receivers=(received_from(),), points_per_m2=200.0)

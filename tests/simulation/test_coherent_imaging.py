@@ -122,6 +122,7 @@ def test_rays_change_nothing_on_a_plane(flat: mi.Scene) -> None:
     assert np.corrcoef((np.abs(one) ** 2).ravel(), (np.abs(other) ** 2).ravel())[0, 1] > 0.999
 
 
+@pytest.mark.thorough
 def test_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Silhouettes: twice the rays leave intensities correlated by 0.98, eight times by 0.97; energy as physical, 0.2 dB."""
     loaded = load_scene(RockyField(size_m=12, a_side=(24, 24)).build(3).write(tmp_path / "world"))

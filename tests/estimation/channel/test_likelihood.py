@@ -76,7 +76,8 @@ def test_delay_of_a_resting_and_of_a_moving_receiver() -> None:
     np.testing.assert_allclose(moving, met, rtol=1e-14)
 
 
-@pytest.mark.parametrize("source", ["points", pytest.param("simulator", marks=pytest.mark.thorough)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("source", ["points", "simulator"])
 @pytest.mark.usefixtures("variant")
 def test_covariance_of_scatterers_drawn_at_random(source: str) -> None:
     """Products of taps over 12 grounds against the law, by a z-test of their weighted sum: of points written down in NumPy,
