@@ -260,6 +260,7 @@ def test_a_command_names_the_extra_that_it_lacks(tmp_path: Path) -> None:
     assert "pip install 'mitsonar[meshes]'" in said
 
 
+@pytest.mark.thorough
 def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:
     script = f"""
         import sys

@@ -282,6 +282,7 @@ def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path
     assert not list(tmp_path.glob("*.png"))
 
 
+@pytest.mark.thorough
 def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     """Paths are the same ones, the mosaic too; a folder remembers its own convention."""
     for frame in ("mitsonar", "ros-enu", "ned"):

@@ -175,6 +175,7 @@ def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> No
     assert command_line("dataset", "show", Path("a b.zarr")) == "mitsonar dataset show 'a b.zarr'"
 
 
+@pytest.mark.thorough
 def test_a_data_sets_command_is_quoted(mitsonar: Command, tmp_path: Path) -> None:
     told = ["--sequences", 1, "--workers", 1, "--set", "sonar.beams=4", "--set", "sonar.range_bins=16"]
     told += ["--set", "world={family: flat-objects, size_m: 20}", "--set", "flight.jump_m=null"]

@@ -292,7 +292,7 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     assert "rays traced and binned" in doctor.stdout
 
 
-LONG_TO_COMPILE = ("objects", "observatory", "pattern", "sunken_ship")
+LONG_TO_COMPILE = ("hydrophones", "objects", "observatory", "pattern", "sunken_ship")
 """Scenes of many materials or textures; the commands of the README render `pattern` along its trajectory."""
 
 

@@ -772,6 +772,7 @@ def test_objects_of_others_are_kept(bucket: str) -> None:
 
 
 @pytest.mark.e2e
+@pytest.mark.thorough
 def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
@@ -849,6 +850,7 @@ def test_commands_answer_mistakes(mitsonar: Command, made: Path, tmp_path: Path)
     assert yaml.safe_load(printed)["world"]["family"] == "ship-hull"
 
 
+@pytest.mark.thorough
 def test_worlds_from_the_command_line(mitsonar: Command, tmp_path: Path) -> None:
     made = mitsonar(
         "world", "rocky-field", "--size-m", 4, "--a-side", "2,3", "--rotation-deg", "-10,10", "-o", tmp_path / "w"

@@ -321,6 +321,7 @@ def test_workers_of_a_data_loader_read_the_same(made: Path, start: str) -> None:
     torch.testing.assert_close(torch.cat(batches), torch.stack(alone), rtol=0, atol=0)
 
 
+@pytest.mark.thorough
 def test_stores_are_read_without_a_renderer(made: Path) -> None:
     """Whoever trains need not be able to render."""
     script = f"""

@@ -195,6 +195,7 @@ def test_damaged_answers_are_said(mitsonar: Command, made: Path, tmp_path: Path)
     refused(mitsonar(*words), "is damaged", "remove it")
 
 
+@pytest.mark.thorough
 def test_an_axis_that_never_moves_and_a_turned_mount(mitsonar: Command, tmp_path: Path) -> None:
     """The truth is the sonar's motion, not the vehicle's; tables have no number for an axis without motion."""
     words = {"sonar__beams": 48, "sonar__range_bins": 256, "sonar__rays_per_beam": 200, "world__a_side": [25, 25]}

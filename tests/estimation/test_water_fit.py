@@ -49,6 +49,7 @@ def test_a_glow_comes_back(deep: mi.Scene, glow: float, gone: float) -> None:
     assert sonar.noise_level_db == pytest.approx(-95, abs=1)
 
 
+@pytest.mark.thorough
 def test_what_beams_glow_and_what_stays_comes_back(deep: mi.Scene) -> None:
     fields: dict[str, Any] = {"near_glow_db": 60.0, "near_glow_m": 1.8, "near_glow_edge_db": 15.0}
     made = recorded(deep, 3.0, **fields, near_glow_spread_db=4.0, near_glow_still=0.8)

@@ -80,7 +80,7 @@ def test_labels_name_shapes_and_leave_out_faint_pixels() -> None:
 
 def test_a_run_writes_them_and_says_the_names(mitsonar: Command, tmp_path: Path) -> None:
     words = ("--set", "range_bins=64", "--set", "beams=16", "--quality", "draft", "-o", tmp_path / "run")
-    done = mitsonar("render", "objects", "--fan", "--labels", "--label-floor", "0.01", *words)
+    done = mitsonar("render", "flat_floor", "--fan", "--labels", "--label-floor", "0.01", *words)
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "run" / "run.json").read_text())
     frames = SonarFrames.load(tmp_path / "run")

@@ -83,6 +83,7 @@ def test_a_quadrant_holds_what_lies_there(name: str, x: int, y: int) -> None:
     assert shares[names.index(name)] > 0.999
 
 
+@pytest.mark.thorough
 def test_energies_are_those_of_the_model_physical() -> None:
     """The vectors of a flat floor, mean over 40 pings 3 m apart, whose speckle is independent."""
     loaded = scene(floor=floor())

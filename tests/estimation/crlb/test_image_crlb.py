@@ -464,6 +464,7 @@ def test_more_pixels_reach_the_bound_of_finer_grey_values(noise: NoiseModel, gre
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.thorough
 def test_segments_and_their_sums() -> None:
     """Four quadrants of a looking-down sonar: information adds up, and pixels tell no less than their sums."""
     from mitsonar.instruments.views import Segment

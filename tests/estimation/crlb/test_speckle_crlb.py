@@ -209,7 +209,7 @@ def test_commands_answer_coherent_data_sets(tmp_path: Path, mitsonar: Command) -
     from mitsonar.datasets.generation import make_dataset
 
     url = tmp_path / "coherent.zarr"
-    changes = {"model": "coherent", "beams": 24, "range_bins": 96}
+    changes = {"model": "coherent", "beams": 12, "range_bins": 48}
     make_dataset(tiny_recipe(**{f"sonar__{key}": value for key, value in changes.items()}), str(url), sequences=3)
     done = mitsonar("crlb", url, "--pairs", 1, "--part", "all", "--json")
     assert done.returncode == 0, done.stderr
