@@ -138,6 +138,7 @@ def test_a_prior_shrinks_what_is_unsure_and_leaves_what_is_sure() -> None:
     assert (np.abs(found[1]) < 1e-5).all()
 
 
+@pytest.mark.thorough
 def test_limits_are_below_what_is_reached(pairs: SonarPairs) -> None:
     """The bound by the rays' own noise at high noise is positive, and below direct's errors."""
     loud = SonarPairs(pairs.store.place.url, part="all", frames=2, one_a_sequence=True, noise="high")

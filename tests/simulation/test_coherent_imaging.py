@@ -115,6 +115,7 @@ def test_density_changes_nothing(flat: mi.Scene) -> None:
     assert 10 * np.log10(made[1].mean() / made[0].mean()) == pytest.approx(0, abs=0.1)
 
 
+@pytest.mark.thorough
 def test_rays_change_nothing_on_a_plane(flat: mi.Scene) -> None:
     """Each point counts once, whatever the rays; their rounding turns phases by 0.02."""
     one, other = (imager(flat, SONAR.replace(quality=name)).image(POSE, 0)[0] for name in ("standard", "fine"))
