@@ -10,16 +10,10 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.error_correlation import ErrorCorrelation
+from mitsonar.mapping.graph_solver import GraphSolution, solved
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.pose_covariance import pose_covariances
-from mitsonar.mapping.pose_graph import (
-    GraphSolution,
-    Headings,
-    PoseEdges,
-    PoseGraph,
-    relative_motions,
-    solved,
-)
+from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 
@@ -102,6 +96,21 @@ def test_headings_join_with_motions_by_variance() -> None:
     assert loose.covariances()[0][0, 2, 2] == pytest.approx(8e-6, rel=1e-4)
 
 
+def test_a_bias_of_a_sensor_is_found_by_a_heading_and_counts_in_the_covariance() -> None:
+    """Four motions at rest that each show a turn of b: the heading at the end says what of it is bias."""
+    still, loose = np.zeros((4, 3)), np.array([1e-3, 1e-3, 1.0])
+    turning = still + np.array([0, 0, 0.01])
+    graph = replace(graph_of(still, loose), others=PoseEdges.chain(turning, np.tile(np.diag(loose**2 * 1e-6), (4, 1, 1))))
+    graph = replace(graph, bias=np.tile([0, 0, 0.02], (4, 1)))
+    own, _ = solved(graph).covariances()
+    # four independent errors of 1e-3, and four times a common one of 0.02
+    assert own[4, 2, 2] == pytest.approx(4e-6 + (4 * 0.02) ** 2, rel=1e-3)
+    found = solved(replace(graph, headings=Headings(np.array([4]), np.zeros(1), np.array([1e-4]))))
+    np.testing.assert_allclose(found.poses[:, 2], 0, atol=1e-4)
+    with pytest.raises(MitsonarError, match="for each of 4 motions"):
+        replace(graph, bias=np.zeros((3, 3)))
+
+
 def test_a_wrong_loop_is_left_out_and_right_ones_are_kept() -> None:
     rng = np.random.default_rng(1)
     true = composed(square())
@@ -137,7 +146,7 @@ def tangled(rng: np.random.Generator, share: float = 0.8, slope: float = 0.01) -
     pairs = [(0, 44), (1, 43), (2, 43)]
     loops = joined(*(edge(i, j, relative_motions(true, [i], [j])[0] + STD * rng.normal(size=3)) for i, j in pairs))
     headings = Headings(np.array([20, 30]), true[[20, 30], 2] + 5e-3 * rng.normal(size=2), np.full(2, 5e-3))
-    return PoseGraph(composed(measured), chain, others, loops, headings, correlated), true
+    return PoseGraph(composed(measured), chain, others, loops=loops, headings=headings, correlated=correlated), true
 
 
 def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
