@@ -1,8 +1,8 @@
 """Solution of a pose graph: the poses that agree best with all that is known, and their marginal covariances.
 
 Sparse Gauss-Newton over x, y [m] and heading [rad]. Errors of consecutive motions may depend on each other (see
-:mod:`mitsonar.mapping.error_correlation`): then each motion has an unknown error of its own beside the poses, and these errors
-form a chain of first order. Loops have Cauchy weights until outliers are out.
+:mod:`mitsonar.mapping.error_correlation`): then each motion has an unknown error of its own, and these errors form a chain
+of first order. Loops have Cauchy weights until outliers are out.
 """
 
 from __future__ import annotations

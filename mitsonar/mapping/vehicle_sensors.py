@@ -43,7 +43,7 @@ class Readings:
             second).
 
     Raises:
-        MitsonarError: other shapes, numbers that are not finite, times that do not increase, deviations that are not positive.
+        MitsonarError: other shapes, numbers that are not finite, times that do not increase, deviations not above 0.
     """
 
     time_s: Array
@@ -69,13 +69,13 @@ class Readings:
         """Return the times at which one reading gives way to the next ``(n + 1,)``: each holds around its own time."""
         step = np.diff(self.time_s)
         if not step.size:
-            return self.time_s[0] + np.array([-0.5, 0.5]) * LONGEST_GAP_S
+            return np.asarray(self.time_s[0] + np.array([-0.5, 0.5]) * LONGEST_GAP_S)
         middle = self.time_s[:-1] + step / 2
         return np.concatenate([[self.time_s[0] - step[0] / 2], middle, [self.time_s[-1] + step[-1] / 2]])
 
     def means(self, time_s: Array) -> Array:
-        """Return the mean between consecutive times ``(times - 1,)``; nan where no reading covers the time."""
-        return _between(self.edges_s, self.values, time_s) / np.diff(time_s)
+        """Return the mean between consecutive times ``(times - 1,)``, of use where readings cover them."""
+        return np.asarray(_between(self.edges_s, self.values, time_s) / np.diff(time_s))
 
     def variances(self, time_s: Array, *, density: bool) -> Array:
         """Return the variance of the integral between consecutive times ``(times - 1,)``.
@@ -85,7 +85,7 @@ class Readings:
             density: whether ``std`` is a noise density, per root Hz; else it is that of each reading, and readings average.
         """
         edges = self.edges_s
-        power = self.std**2 if density else self.std**2 * np.diff(edges)
+        power = np.asarray(self.std**2 if density else self.std**2 * np.diff(edges))
         return _between(edges, power, time_s)
 
     def covers(self, time_s: Array) -> NDArray[np.bool_]:
@@ -295,11 +295,10 @@ class VehicleSensors:
         information = np.tile(np.diag(1 / UNKNOWN_STD**2), (len(time_s) - 1, 1, 1))
         weighted = np.zeros((len(time_s) - 1, 3, 1))
         for one in told:
-            spread = one.covariances + one.bias[:, :, None] * one.bias[:, None]
-            inverse = np.linalg.inv(spread)
+            inverse = _inverse(one.covariances + one.bias[:, :, None] * one.bias[:, None])
             information[one.pair] += inverse
             weighted[one.pair] += inverse @ one.motions[..., None]
-        covariances = np.linalg.inv(information)
+        covariances = _inverse(information)
         means = (covariances @ weighted)[..., 0]
         return [
             MotionPrior(Motion(*(float(value) for value in mean)), covariance)
@@ -322,6 +321,13 @@ class VehicleSensors:
         depth = np.interp(time_s, self.depth.time_s, self.depth.values)
         covered = time_s[0] >= self.depth.edges_s[0] - 1e-6 and time_s[-1] <= self.depth.edges_s[-1] + 1e-6
         return depth[0] - depth if covered else None
+
+
+def _inverse(matrices: Array) -> Array:
+    """Invert covariances or information ``(n, 3, 3)`` whose components differ by many orders."""
+    scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    both = scale[:, :, None] * scale[:, None]
+    return np.asarray(both * np.linalg.inv(matrices * both))
 
 
 def _reckoned(dead: DeadReckoning, time_s: Array) -> SensorMotions:
