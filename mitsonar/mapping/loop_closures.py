@@ -26,7 +26,7 @@ from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.pose import Pose
 
-__all__ = ["LoopSearch", "canvas_of", "search_loops"]
+__all__ = ["KeepLoop", "KnownLoops", "LoopSearch", "canvas_of", "search_loops"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -63,6 +63,11 @@ ASTRAY_CELLS, ASTRAY_RAD = 3.0, np.radians(4)
 NEIGHBOURS = 6
 AGREEING, AGREEING_RAD = 0.02, np.radians(2)
 """Keyframes within which loops check each other, and by how much they may differ, as a part of the reach, and in turn."""
+
+
+KnownLoops = Mapping[tuple[int, int, Motion], Estimate]
+KeepLoop = Callable[[int, int, Motion, Estimate], None]
+"""Registrations by the numbers of their frames in the source, and the motion from which they begin."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +122,10 @@ class _Searched:
 
 
 def canvas_of(source: FrameSource) -> Canvas | None:
-    """Return the ground before the sonar on which frames are compared; None where no frame shows any."""
+    """Return the ground before the sonar on which frames are compared; None where no frame is known to show any."""
     for number in np.unique(np.linspace(0, len(source) - 1, 5).astype(np.intp)):
-        canvas = Canvas.of(source.read([number]))
+        frame = source.read([number])
+        canvas = None if frame.poses is None else Canvas.of(frame)
         if canvas is not None:
             return canvas
     return None
@@ -131,9 +137,10 @@ def search_loops(
     numbers: Index,
     solution: GraphSolution,
     errors: ErrorCorrelation,
+    canvas: Canvas,
     *,
-    known: Mapping[tuple[int, int], Estimate] | None = None,
-    keep: Callable[[int, int, Estimate], None] = lambda first, second, estimate: None,
+    known: KnownLoops | None = None,
+    keep: KeepLoop = lambda first, second, motion, estimate: None,
 ) -> LoopSearch:
     """Search a path for loops.
 
@@ -143,15 +150,13 @@ def search_loops(
         numbers: of the frames used ``(frames,)``.
         solution: of the pose graph without loops.
         errors: how errors over the same ground depend on each other: loops side by side count as fewer.
-        known: registrations of an earlier run, by the numbers of their frames in the source.
+        canvas: of :func:`canvas_of`.
+        known: registrations of an earlier run.
         keep: called with each new one.
 
     Raises:
         MitsonarError: frames that cannot be read, or that tell no height or pitch.
     """
-    canvas = canvas_of(source)
-    if canvas is None:
-        return LoopSearch(PoseEdges.none(), 0, Counter({"no frame shows level ground": 1}))
     searched = _searched(source, numbers, solution, canvas)
     rejected: Counter[str] = Counter()
     compared, found = 0, []
@@ -163,10 +168,10 @@ def search_loops(
             rejected[reason] += bool(reason)
             continue
         pair = int(numbers[candidate.first]), int(numbers[candidate.second])
-        estimate = (known or {}).get(pair)
+        estimate = (known or {}).get((*pair, candidate.motion))
         if estimate is None:
             estimate = _registered(source, estimator, pair, candidate, searched)
-            keep(*pair, estimate)
+            keep(*pair, candidate.motion, estimate)
         reason = _astray(estimate, candidate.motion, searched)
         rejected[reason] += bool(reason)
         if not reason:

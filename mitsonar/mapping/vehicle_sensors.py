@@ -5,6 +5,7 @@ Readings are put together over the time from frame to frame: they become motions
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -216,6 +217,20 @@ class VehicleSensors:
             "dead reckoning": self.dead_reckoning,
         }
         return [name for name, sensor in there.items() if sensor is not None]
+
+    def digest(self) -> str:
+        """Return the SHA-256 of all readings."""
+        digest = hashlib.sha256(repr(self.bias_std).encode())
+        for one in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading):
+            for values in () if one is None else (one.time_s, one.values, one.std):
+                digest.update(values.astype(float).tobytes())
+            digest.update(b";")
+        if self.dead_reckoning is not None:
+            dead = self.dead_reckoning
+            digest.update(
+                dead.path.poses.tobytes() + dead.path.time_s.tobytes() + repr((dead.walk_m, dead.walk_rad)).encode()
+            )
+        return digest.hexdigest()
 
     def motions(self, time_s: Array) -> list[SensorMotions]:
         """Return the motions between frames at ``time_s`` ``(frames,)`` [s], one item a sensor; errors are independent.
