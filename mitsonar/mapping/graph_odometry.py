@@ -149,8 +149,22 @@ def graph_path(
         search = search_loops(
             loops.source, loops.estimator, loops.numbers, before, errors, canvas, known=loops.known, keep=loops.keep
         )
-        after = solved(replace(graph, start=before.poses, loops=search.loops)) if len(search.loops.first) else before
+        after = _closed(replace(graph, start=before.poses), search, before)
     return _path_of(after, before, measured.time_s, start, sensors, search)
+
+
+def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> GraphSolution:
+    """Solve a graph with loops; stretches where most loops disagree with all else lose the others too."""
+    if not len(search.loops.first):
+        return before
+    after = solved(replace(graph, loops=search.loops))
+    out = after.kept & search.outvoted(after.kept)
+    if not out.any():
+        return after
+    kept = after.kept & ~out
+    rest = solved(replace(graph, loops=search.loops.at(kept))) if kept.any() else before
+    kept[kept] = rest.kept if kept.any() else True
+    return replace(rest, kept=kept)
 
 
 def _path_of(

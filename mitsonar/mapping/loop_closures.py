@@ -8,7 +8,7 @@ only if others beside it agree with it; the pose graph is the last check.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_solver import GraphSolution, motion_derivatives
 from mitsonar.mapping.loop_appearance import Canvas, CoarseView, Likeness, likenesses
 from mitsonar.mapping.pair_estimation import estimate_motions
-from mitsonar.mapping.pose_graph import PoseEdges, relative_motions, wrapped
+from mitsonar.mapping.pose_graph import PoseEdges, relative_motions
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.pose import Pose
@@ -40,7 +40,7 @@ APART = 2.0
 GATE = 3.0
 """Standard deviations of the path within which the same place is looked for."""
 
-MOST_COMPARED = 40
+MOST_COMPARED = 24
 WIDEST_TURN = np.radians(60)
 TURN_STEP = np.radians(3)
 """Most keyframes with which one is compared, largest turn to either side, and step of the turns that are tried."""
@@ -60,10 +60,14 @@ SAME_PLACE = 0.12
 ASTRAY_CELLS, ASTRAY_RAD = 3.0, np.radians(4)
 """How far a registration may end from where appearance began it."""
 
-NEIGHBOURS = 6
-AGREEING, AGREEING_RAD = 0.02, np.radians(2)
-"""Keyframes within which loops check each other, and by how much they may differ, as a part of the reach, and in turn."""
+WITNESS = 0.4
+"""Distance of a lone loop from a frame that is registered as its witness, in those of keyframes."""
 
+NEIGHBOURS = 6
+"""Keyframes within which loops check each other."""
+
+AGREEING_STD, AGREEING_WAY, AGREEING_M = 3.0, 0.03, 0.005
+"""By how much two loops beside each other may differ: in standard deviations of both, of the way between them, and [m]."""
 
 KnownLoops = Mapping[tuple[int, int, Motion], Estimate]
 KeepLoop = Callable[[int, int, Motion, Estimate], None]
@@ -76,13 +80,20 @@ class LoopSearch:
 
     Attributes:
         loops: frames of each loop, its motion and covariance.
+        group: number of the stretch of the path to which each loop belongs ``(loops,)``.
         compared: pairs of keyframes whose views were compared.
         rejected: candidates that did not become loops, by reason.
     """
 
     loops: PoseEdges
+    group: Index
     compared: int
     rejected: Counter[str]
+
+    def outvoted(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which loops belong to a stretch where fewer than two, or not most, were kept ``(loops,)``."""
+        votes, voters = np.bincount(self.group, kept), np.bincount(self.group)
+        return np.asarray(((votes < 2) | (2 * votes <= voters))[self.group])
 
 
 class _Candidate(NamedTuple):
@@ -158,27 +169,24 @@ def search_loops(
         MitsonarError: frames that cannot be read, or that tell no height or pitch.
     """
     searched = _searched(source, numbers, solution, canvas)
+    register = _Register(source, estimator, numbers, searched, known or {}, keep)
     rejected: Counter[str] = Counter()
     compared, found = 0, []
     for second in (int(one) for one in searched.keys if int(one) in searched.views):
         alike, tried = _alike(searched, second)
         compared += tried
         reason, candidate = _unambiguous(searched, second, alike)
-        if candidate is None:
-            rejected[reason] += bool(reason)
-            continue
-        pair = int(numbers[candidate.first]), int(numbers[candidate.second])
-        estimate = (known or {}).get((*pair, candidate.motion))
-        if estimate is None:
-            estimate = _registered(source, estimator, pair, candidate, searched)
-            keep(*pair, candidate.motion, estimate)
-        reason = _astray(estimate, candidate.motion, searched)
+        if candidate is not None:
+            estimate = register(candidate)
+            reason = _astray(estimate, candidate.motion, searched)
+            found += [] if reason else [(candidate, estimate)]
         rejected[reason] += bool(reason)
-        if not reason:
-            found.append((candidate, estimate))
-    agreeing = [one for one in found if _agrees(one, found, searched)]
-    rejected["no other loop beside it agrees"] += len(found) - len(agreeing)
-    return LoopSearch(_edges(agreeing, searched, errors), compared, +rejected)
+    loops = [loop for one in found for loop in _with_witness(one, found, register)]
+    rejected["no other loop beside it agrees"] += len(found) - sum(one in found for one in loops)
+    edges = _edges(sorted(loops, key=lambda one: one[0].second), searched, errors)
+    way = searched.travelled[edges.second]
+    group = np.cumsum(np.diff(way, prepend=way[:1]) > NEIGHBOURS * SPACING * searched.reach).astype(np.intp)
+    return LoopSearch(edges, group, compared, +rejected)
 
 
 def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canvas: Canvas) -> _Searched:
@@ -282,12 +290,26 @@ def _middle_of(pose: Array, reach: float) -> Array:
 # ---------------------------------------------------------------- registration
 
 
-def _registered(
-    source: FrameSource, estimator: AnyEstimator, pair: tuple[int, int], candidate: _Candidate, searched: _Searched
-) -> Estimate:
-    """Register two frames from where appearance has them."""
-    prior = MotionPrior(candidate.motion, np.diag([searched.cell**2, searched.cell**2, TURN_STEP**2]))
-    return estimate_motions(source, estimator, pair, priors=[prior])[0]
+@dataclass(frozen=True)
+class _Register:
+    """Registers two frames from where appearance has them, or looks up what an earlier run found."""
+
+    source: FrameSource
+    estimator: AnyEstimator
+    numbers: Index
+    searched: _Searched
+    known: KnownLoops
+    keep: KeepLoop
+
+    def __call__(self, candidate: _Candidate) -> Estimate:
+        pair = int(self.numbers[candidate.first]), int(self.numbers[candidate.second])
+        estimate = self.known.get((*pair, candidate.motion))
+        if estimate is None:
+            cell = self.searched.cell
+            prior = MotionPrior(candidate.motion, np.diag([cell**2, cell**2, TURN_STEP**2]))
+            estimate = estimate_motions(self.source, self.estimator, pair, priors=[prior])[0]
+            self.keep(*pair, candidate.motion, estimate)
+        return estimate
 
 
 def _astray(estimate: Estimate, motion: Motion, searched: _Searched) -> str:
@@ -302,18 +324,38 @@ def _astray(estimate: Estimate, motion: Motion, searched: _Searched) -> str:
 _Found = tuple[_Candidate, Estimate]
 
 
-def _agrees(one: _Found, found: list[_Found], searched: _Searched) -> bool:
-    """Return whether some other loop beside this one puts it at the same place."""
-    return any(_same_place(one, other, searched) for other in _beside(one, found, searched))
+def _with_witness(one: _Found, found: list[_Found], register: _Register) -> list[_Found]:
+    """Return a loop if another beside it puts it at the same place; a lone one with a new one as its witness; or none."""
+    searched = register.searched
+    beside = [other for other in found if other is not one and _is_beside(one, other, searched)]
+    if any(_same_place(one, other, searched) for other in beside):
+        return [one]
+    for candidate in () if beside else _witnesses(one, searched):
+        estimate = register(candidate)
+        witness = candidate, estimate
+        if not _astray(estimate, candidate.motion, searched) and _same_place(one, witness, searched):
+            return [one, witness]
+    return []
 
 
-def _beside(one: _Found, found: list[_Found], searched: _Searched) -> Iterator[_Found]:
-    """Yield the other loops of neighbouring keyframes."""
-    here = searched.travelled[one[0].second]
-    for other in found:
-        way = abs(searched.travelled[other[0].second] - here)
-        if other is not one and way <= NEIGHBOURS * SPACING * searched.reach:
-            yield other
+def _is_beside(one: _Found, other: _Found, searched: _Searched) -> bool:
+    """Return whether two loops are of neighbouring keyframes."""
+    way = abs(searched.travelled[other[0].second] - searched.travelled[one[0].second])
+    return bool(way <= NEIGHBOURS * SPACING * searched.reach)
+
+
+def _witnesses(one: _Found, searched: _Searched) -> list[_Candidate]:
+    """Return the same loop from later frames a little before and after, the smaller motion first."""
+    candidate, estimate = one
+    there = _composed(searched.poses[candidate.first], estimate.motion)
+    way, found = searched.travelled, []
+    for off in (-WITNESS, WITNESS):
+        other = int(np.searchsorted(way, way[candidate.second] + off * SPACING * searched.reach))
+        if 0 < other < len(way) and other != candidate.second:
+            onward = relative_motions(searched.poses, [candidate.second], [other])[0]
+            ends = np.array([searched.poses[candidate.first], _composed(there, Motion(*onward.tolist()))])
+            found.append(_Candidate(candidate.first, other, Motion(*relative_motions(ends, [0], [1])[0].tolist())))
+    return sorted(found, key=lambda each: float(np.hypot(each.motion.sideways, each.motion.forward)))
 
 
 def _same_place(one: _Found, other: _Found, searched: _Searched) -> bool:
@@ -322,10 +364,19 @@ def _same_place(one: _Found, other: _Found, searched: _Searched) -> bool:
     by_one = _composed(poses[one[0].first], one[1].motion)
     by_other = _composed(poses[other[0].first], other[1].motion)
     onward = relative_motions(poses, [one[0].second], [other[0].second])[0]
-    there = _composed(by_one, Motion(*(float(value) for value in onward)))
-    off = relative_motions(np.array([by_other, there]), [0], [1])[0]
-    limit = AGREEING * (searched.reach + np.hypot(onward[0], onward[1]))
-    return bool(np.hypot(off[0], off[1]) <= limit and abs(float(wrapped(off[2:])[0])) <= AGREEING_RAD)
+    there = _composed(by_one, Motion(*onward.tolist()))
+    off = np.abs(relative_motions(np.array([by_other, there]), [0], [1])[0])
+    variance = np.diag(_covariance_of(one[1], searched) + _covariance_of(other[1], searched))
+    way = searched.travelled[[one[0].second, other[0].second]]
+    limit = AGREEING_STD * np.sqrt([variance[:2].sum(), variance[2]])
+    limit += (AGREEING_WAY * float(np.ptp(way)) + AGREEING_M) * np.array([1, 1 / searched.reach])
+    return bool(np.hypot(off[0], off[1]) <= limit[0] and off[2] <= limit[1])
+
+
+def _covariance_of(estimate: Estimate, searched: _Searched) -> Array:
+    """Return the covariance of a registration; that of its appearance where it tells none."""
+    rough = np.diag([searched.cell**2, searched.cell**2, TURN_STEP**2])
+    return rough if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float)
 
 
 def _edges(found: list[_Found], searched: _Searched, errors: ErrorCorrelation) -> PoseEdges:
@@ -333,8 +384,7 @@ def _edges(found: list[_Found], searched: _Searched, errors: ErrorCorrelation) -
     if not found:
         return PoseEdges.none()
     motions = np.array([one.motion for _, one in found], dtype=float)
-    rough = np.diag([searched.cell**2, searched.cell**2, TURN_STEP**2])
-    known = [rough if one.covariance is None else one.covariance for _, one in found]
+    known = [_covariance_of(one, searched) for _, one in found]
     slopes = errors.of(np.vstack([motions, motions[:1]]), searched.reach).slope_std
     scaled = (motions**2) @ (slopes**2).T
     alike = errors.share * np.exp(-SPACING / errors.length)
