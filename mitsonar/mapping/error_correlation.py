@@ -35,7 +35,7 @@ class ErrorCorrelation:
     """
 
     share: float = 0.9
-    length: float = 0.17
+    length: float = 0.12
     slope: float = 0.006
 
     def __post_init__(self) -> None:

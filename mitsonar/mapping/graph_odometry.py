@@ -15,13 +15,13 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_solver import GraphSolution, solved
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, LoopSearch, canvas_of, search_loops
 from mitsonar.mapping.motion_series import MotionSeries, path_of
-from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions
+from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions, wrapped
 from mitsonar.mapping.trajectory_smoothing import fit_noise
 from mitsonar.mapping.vehicle_sensors import UNKNOWN_STD, VehicleSensors
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["GraphPath", "LoopTask", "graph_path"]
+__all__ = ["GraphPath", "LoopTask", "graph_path", "normalised_errors"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -100,17 +100,24 @@ class GraphPath:
             ]
         rows.append(("standard deviation of the end as told", 1e3 * self.end_told_m, "mm"))
         if true is not None:
-            each = self.normalised_errors(true)
+            each = normalised_errors(self.path, self.covariances, true)
             rows.append(("squared pose error over its covariance, a third, mean along the path", float(each.mean()), ""))
             rows.append(("squared pose error over its covariance, a third, at the end", float(each[-1]), ""))
         return rows
 
-    def normalised_errors(self, true: Trajectory) -> Array:
-        """Return the squared error of each pose but the first over its covariance, a third of it ``(frames - 1,)``."""
-        off = (self.path.poses - true.poses)[1:, [0, 1, 5]]
-        off[:, 2] -= 2 * np.pi * np.rint(off[:, 2] / (2 * np.pi))
-        solution = np.linalg.solve(self.covariances[1:], off[..., None])[..., 0]
-        return np.asarray((off * solution).sum(axis=1) / 3)
+
+def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) -> Array:
+    """Return the squared error of each pose but the first over its covariance, a third of it ``(frames - 1,)``.
+
+    Args:
+        path: the estimated path.
+        covariances: of x, y [m], heading [rad] ``(frames, 3, 3)``.
+        true: the true path, at the same times.
+    """
+    off = (path.poses - true.poses)[1:, [0, 1, 5]]
+    off[:, 2] = wrapped(off[:, 2])
+    solution = np.linalg.solve(covariances[1:], off[..., None])[..., 0]
+    return np.asarray((off * solution).sum(axis=1) / 3)
 
 
 def graph_path(
