@@ -88,8 +88,8 @@ def estimator_from(text: str) -> AnyEstimator:
     """Create an estimator from a text of the command line.
 
     The text is a name, a checkpoint or the folder of a training run, or one of them with options:
-    ``NAME:key=value:key=value``, angles as ``..._deg``; or the path of a Python class, ``my_module:MyEstimator``. Of several checkpoints with commas between them, the one trained
-    nearest to the height of the frames is used.
+    ``NAME:key=value:key=value``, angles as ``..._deg``; or a Python class, ``my_module:MyEstimator``. Of several checkpoints
+    with commas between them, the one trained nearest to the height of the frames is used.
 
     Raises:
         MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
@@ -103,7 +103,8 @@ def estimator_from(text: str) -> AnyEstimator:
         return PythonClass(text)
     if not names_checkpoint(name):
         names = nearest_names(name, NAMES)
-        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint, the folder of a training run or my_module:MyEstimator")
+        other = "a checkpoint, the folder of a training run, or a class as my_module:MyEstimator"
+        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give {other}")
     made = _trained(name)
     return made(**options_from(name, words, made))
 

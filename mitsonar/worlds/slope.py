@@ -12,7 +12,7 @@ __all__ = ["sloped"]
 
 
 def sloped(world: World, slope_deg: float) -> World:
-    """Tilt a world so that its ground rises forward, along +y, by an angle [deg]. The sonar to begin with stays where it is."""
+    """Tilt a world so that its ground rises forward, along +y, by an angle [deg]; its standpoint stays where it is."""
     turn = Rotation.from_euler("x", slope_deg, degrees=True)
 
     def tilted(mesh: Mesh) -> Mesh:
