@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import INPUTS, Estimate, rejected
 from mitsonar.estimation.external.ground_pair import ground_pair, package
@@ -19,6 +21,8 @@ INSTALL = "pip install --no-deps fourier-mellin (its dependency opencv-python wo
 @dataclass(frozen=True)
 class FourierMellin:
     """Rotation, scale and translation of the frames as seen from above; the scale is dropped.
+
+    The package takes squares, and is misled by borders: the pictures fall to 0 there, within a square of twice their edge.
 
     Raises:
         MitsonarError: fourier-mellin is not installed.
@@ -40,8 +44,21 @@ class FourierMellin:
         pair = ground_pair(frames, "fourier-mellin")
         if pair.reason:
             return rejected(pair.reason)
-        found = package("fourier_mellin", INSTALL).FourierMellin(pair.first).register_image(pair.second)
         rows, columns = pair.first.shape
-        warp = cv2.getRotationMatrix2D(((columns - 1) / 2, (rows - 1) / 2), found.rotation, 1.0)
+        edge = 2 * max(rows, columns)
+        column, row = (edge - columns) // 2, (edge - rows) // 2
+        images = [
+            np.pad(_tapered(image), ((row, edge - rows - row), (column, edge - columns - column)))
+            for image in (pair.first, pair.second)
+        ]
+        found = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
+        warp = cv2.getRotationMatrix2D(((edge - 1) / 2, (edge - 1) / 2), found.rotation, 1.0)
         warp[:, 2] += found.x, -found.y  # it counts rows upwards
-        return Estimate(pair.motion(warp), about={"response": float(found.response)})
+        square = replace(pair, corner=(pair.corner[0] - column, pair.corner[1] - row))
+        return Estimate(square.motion(warp), about={"response": float(found.response)})
+
+
+def _tapered(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a picture less its mean, that falls to 0 at its border."""
+    window = cv2.createHanningWindow(image.shape[::-1], cv2.CV_32F)
+    return np.asarray((image - image.mean()) * window, dtype=np.float32)
