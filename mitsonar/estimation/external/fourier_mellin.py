@@ -44,18 +44,22 @@ class FourierMellin:
         pair = ground_pair(frames, "fourier-mellin")
         if pair.reason:
             return rejected(pair.reason)
-        rows, columns = pair.first.shape
-        edge = 2 * max(rows, columns)
-        column, row = (edge - columns) // 2, (edge - rows) // 2
-        images = [
-            np.pad(_tapered(image), ((row, edge - rows - row), (column, edge - columns - column)))
-            for image in (pair.first, pair.second)
-        ]
+        square, corner = _square(pair.first.shape)
+        images = [np.pad(_tapered(image), square) for image in (pair.first, pair.second)]
         found = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
-        warp = cv2.getRotationMatrix2D(((edge - 1) / 2, (edge - 1) / 2), found.rotation, 1.0)
+        middle = (len(images[0]) - 1) / 2
+        warp = cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0)
         warp[:, 2] += found.x, -found.y  # it counts rows upwards
-        square = replace(pair, corner=(pair.corner[0] - column, pair.corner[1] - row))
-        return Estimate(square.motion(warp), about={"response": float(found.response)})
+        drawn = replace(pair, corner=(pair.corner[0] - corner[0], pair.corner[1] - corner[1]))
+        return Estimate(drawn.motion(warp), about={"response": float(found.response)})
+
+
+def _square(shape: tuple[int, ...]) -> tuple[list[tuple[int, int]], tuple[int, int]]:
+    """Return by how much a picture is padded before and after, rows then columns, and the column and row of its corner."""
+    edge = 2 * max(shape)
+    before = [(edge - size) // 2 for size in shape]
+    around = [(first, edge - size - first) for first, size in zip(before, shape, strict=True)]
+    return around, (before[1], before[0])
 
 
 def _tapered(image: NDArray[np.float32]) -> NDArray[np.float32]:
