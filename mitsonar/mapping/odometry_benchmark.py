@@ -32,8 +32,11 @@ __all__ = ["FRAMES", "METHODS", "Wanted", "benchmark_odometry"]
 FRAMES = 260
 """Frames of a simulated set: 5.2 m, so that segments of 5 m fit."""
 
-METHODS = ("zero", "ecc", "phase", "flow", "direct", "corrnet", *EXTERNAL)
-"""Rows that are made unasked; in speckle ``corrnet-coherent`` stands for ``corrnet``."""
+METHODS = ("zero", "ecc", "phase", "flow", "direct", "corrnet", "corrnet-coherent", *EXTERNAL)
+"""Rows that are made unasked, but for :data:`OTHER_GRAIN`."""
+
+OTHER_GRAIN = {"still": "corrnet-coherent", "speckle": "corrnet", "recorded": "corrnet"}
+"""The network that was not trained for frames of a texture."""
 
 LARGEST_JOURNAL = 2**28
 
@@ -127,7 +130,7 @@ def _methods(wanted: Wanted) -> tuple[dict[str, AnyEstimator], list[str]]:
             raise MitsonarError(f"{other[0]} does not read frames of one view: the benchmark takes {', '.join(METHODS)}")
         return asked, []
     made, notes = {}, []
-    for name in (*METHODS, "corrnet-coherent"):
+    for name in METHODS:
         try:
             made[name] = estimator_from(name)
         except MitsonarError as error:
@@ -162,13 +165,13 @@ def _cells(wanted: Wanted) -> Iterator[Case]:
 
 def _cases(cell: Case, methods: dict[str, AnyEstimator], wanted: Wanted) -> Iterator[Case]:
     """List the rows of a cell."""
-    unwanted = "" if wanted.methods else "corrnet" if cell.texture == "speckle" else "corrnet-coherent"
+    unwanted = "" if wanted.methods else OTHER_GRAIN[cell.texture]
     yield from (replace(cell, method=name) for name in methods if name != unwanted)
 
 
 def _order(row: PlainTable) -> tuple[int, str, str, int, int, str]:
     """Return where a row stands in the table: sets, textures, noises and methods in their own order, others after them."""
-    places = [[*SETS], [*NOISES], [*METHODS[:6], "corrnet-coherent", *EXTERNAL]]
+    places = [[*SETS], [*NOISES], [*METHODS]]
     words = row["set"], row["noise"], row["method"]
     at = [known.index(word) if word in known else len(known) for known, word in zip(places, words, strict=True)]
     return at[0], row["set"], "" if row["texture"] == "still" else row["texture"], at[1], at[2], row["method"]
