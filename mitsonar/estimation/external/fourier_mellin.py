@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -50,8 +50,8 @@ class FourierMellin:
         middle = (len(images[0]) - 1) / 2
         warp = cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0)
         warp[:, 2] += found.x, -found.y  # it counts rows upwards
-        drawn = replace(pair, corner=(pair.corner[0] - corner[0], pair.corner[1] - corner[1]))
-        return Estimate(drawn.motion(warp), about={"response": float(found.response)})
+        warp[:, 2] += warp[:, :2] @ corner - corner
+        return pair.estimate(warp)
 
 
 def _square(shape: tuple[int, ...]) -> tuple[list[tuple[int, int]], tuple[int, int]]:

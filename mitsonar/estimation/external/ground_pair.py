@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, explain_missing
-from mitsonar.estimation.estimator import two_frames
+from mitsonar.estimation.estimator import Estimate, rejected, two_frames
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion
@@ -50,6 +50,15 @@ class GroundPair:
         whole = np.array(warp, dtype=float)
         whole[:, 2] += np.array(self.corner) - whole[:, :2] @ np.array(self.corner)
         return self.view.motion(whole)
+
+    def estimate(self, warp: NDArray[np.floating]) -> Estimate:
+        """Return the estimate of such a warp; reject one that takes the pictures half apart."""
+        rows, columns = self.first.shape
+        corners = np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]], dtype=float)
+        moved = np.abs(corners @ warp[:, :2].T + warp[:, 2] - corners)
+        if not (moved < np.array([columns, rows]) / 2).all():
+            return rejected("the pictures as registered do not overlap by half")
+        return Estimate(self.motion(warp))
 
 
 def ground_pair(frames: SonarFrames, name: str) -> GroundPair:

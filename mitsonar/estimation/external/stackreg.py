@@ -37,4 +37,4 @@ class StackReg:
         if pair.reason:
             return rejected(pair.reason)
         registration = package("pystackreg").StackReg(package("pystackreg").StackReg.RIGID_BODY)
-        return Estimate(pair.motion(registration.register(pair.first, pair.second)[:2]))
+        return pair.estimate(registration.register(pair.first, pair.second)[:2])

@@ -107,6 +107,9 @@ def test_pictures_hold_nothing_but_the_fan(ground: NDArray[np.float64]) -> None:
     cut = whole.copy()
     cut[:, 2] += whole[:, :2] @ found.corner - found.corner
     np.testing.assert_allclose(found.motion(cut), motion, atol=1e-6)
+    assert found.estimate(cut).valid
+    apart = cut + np.array([[0, 0, 0.6 * columns], [0, 0, 0]])
+    assert "do not overlap by half" in found.estimate(apart).reason
 
 
 # ---------------------------------------------------------------- anybody's class
