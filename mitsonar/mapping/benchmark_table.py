@@ -1,8 +1,8 @@
-"""The table of the odometry benchmark as Markdown: a part for each set, texture and noise."""
+"""The tables of the odometry benchmark as Markdown: drift of all, then a part for each set, texture and noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 
 from mitsonar.estimation.benchmark_tables import Cells, markdown
@@ -19,7 +19,33 @@ UNITS = " / ".join(f"{axis.name} {axis.unit}" for axis in AXES)
 
 def benchmark_lines(rows: Sequence[PlainTable]) -> list[str]:
     """Return the rows, in their order, as lines of Markdown."""
-    return [line for _, group in groupby(rows, key=_cell) for line in _part(list(group))]
+    parts = [list(group) for _, group in groupby(rows, key=_cell)]
+    return [*_overview(parts), *(line for part in parts for line in _part(part))]
+
+
+def _overview(parts: list[list[PlainTable]]) -> Iterator[str]:
+    """Yield a table of drift in percent: a line a method, a column a set; nothing for a single set."""
+    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in parts if "path_m" in part[0]}
+    if len(drifts) < 2:
+        return
+    methods = dict.fromkeys(name for of in drifts.values() for name in of)
+    texts: Cells = {name: _drift_in(name) for name in drifts}
+    lines: list[PlainTable] = [{"method": m, **{name: of.get(m, {}) for name, of in drifts.items()}} for m in methods]
+    yield from ("", "Drift over segments, % of their length; after a comma the motions that failed, %", "")
+    yield from markdown(lines, ("method", *drifts), {"method": CELLS["method"], **texts})
+
+
+def _drift_in(name: str) -> Callable[[PlainTable], str]:
+    """Return what writes the drift and the failures of a method in a set."""
+
+    def text(line: PlainTable) -> str:
+        row = line[name]
+        if not row:
+            return ""
+        failed = f", {100 * row['failures'] / row['pairs']:.0f}" if row["failures"] else ""
+        return f"{row['drift_percent'][0]:.1f}{failed}" if row.get("drift_percent") else f"-{failed}"
+
+    return text
 
 
 def _cell(row: PlainTable) -> tuple[str, str, str]:
@@ -68,20 +94,12 @@ def _spanned(row: PlainTable, name: str, digits: int) -> str:
     return f"{value:.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
 
 
-def _errors(row: PlainTable) -> str:
-    """Return the RMSE of each axis with its interval."""
-    if "rmse" not in row:
-        return "-"
-    table = zip(row["rmse"], row["rmse_low"], row["rmse_high"], DIGITS, strict=True)
-    return " / ".join(f"{value:.{d}f} ({low:.{d}f}..{high:.{d}f})" for value, low, high, d in table)
-
-
 CELLS: Cells = {
     "method": lambda row: str(row["method"]),
     "drift %": lambda row: _spanned(row, "drift_percent", 1),
     "drift deg / 100 m": lambda row: _spanned(row, "drift_deg_per_100m", 0),
     "end %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.1f}",
-    "RMSE": _errors,
+    "RMSE": lambda row: _three(row["rmse"]) if "rmse" in row else "-",
     "/ bound": lambda row: _three(row["over_bound"], (0, 0, 0)) if "over_bound" in row else "-",
     "nees": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.1f}",
     "net motion": lambda row: _three(row["sums"]) if "sums" in row else "-",

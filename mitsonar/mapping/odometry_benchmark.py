@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.named_estimators import EXTERNAL, estimator_from
 from mitsonar.io.plain_data import parse_json
@@ -99,8 +99,9 @@ def benchmark_odometry(
     Raises:
         MitsonarError: unknown names, no frames, or another benchmark in the folder.
     """
+    cells = list(_cells(wanted))
     methods, notes = _methods(wanted)
-    cases = [case for cell in _cells(wanted) for case in _cases(cell, methods, wanted)]
+    cases = [case for cell in cells for case in _cases(cell, methods, wanted)]
     settings = {"frames": wanted.frames or FRAMES, "limit": wanted.frames, "seed": SEED, "lengths_m": LENGTHS_M}
     bench = _Bench(RunDirectory.begin(out, BENCHMARK, settings, resume=resume, overwrite=overwrite), wanted)
     bench.run.start()
@@ -181,10 +182,15 @@ def _order(row: PlainTable) -> tuple[int, str, str, int, int, str]:
 
 
 class _Bench:
-    """The folder of a benchmark."""
+    """The folder of a benchmark.
+
+    Attributes:
+        told: sentences that opening recordings gave, each once; they are the same for every method.
+    """
 
     def __init__(self, run: RunDirectory, wanted: Wanted) -> None:
         self.run, self.out, self.wanted = run, run.path, wanted
+        self.told: dict[str, None] = {}
         self.journal = run.path / "rows.jsonl"
 
     def rows(self) -> dict[tuple[str, str, str, str], PlainTable]:
@@ -220,7 +226,10 @@ class _Bench:
             rendered = RenderedSet(case.name, case.texture, case.noise, self.wanted.frames or FRAMES, self.out)
             source = rendered.source(begin)
         else:
-            source = _recorded(case, estimator, self.wanted.frames)
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always", MitsonarWarning)
+                source = _recorded(case, estimator, self.wanted.frames)
+            self.told |= dict.fromkeys(str(one.message) for one in told if one.category is MitsonarWarning)
         bound = None if rendered is None or not self.wanted.bound else self._bound(case, rendered, begin)
         loops = 0 if source.true is not None else max(0, len(source) - 1 - LOOP)
         with begin(" ".join(case.words), len(source) - 1 + loops) as progress:
@@ -243,7 +252,8 @@ class _Bench:
 
     def finish(self, rows: list[PlainTable], notes: list[str]) -> PlainTable:
         """Write the table of all rows."""
-        report: PlainTable = {**self.run.asked, "loop": LOOP, "notes": notes, "rows": rows, **versions(BENCHMARK.packages)}
+        report: PlainTable = {**self.run.asked, "loop": LOOP, "notes": [*self.told, *notes], "rows": rows}
+        report |= versions(BENCHMARK.packages)
         write_whole(self.out / "table.md", ("\n".join(benchmark_lines(rows)) + "\n").encode())
         write_json(self.out / "table.json", report)
         self.run.finish()
@@ -256,9 +266,7 @@ def _recorded(case: Case, estimator: AnyEstimator, frames: int | None) -> FrameS
     Raises:
         MitsonarError: fewer than two frames, or frames that the estimator does not take.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the same for every method; `mitsonar recording info` tells them
-        source = cast(FrameSource, open_source(case.name, estimator, Reading(geometry=case.geometry)))
+    source = cast(FrameSource, open_source(case.name, estimator, Reading(geometry=case.geometry)))
     return source if frames is None else _first(source, frames)
 
 

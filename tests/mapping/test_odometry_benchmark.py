@@ -18,10 +18,12 @@ from mitsonar.estimation.zero import Zero
 from mitsonar.mapping import benchmark_row, benchmark_sets, odometry_benchmark, odometry_run
 from mitsonar.mapping.benchmark_row import Case, measured_row
 from mitsonar.mapping.benchmark_sets import SETS, STEP_M, RenderedSet, benchmark_course
+from mitsonar.mapping.benchmark_table import benchmark_lines
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
 from mitsonar.motion.composition import motions
 from mitsonar.motion.trajectory_errors import path_length
+from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.worlds.ship_hull import ShipHull
 from mitsonar.worlds.slope import sloped
@@ -164,6 +166,22 @@ def test_without_truth_loops_are_closed(frames: SonarFrames, tmp_path: Path) -> 
     np.testing.assert_allclose(row["sums"][:2], motions(frames.poses).sum(axis=0)[:2] * 1e3, atol=8)
 
 
+def test_the_overview_has_a_column_a_set() -> None:
+    row = {"texture": "still", "noise": "none", "frames": 9, "pairs": 8, "failures": 2, "note": "", "ms": 1.0, "path_m": 2.0}
+    rows = [
+        row | {"set": "rocks", "method": "ecc", "drift_percent": [3.25, 2.0, 4.0]},
+        row | {"set": "rocks", "method": "flow", "failures": 0, "drift_percent": [1.0, 0.5, 2.0]},
+        row | {"set": "hull", "method": "ecc"},
+    ]
+    lines = benchmark_lines(rows)
+    assert [" ".join(line.split()) for line in lines[3:7]] == [
+        "| method | rocks, still, none | hull, still, none |",
+        "| --- | --- | --- |",
+        "| ecc | 3.2, 25 | -, 25 |",
+        "| flow | 1.0 | |",
+    ]
+
+
 # ---------------------------------------------------------------- the folder
 
 
@@ -200,6 +218,18 @@ def test_rows_come_one_by_one_and_are_not_made_again(run_of: Path, tmp_path: Pat
     assert table_of(out)[0] == first[0]
     with pytest.raises(MitsonarError, match="limit"):
         benchmark_odometry(Wanted((str(run_of),), methods=("zero",), frames=5), out, resume=True)
+
+
+@pytest.mark.filterwarnings("default")
+def test_what_is_assumed_of_a_recording_is_told_once(tmp_path: Path, frames: SonarFrames) -> None:
+    decibels = np.clip(1 + np.log10(np.maximum(frames.image, 1e-8)) / 8, 0, 1).astype(np.float32)
+    sonar = frames.sonar.replace(coding="dB", coding_db=80.0, frequency_hz=1.8e6, azimuth_fov_deg=28)
+    blind = replace(frames, image=decibels, level="dB", poses=None, height_m=None, sonar=sonar)
+    write_aris(tmp_path / "dive.aris", blind, beams=96)
+    wanted = Wanted((str(tmp_path / "dive.aris"),), methods=("zero", "flow"), frames=4)
+    report = benchmark_odometry(wanted, tmp_path / "bench")
+    assert [row["frames"] for row in report["rows"]] == [4, 4]
+    assert sum("tells no height over the ground" in note for note in report["notes"]) == 1
 
 
 def test_a_method_that_takes_other_frames_is_a_note(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
