@@ -44,6 +44,8 @@ EXTRAS = {
     "foxglove": ("live", "a live sonar"),
     "websockets": ("live", "a client of a live sonar"),
     "rerun": ("view", "showing frames in Rerun"),
+    "small_gicp": ("bench", "the estimator cfar-gicp"),
+    "pystackreg": ("bench", "the estimator stackreg"),
 }
 """Optional packages: the extra that installs each, and what needs it."""
 

@@ -24,6 +24,7 @@ def application() -> typer.Typer:
     import typer
 
     from mitsonar.cli import (
+        benchmark_command,
         compare_command,
         crlb_command,
         dataset_command,
@@ -77,4 +78,5 @@ def application() -> typer.Typer:
     app.add_typer(dataset_command.datasets(), name="dataset")
     app.add_typer(recording_command.recordings(), name="recording")
     app.add_typer(frames_command.frames(), name="frames")
+    app.add_typer(benchmark_command.benchmarks(), name="benchmark")
     return app

@@ -33,7 +33,7 @@ def warn(text: str) -> None:
     typer.echo(f"warning: {text}", err=True)
 
 
-RESUME_HINT = "the same command goes on (`render`, `odometry` and `train` with --resume)"
+RESUME_HINT = "the same command goes on (`render`, `odometry`, `benchmark odometry` and `train` with --resume)"
 
 
 def say_stopped() -> None:

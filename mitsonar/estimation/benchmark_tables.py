@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from mitsonar.estimation.estimator import PlainTable
 
-__all__ = ["FEWEST_SCENES", "markdown", "table_lines"]
+__all__ = ["FEWEST_SCENES", "Cells", "markdown", "table_lines"]
 
 FEWEST_SCENES = 10
 """Fewest scenes for clustered intervals; with fewer they are much too narrow."""
@@ -30,9 +30,14 @@ def table_lines(table: PlainTable) -> list[str]:
     return lines
 
 
-def markdown(rows: list[PlainTable], columns: Sequence[str]) -> list[str]:
-    """Return the methods as lines of a Markdown table with these columns of :data:`CELLS`."""
-    cells = [list(columns), ["---"] * len(columns), *([CELLS[column](row) for column in columns] for row in rows)]
+Cells = Mapping[str, Callable[[PlainTable], str]]
+"""The text of a column, of a row."""
+
+
+def markdown(rows: list[PlainTable], columns: Sequence[str], texts: Cells | None = None) -> list[str]:
+    """Return the methods as lines of a Markdown table with these columns of ``texts``; default: of :data:`CELLS`."""
+    text = CELLS if texts is None else texts
+    cells = [list(columns), ["---"] * len(columns), *([text[column](row) for column in columns] for row in rows)]
     width = [max(len(row[k]) for row in cells) for k in range(len(columns))]
     return ["| " + " | ".join(cell.ljust(size) for cell, size in zip(row, width, strict=True)) + " |" for row in cells]
 
@@ -57,7 +62,7 @@ def _interval(row: PlainTable) -> str:
     return " ".join(f"{_number(low, k)}..{_number(high, k)}" for k, (low, high) in enumerate(ends))
 
 
-CELLS: dict[str, Callable[[PlainTable], str]] = {
+CELLS: Cells = {
     "method": lambda row: str(row["method"]),
     "RMSE": lambda row: _three(row["rmse"]),
     "as in the thesis": lambda row: _joined(row["thesis"], 2),
@@ -74,7 +79,7 @@ CELLS: dict[str, Callable[[PlainTable], str]] = {
     "ms": lambda row: f"{row['ms']:.1f}",
     "inputs": lambda row: str(row["inputs"]),
 }
-"""The text of a column, of a row."""
+"""Those of a comparison or an evaluation."""
 
 COLUMNS = (
     *("method", "RMSE", "95 % interval", "median", "95 %", "slope", "large", "fail", "skill", "/ limit (rays)", "nees"),

@@ -13,6 +13,10 @@ from mitsonar.errors import MitsonarError, explain_missing, meant, nearest_names
 from mitsonar.estimation.channel.correlation import Correlation
 from mitsonar.estimation.channel.likelihood import Likelihood
 from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.estimation.external.cfar_gicp import CfarGicp
+from mitsonar.estimation.external.fourier_mellin import FourierMellin
+from mitsonar.estimation.external.python_class import PythonClass, names_python_class
+from mitsonar.estimation.external.stackreg import StackReg
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.flow import Flow
@@ -25,6 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ESTIMATORS",
+    "EXTERNAL",
     "NAMES",
     "create_estimator",
     "estimator_from",
@@ -45,10 +50,19 @@ ESTIMATORS: dict[str, type[AnyEstimator]] = {
 }
 """Estimators without training, of sonar frames or of impulse responses: see ``consumes``."""
 
+EXTERNAL: dict[str, type[AnyEstimator]] = {
+    "cfar-gicp": CfarGicp,
+    "fourier-mellin": FourierMellin,
+    "stackreg": StackReg,
+}
+"""Estimators by packages that mitsonar does not need: the extra ``bench``."""
+
+UNTRAINED = ESTIMATORS | EXTERNAL
+
 Options = dict[str, Any]
 """Options of an estimator by name: numbers, or yes and no."""
 
-NAMES = (*ESTIMATORS, *SHIPPED)
+NAMES = (*UNTRAINED, *SHIPPED)
 
 
 def estimators_for(record: type) -> tuple[str, ...]:
@@ -74,8 +88,8 @@ def estimator_from(text: str) -> AnyEstimator:
     """Create an estimator from a text of the command line.
 
     The text is a name, a checkpoint or the folder of a training run, or one of them with options:
-    ``NAME:key=value:key=value``, angles as ``..._deg``. Of several checkpoints with commas between them, the one trained
-    nearest to the height of the frames is used.
+    ``NAME:key=value:key=value``, angles as ``..._deg``; or a Python class, ``my_module:MyEstimator``. Of several checkpoints
+    with commas between them, the one trained nearest to the height of the frames is used.
 
     Raises:
         MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
@@ -85,9 +99,12 @@ def estimator_from(text: str) -> AnyEstimator:
     name, *words = text.split(":")
     if name in NAMES:
         return create_estimator(name, **options_from(name, words, _maker(name)))
+    if names_python_class(text):
+        return PythonClass(text)
     if not names_checkpoint(name):
         names = nearest_names(name, NAMES)
-        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give a checkpoint or the folder of a training run")
+        other = "a checkpoint, the folder of a training run, or a class as my_module:MyEstimator"
+        raise MitsonarError(f"unknown estimator {name!r}: {names}; or give {other}")
     made = _trained(name)
     return made(**options_from(name, words, made))
 
@@ -110,7 +127,7 @@ def _nearest(texts: list[str]) -> AnyEstimator:
 
 def _maker(name: str) -> Callable[..., AnyEstimator]:
     """Return the function that creates the estimator of that name from options."""
-    return ESTIMATORS[name] if name in ESTIMATORS else _trained(shipped_path(name))
+    return UNTRAINED[name] if name in UNTRAINED else _trained(shipped_path(name))
 
 
 def _trained(path: str | Path) -> Callable[..., AnyEstimator]:

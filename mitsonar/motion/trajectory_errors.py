@@ -21,6 +21,7 @@ __all__ = [
     "aligned",
     "assess",
     "associated",
+    "distance_driven",
     "path_length",
     "relative_errors",
 ]
@@ -189,7 +190,12 @@ def associated(estimated_s: Array, true_s: Array, tolerance_s: float = 0.01) -> 
 
 def path_length(path: Trajectory) -> float:
     """Sum the distances from pose to pose [m]."""
-    return float(_driven(path)[-1])
+    return float(distance_driven(path)[-1])
+
+
+def distance_driven(path: Trajectory) -> Array:
+    """Sum the distances from pose to pose up to each pose ``(frames,)`` [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.poses[:, :3], axis=0), axis=1))])
 
 
 def aligned(estimated: Trajectory, true: Trajectory, align: Alignment) -> Trajectory:
@@ -260,7 +266,7 @@ def _pairs(true: Trajectory, delta: float, unit: DeltaUnit, overlapping: bool) -
     if unit == "frames" and delta >= 1 and float(delta).is_integer():
         ends = index + int(delta)
     elif unit == "metres" and delta > 0:
-        driven = _driven(true)
+        driven = distance_driven(true)
         ends = np.searchsorted(driven, driven + delta * (1 - 1e-9))  # rounding must not lengthen equal steps
     else:
         raise MitsonarError(f"delta must be 1, 2, ... frames or a positive number of metres: got {delta:g} {unit}")
@@ -298,11 +304,6 @@ def _turn_in_space(here: Array, there: Array) -> Rotation:
             "a straight path does not determine the rotation about itself: align in the plane or by the first pose"
         )
     return Rotation.align_vectors(b, a)[0]
-
-
-def _driven(path: Trajectory) -> Array:
-    """Return the distance driven up to each pose ``(frames,)`` [m]."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path.poses[:, :3], axis=0), axis=1))])
 
 
 def _picked(path: Trajectory, index: Index) -> Trajectory:

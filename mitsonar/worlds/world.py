@@ -173,12 +173,16 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Floor:
-    """A square plane around the origin; ``texture`` is the XML of what gives its reflectivity."""
+    """A square plane around the origin; ``texture`` is the XML of what gives its reflectivity.
+
+    It rises along +y by ``slope_deg``.
+    """
 
     half_m: float
     texture: str
     z_m: float = 0.0
     name: str = "seabed"
+    slope_deg: float = 0.0
 
     @staticmethod
     def cells(count: int, span: tuple[float, float], seed: int) -> str:
@@ -192,11 +196,12 @@ class Floor:
 
     def xml(self) -> str:
         """Return the XML of the shape."""
+        turn = f'<rotate x="1" angle="{self.slope_deg!r}"/>\n            ' if self.slope_deg else ""
         return f"""
     <shape type="rectangle" id="{self.name}">
         <transform name="to_world">
             <scale value="{self.half_m!r}"/>
-            <translate z="{self.z_m!r}"/>
+            {turn}<translate z="{self.z_m!r}"/>
         </transform>
         <bsdf type="diffuse">
             {self.texture}

@@ -1,0 +1,1 @@
+"""Methods of other packages, and of anybody, as estimators."""

@@ -1,0 +1,112 @@
+"""The tables of the odometry benchmark as Markdown: drift of all, then a part for each set, texture and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+
+from mitsonar.estimation.benchmark_tables import Cells, markdown
+from mitsonar.estimation.estimator import PlainTable
+from mitsonar.motion.motion_errors import AXES
+
+__all__ = ["benchmark_lines"]
+
+FEWEST_BLOCKS = 10
+"""Fewest blocks of a path for intervals; with fewer they are too narrow."""
+
+UNITS = " / ".join(f"{axis.name} {axis.unit}" for axis in AXES)
+
+
+def benchmark_lines(rows: Sequence[PlainTable]) -> list[str]:
+    """Return the rows, in their order, as lines of Markdown."""
+    parts = [list(group) for _, group in groupby(rows, key=_cell)]
+    return [*_overview(parts), *(line for part in parts for line in _part(part))]
+
+
+def _overview(parts: list[list[PlainTable]]) -> Iterator[str]:
+    """Yield a table of drift in percent: a line a method, a column a set; nothing for a single set."""
+    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in parts if "path_m" in part[0]}
+    if len(drifts) < 2:
+        return
+    methods = dict.fromkeys(name for of in drifts.values() for name in of)
+    texts: Cells = {name: _drift_in(name) for name in drifts}
+    lines: list[PlainTable] = [{"method": m, **{name: of.get(m, {}) for name, of in drifts.items()}} for m in methods]
+    yield from ("", "Drift over segments, % of their length; after a comma the motions that failed, %", "")
+    yield from markdown(lines, ("method", *drifts), {"method": CELLS["method"], **texts})
+
+
+def _drift_in(name: str) -> Callable[[PlainTable], str]:
+    """Return what writes the drift and the failures of a method in a set."""
+
+    def text(line: PlainTable) -> str:
+        row = line[name]
+        if not row:
+            return ""
+        failed = f", {100 * row['failures'] / row['pairs']:.0f}" if row["failures"] else ""
+        return f"{row['drift_percent'][0]:.1f}{failed}" if row.get("drift_percent") else f"-{failed}"
+
+    return text
+
+
+def _cell(row: PlainTable) -> tuple[str, str, str]:
+    return row["set"], row["texture"], row["noise"]
+
+
+def _part(rows: list[PlainTable]) -> Iterator[str]:
+    """Yield heading, facts and table of one set."""
+    first = rows[0]
+    true = [row for row in rows if "path_m" in row]
+    noise = "" if first["texture"] == "recorded" else f", noise {first['noise']}"
+    yield from ("", f"**{first['set']}, {first['texture']}{noise}**: {'; '.join(_facts(first, true))}", "")
+    yield from markdown(rows, COLUMNS if true else CLOSURE_COLUMNS, CELLS)
+    yield from (f"- {row['method']}: {row['note']}" for row in rows if row["note"])
+
+
+def _facts(first: PlainTable, true: list[PlainTable]) -> Iterator[str]:
+    """Yield what holds for all rows."""
+    yield f"{first['frames']} frames"
+    if not true:
+        yield f"no truth; net motion and closure: {UNITS}"
+        return
+    one = true[0]
+    yield f"path {one['path_m']:.2f} m; RMSE: {UNITS}"
+    if one.get("bound") is not None:
+        yield f"bound {_three(one['bound'])}"
+    if "segments" in one:
+        lengths = ", ".join(f"{length:g}" for length in one["lengths_m"])
+        few = f", so few that intervals are too narrow (95 %, over {one['blocks']} blocks)"
+        blocks = few if one["blocks"] < FEWEST_BLOCKS else f", 95 % intervals over {one['blocks']} blocks"
+        yield f"{one['segments']} segments of {lengths} m{blocks}"
+
+
+DIGITS = (2, 2, 3)
+
+
+def _three(values: Sequence[float | None], digits: Sequence[int] = DIGITS) -> str:
+    return " / ".join("-" if value is None else f"{value:.{d}f}" for value, d in zip(values, digits, strict=True))
+
+
+def _spanned(row: PlainTable, name: str, digits: int) -> str:
+    """Return a value with its interval."""
+    if row.get(name) is None:
+        return "-"
+    value, low, high = row[name]
+    return f"{value:.{digits}f} ({low:.{digits}f}..{high:.{digits}f})"
+
+
+CELLS: Cells = {
+    "method": lambda row: str(row["method"]),
+    "drift %": lambda row: _spanned(row, "drift_percent", 1),
+    "drift deg / 100 m": lambda row: _spanned(row, "drift_deg_per_100m", 0),
+    "end %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.1f}",
+    "RMSE": lambda row: _three(row["rmse"]) if "rmse" in row else "-",
+    "/ bound": lambda row: _three(row["over_bound"], (0, 0, 0)) if "over_bound" in row else "-",
+    "nees": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.1f}",
+    "net motion": lambda row: _three(row["sums"]) if "sums" in row else "-",
+    "closure": lambda row: _three(row["closure"]) if "closure" in row else "-",
+    "fail": lambda row: f"{row['failures']} of {row['pairs']}",
+    "ms": lambda row: f"{row['ms']:.0f}",
+}
+
+COLUMNS = ("method", "drift %", "drift deg / 100 m", "end %", "RMSE", "/ bound", "nees", "fail", "ms")
+CLOSURE_COLUMNS = ("method", "net motion", "closure", "fail", "ms")

@@ -1,0 +1,162 @@
+"""Other packages as estimators: a known motion is found, an absent package is one sentence, anybody's class works."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_frames import SONAR
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.external.ground_pair import ground_pair
+from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator, estimator_from
+from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.records.sonar_frames import SonarFrames
+
+START = Pose.from_degrees([1.0, -2.0, 2.5, 35, 0, 40])
+UNITS = np.array([1e3, 1e3, 180 / np.pi])
+MODULES = {"cfar-gicp": "small_gicp", "fourier-mellin": "fourier_mellin", "stackreg": "pystackreg"}
+
+ALLOWED = {"cfar-gicp": [25.0, 8.0, 0.5], "fourier-mellin": [25.0, 8.0, 0.5], "stackreg": [2.0, 2.0, 0.05]}
+"""Errors on drawn ground in mm, mm, deg. A beam is 23 mm wide, which is as well as a detection knows its place."""
+
+
+@pytest.fixture(scope="module")
+def ground() -> NDArray[np.float64]:
+    """Ground of fine grain with bright spots: some packages find nothing in what is smooth."""
+    rng = np.random.default_rng(7)
+    fine = ndimage.gaussian_filter(rng.normal(size=(700, 700)), 1)
+    spots = ndimage.gaussian_filter((rng.random((700, 700)) < 0.004).astype(float), 1)
+    return np.asarray(np.clip(0.15 + 0.05 * fine / fine.std() + 0.6 * spots / spots.max(), 0, 1))
+
+
+def pair(ground: NDArray[np.float64], motion: Motion, start: Pose = START) -> SonarFrames:
+    """Two frames of that ground, the motion apart, drawn by geometry alone."""
+    poses = Trajectory(np.array([start, compose(start, motion)]), np.array([0.0, 0.1]))
+    images = []
+    for pose in poses.poses:
+        seen = GroundGeometry(SONAR.range_m, SONAR.bearing_rad, SONAR.bearing, pose[2], pose[3], pose[4])
+        place = moved(seen.points, (0.0, 0.0, -pose[5])) + pose[:2]
+        images.append(ndimage.map_coordinates(ground, np.moveaxis(place, -1, 0)[::-1] / 0.02 + 350, order=1))
+    image = np.array(images, np.float32)
+    return SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, poses.time_s, SONAR, poses.poses, poses.poses[:, 2].copy())
+
+
+MOTIONS = [
+    Motion(0.0, 0.0, 0.0),
+    Motion(0.06, 0.0, 0.0),
+    Motion(0.0, -0.06, 0.0),
+    Motion(0.0, 0.0, 0.03),
+    Motion(-0.03, 0.04, -0.02),
+]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("name", EXTERNAL)
+def test_a_known_motion_is_found(name: str, motion: Motion, ground: NDArray[np.float64]) -> None:
+    pytest.importorskip(MODULES[name])
+    found = create_estimator(name).estimate(pair(ground, motion))
+    assert found.valid, found.reason
+    error = (np.array(found.motion) - motion) * UNITS
+    assert (np.abs(error) < ALLOWED[name]).all(), f"{name}: {error} mm, mm, deg"
+
+
+@pytest.mark.parametrize("name", EXTERNAL)
+def test_empty_frames_are_rejected(name: str, ground: NDArray[np.float64]) -> None:
+    pytest.importorskip(MODULES[name])
+    frames = pair(ground, Motion(0.0, 0.0, 0.0))
+    found = create_estimator(name).estimate(replace(frames, image=np.zeros_like(frames.image)))
+    assert not found.valid
+    assert found.reason
+
+
+def test_a_prior_begins_the_registration_of_points(ground: NDArray[np.float64]) -> None:
+    """A motion of 0.8 m lies beyond the neighbours of a point; from a prior nearby it is found."""
+    pytest.importorskip("small_gicp")
+    far = Motion(0.0, 0.8, 0.0)
+    estimator, frames = create_estimator("cfar-gicp"), pair(ground, far)
+    prior = MotionPrior(Motion(0.02, 0.78, 0.0), np.eye(3))
+    assert abs(estimator.estimate(frames).motion.forward - 0.8) > 0.1
+    assert abs(estimator.estimate(frames, prior=prior).motion.forward - 0.8) < 0.02
+
+
+@pytest.mark.parametrize("name", EXTERNAL)
+def test_an_absent_package_is_one_sentence(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, MODULES[name], None)
+    with pytest.raises(MitsonarError, match=r"which is not installed: pip install"):
+        create_estimator(name)
+
+
+def test_pictures_hold_nothing_but_the_fan(ground: NDArray[np.float64]) -> None:
+    """The rectangle lies inside; its warp is that of the whole view, about another corner."""
+    found = ground_pair(pair(ground, Motion(0.0, 0.0, 0.0)), "it")
+    column, row = found.corner
+    rows, columns = found.first.shape
+    assert found.view.inside[row : row + rows, column : column + columns].all()
+    motion = Motion(0.02, -0.01, 0.03)
+    whole = found.view.warp(motion).astype(float)
+    cut = whole.copy()
+    cut[:, 2] += whole[:, :2] @ found.corner - found.corner
+    np.testing.assert_allclose(found.motion(cut), motion, atol=1e-6)
+    assert found.estimate(cut).valid
+    apart = cut + np.array([[0, 0, 0.6 * columns], [0, 0, 0]])
+    assert "do not overlap by half" in found.estimate(apart).reason
+
+
+# ---------------------------------------------------------------- anybody's class
+
+MINE = '''
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.motion.composition import Motion
+
+class Fixed:
+    """Always the same motion."""
+    def estimate(self, frames):
+        return Estimate(Motion(0.01 * len(frames), 0.0, 0.0))
+
+class Bare:
+    def estimate(self, frames):
+        return 0.01, 0.0, 0.0
+
+class Other:
+    pass
+'''
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_module.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_module", raising=False)
+
+
+@pytest.mark.usefixtures("mine")
+def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -> None:
+    estimator = estimator_from("my_module:Fixed")
+    frames = pair(ground, Motion(0.0, 0.0, 0.0))
+    assert estimator.estimate(frames).motion == Motion(0.02, 0.0, 0.0)
+    with pytest.raises(MitsonarError, match="my_module:Bare: estimate must return an Estimate: got tuple"):
+        estimator_from("my_module:Bare").estimate(frames)
+
+
+@pytest.mark.usefixtures("mine")
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("my_module:Missing", "my_module has no Missing"),
+        ("my_module:Other", r"has no method estimate\(frames\)"),
+        ("no_module_of_this_name:Fixed", "is no module here: start in its folder, or install it"),
+    ],
+)
+def test_what_is_no_estimator_is_one_sentence(text: str, reason: str) -> None:
+    with pytest.raises(MitsonarError, match=reason):
+        estimator_from(text)

@@ -1,0 +1,291 @@
+"""The odometry benchmark: its sets, its rows against closed forms, its folder that goes on, and its command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drawn_frames import over_ground, sway
+from helpers import Command
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.zero import Zero
+from mitsonar.mapping import benchmark_row, benchmark_sets, odometry_benchmark, odometry_run
+from mitsonar.mapping.benchmark_row import Case, measured_row
+from mitsonar.mapping.benchmark_sets import SETS, STEP_M, RenderedSet, benchmark_course
+from mitsonar.mapping.benchmark_table import benchmark_lines
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
+from mitsonar.motion.composition import motions
+from mitsonar.motion.trajectory_errors import path_length
+from mitsonar.recordings.aris_writer import write_aris
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.worlds.ship_hull import ShipHull
+from mitsonar.worlds.slope import sloped
+from mitsonar.worlds.world import World
+
+Row = dict[str, Any]
+
+
+@pytest.fixture(autouse=True)
+def bare(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figure of each path, which takes a second, and fewer pairs to time."""
+    monkeypatch.setattr(odometry_run, "save_figure", lambda path, figure: None)
+    monkeypatch.setattr(odometry_run, "path_figure", lambda *_, **__: None)
+    monkeypatch.setattr(benchmark_row, "TIMED_PAIRS", 2)
+
+
+@pytest.fixture(scope="module")
+def frames() -> SonarFrames:
+    """Twelve frames of a drawn floor, with true poses."""
+    return over_ground(sway(12))
+
+
+@pytest.fixture
+def run_of(frames: SonarFrames, tmp_path: Path) -> Path:
+    """The folder of a run of them."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    frames.save(folder / "frames.npz")
+    return folder
+
+
+def row_of(frames: SonarFrames, method: str, folder: Path, **options: Any) -> Row:
+    case = Case("drawn", "recorded", "none", method)
+    return measured_row(case, FrameSource.of(frames), create_estimator(method), folder, **options)
+
+
+# ---------------------------------------------------------------- sets
+
+
+def test_the_course_moves_as_much_as_networks_were_trained_for() -> None:
+    course = benchmark_course(260)
+    moved = motions(course)
+    assert np.linalg.norm(moved[:, :2], axis=1) == pytest.approx(STEP_M, rel=1e-9)
+    assert np.abs(moved).max(axis=0)[0] == pytest.approx(STEP_M / 2, rel=0.02)
+    assert np.degrees(np.abs(moved[:, 2]).max()) < 0.31
+    np.testing.assert_allclose(course[0, :2] + course[-1, :2], 0, atol=1e-12)
+
+
+def test_a_set_stands_where_its_sonar_sees_the_ground() -> None:
+    """The height over a slope follows the course; the path has the length of its steps."""
+    for name, one in SETS.items():
+        path = one.path(260, 20.0)
+        height = path.poses[:, 2] - np.tan(np.radians(one.slope_deg)) * path.poses[:, 1]
+        assert (height > 0.3).all(), name
+        assert path_length(path) == pytest.approx(259 * STEP_M)
+        assert one.sonar("still", "none").model == "physical"
+        levels = [one.sonar("speckle", noise).noise_level_db for noise in ("none", "low", "high")]
+        assert levels[0] is None
+        assert levels[2] == levels[1] + one.raised_db
+
+
+def test_a_slope_turns_all_of_a_world() -> None:
+    """Vertices of the slope lie over its floor as those of the level world do: same distances to the plane."""
+    level = ShipHull(size_m=6, groups_a_side=(1, 2), anodes_a_side=(2, 3)).build(5)
+    tilted = sloped(level, 10.0)
+    normal = np.array([0.0, -np.sin(np.radians(10)), np.cos(np.radians(10))])
+    for mesh, turned in zip(level.meshes, tilted.meshes, strict=True):
+        np.testing.assert_allclose(turned.vertices @ normal, mesh.vertices[:, 2], atol=1e-12)
+    assert level.floor is not None
+    assert tilted.floor is not None
+    assert '<rotate x="1" angle="10.0"/>' in tilted.floor.xml()
+    assert "rotate" not in level.floor.xml()
+
+
+@pytest.mark.usefixtures("variant")
+def test_the_ground_of_the_slope_rises_forward(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heights below the sonar, by rays, against the plane in closed form."""
+    small = replace(
+        SETS["slope"], family=ShipHull(size_m=30, groups_a_side=(0, 0), anodes_a_side=(1, 1)), preset="didson300",
+        window={"range_min": 4.0, "range_max": 9.0, "range_bins": 64, "beams": 16},
+    )  # fmt: skip
+    monkeypatch.setitem(benchmark_sets.SETS, "slope", small)
+    monkeypatch.setitem(benchmark_sets.TEXTURES, "still", {"model": "physical", "rays_per_beam": 20, "rays_across": 1})
+    source = RenderedSet("slope", "still", "none", 12, tmp_path).source(lambda what, count: _Quiet())
+    assert source.poses is not None
+    wanted = source.poses[:, 2] - np.tan(np.radians(10)) * source.poses[:, 1]
+    np.testing.assert_allclose(source.height_m, wanted, atol=0.04)  # an anode is 0.03 m high
+
+
+class _Quiet:
+    """Progress of nobody."""
+
+    def __enter__(self) -> Any:
+        return lambda done: None
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+
+# ---------------------------------------------------------------- rows
+
+
+def test_zero_errs_by_all_of_the_motion(frames: SonarFrames, tmp_path: Path) -> None:
+    row = row_of(frames, "zero", tmp_path / "row", bound=np.array([1e-3, 1e-3, 1e-3]))
+    assert frames.poses is not None
+    true = motions(frames.poses)
+    rms = np.sqrt((true**2).mean(axis=0)) * [1e3, 1e3, 180 / np.pi]
+    np.testing.assert_allclose(row["rmse"], rms)
+    np.testing.assert_allclose(row["over_bound"], rms / [1, 1, 0.18 / np.pi])
+    ends = np.linalg.norm(frames.poses[-1, :2] - frames.poses[0, :2])
+    assert row["end_percent"] == pytest.approx(100 * ends / row["path_m"])
+    assert (row["failures"], row["pairs"], row["nees"]) == (0, 11, None)
+    assert "drift_percent" not in row  # a path of 0.2 m holds no segment of 1 m
+
+
+def test_a_method_is_judged_by_its_path_over_segments(frames: SonarFrames, tmp_path: Path, monkeypatch: Any) -> None:
+    """The same frames as if they were 20 times as far apart: zero drifts by all of each segment's chord."""
+    assert frames.poses is not None
+    far = frames.poses * [20, 20, 1, 1, 1, 1]
+    row = row_of(replace(frames, poses=far), "zero", tmp_path / "row")
+    assert row["lengths_m"][0] == 1
+    drift, low, high = row["drift_percent"]
+    assert 95 < low <= drift <= high < 150  # frames are 0.2 m apart, so that a segment may be longer than its length
+
+
+def test_motions_that_all_fail_are_a_row(frames: SonarFrames, tmp_path: Path) -> None:
+    empty = replace(frames, image=np.zeros_like(frames.image))
+    row = row_of(empty, "ecc", tmp_path / "row")
+    assert row["failures"] == row["pairs"] == 11
+    assert "none of 11 motions is believed" in row["note"]
+
+
+def test_without_truth_loops_are_closed(frames: SonarFrames, tmp_path: Path) -> None:
+    assert frames.poses is not None
+    blind = replace(frames, poses=None, attitude_rad=frames.poses[:, 3:6])
+    row = row_of(blind, "direct", tmp_path / "row")
+    assert "rmse" not in row
+    assert row["closure_steps"] == 8
+    assert max(row["closure"][:2]) < 3  # mm
+    np.testing.assert_allclose(row["sums"][:2], motions(frames.poses).sum(axis=0)[:2] * 1e3, atol=8)
+
+
+def test_the_overview_has_a_column_a_set() -> None:
+    row = {"texture": "still", "noise": "none", "frames": 9, "pairs": 8, "failures": 2, "note": "", "ms": 1.0, "path_m": 2.0}
+    rows = [
+        row | {"set": "rocks", "method": "ecc", "drift_percent": [3.25, 2.0, 4.0]},
+        row | {"set": "rocks", "method": "flow", "failures": 0, "drift_percent": [1.0, 0.5, 2.0]},
+        row | {"set": "hull", "method": "ecc"},
+    ]
+    lines = benchmark_lines(rows)
+    assert [" ".join(line.split()) for line in lines[3:7]] == [
+        "| method | rocks, still, none | hull, still, none |",
+        "| --- | --- | --- |",
+        "| ecc | 3.2, 25 | -, 25 |",
+        "| flow | 1.0 | |",
+    ]
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def table_of(folder: Path) -> list[Row]:
+    rows: list[Row] = json.loads((folder / "table.json").read_text())["rows"]
+    return [{name: value for name, value in row.items() if name != "ms"} for row in rows]
+
+
+def test_a_killed_benchmark_goes_on_to_the_same_bits(run_of: Path, tmp_path: Path) -> None:
+    wanted = Wanted((str(run_of),), methods=("zero", "direct", "flow"))
+    benchmark_odometry(wanted, tmp_path / "whole")
+    broken = tmp_path / "broken"
+    benchmark_odometry(replace(wanted, methods=("zero", "direct")), broken)
+    journal = broken / "rows.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(lines[0] + lines[1][:40])  # killed while the second row was written
+    estimates = next((broken / "paths").glob("*direct")) / "estimates.jsonl"
+    kept = estimates.read_bytes().splitlines(keepends=True)
+    estimates.write_bytes(b"".join(kept[:7]) + kept[7][:20])
+    benchmark_odometry(wanted, broken, resume=True)
+    assert table_of(broken) == table_of(tmp_path / "whole")
+    assert estimates.read_bytes() == b"".join(kept)
+
+
+def test_rows_come_one_by_one_and_are_not_made_again(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    out = tmp_path / "bench"
+    benchmark_odometry(Wanted((str(run_of),), methods=("zero",)), out)
+    with pytest.raises(MitsonarError, match="--resume goes on with it"):
+        benchmark_odometry(Wanted((str(run_of),), methods=("flow",)), out)
+    first = table_of(out)
+    monkeypatch.setattr(Zero, "estimate", None)  # asked again, it would fail
+    report = benchmark_odometry(Wanted((str(run_of),), methods=("zero", "flow")), out, resume=True)
+    assert [row["method"] for row in report["rows"]] == ["zero", "flow"]
+    assert table_of(out)[0] == first[0]
+    with pytest.raises(MitsonarError, match="limit"):
+        benchmark_odometry(Wanted((str(run_of),), methods=("zero",), frames=5), out, resume=True)
+
+
+@pytest.mark.filterwarnings("default")
+def test_what_is_assumed_of_a_recording_is_told_once(tmp_path: Path, frames: SonarFrames) -> None:
+    decibels = np.clip(1 + np.log10(np.maximum(frames.image, 1e-8)) / 8, 0, 1).astype(np.float32)
+    sonar = frames.sonar.replace(coding="dB", coding_db=80.0, frequency_hz=1.8e6, azimuth_fov_deg=28)
+    blind = replace(frames, image=decibels, level="dB", poses=None, height_m=None, sonar=sonar)
+    write_aris(tmp_path / "dive.aris", blind, beams=96)
+    wanted = Wanted((str(tmp_path / "dive.aris"),), methods=("zero", "flow"), frames=4)
+    report = benchmark_odometry(wanted, tmp_path / "bench")
+    assert [row["frames"] for row in report["rows"]] == [4, 4]
+    assert sum("tells no height over the ground" in note for note in report["notes"]) == 1
+
+
+def test_a_method_that_takes_other_frames_is_a_note(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    (tmp_path / "mine.py").write_text("class Choosy:\n    def estimate(self, frames):\n        return None\n")
+    monkeypatch.chdir(tmp_path)
+    report = benchmark_odometry(Wanted((str(run_of),), methods=("mine:Choosy", "zero")), tmp_path / "bench")
+    assert [row["method"] for row in report["rows"]] == ["zero"]
+    assert "mine:Choosy: mine:Choosy: estimate must return an Estimate" in report["notes"][0]
+
+
+def test_an_absent_package_is_a_note_unless_it_was_asked_for(run_of: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(odometry_benchmark, "METHODS", ("zero", "stackreg"))
+    monkeypatch.setitem(__import__("sys").modules, "pystackreg", None)
+    report = benchmark_odometry(Wanted((str(run_of),)), tmp_path / "bench")
+    assert "pip install 'mitsonar[bench]'" in report["notes"][0]
+    with pytest.raises(MitsonarError, match="the estimator stackreg needs pystackreg"):
+        benchmark_odometry(Wanted((str(run_of),), methods=("stackreg",)), tmp_path / "other")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["--set", "rock"], "unknown set 'rock': did you mean rocks?"),
+        (["--texture", "speckled"], "unknown texture 'speckled': did you mean speckle?"),
+        (["--noise", "loud"], "unknown noise 'loud': did you mean low?"),
+        (["--method", "dirct"], "unknown estimator 'dirct': did you mean direct?"),
+        (["--method", "likelihood"], "likelihood does not read frames of one view"),
+        (["--frames", "2"], "--frames must be at least 3: got 2"),
+    ],
+)
+def test_what_cannot_be_made_is_one_sentence(mitsonar: Command, options: list[str], reason: str, tmp_path: Path) -> None:
+    done = mitsonar("benchmark", "odometry", *options, "-o", tmp_path / "bench")
+    assert done.returncode == 2
+    assert reason in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "bench").exists()
+
+
+def small_hull(self: ShipHull, seed: int) -> World:
+    return BUILD(ShipHull(size_m=14, groups_a_side=(2, 3), anodes_a_side=(4, 5)), seed)
+
+
+BUILD = ShipHull.build
+
+
+@pytest.mark.usefixtures("variant")
+def test_one_command_renders_a_set_and_makes_its_row(mitsonar: Command, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(ShipHull, "build", small_hull)
+    monkeypatch.setitem(benchmark_sets.TEXTURES["speckle"], "quality", "draft")
+    command = ("benchmark", "odometry", "--set", "hull", "--texture", "speckle", "--frames", 3, "--bound", 0, "-o", tmp_path)
+    done = mitsonar(*command, "--method", "flow", "--resume")
+    assert done.returncode == 0, done.stderr
+    assert "**hull, speckle, noise none**: 3 frames; path 0.04 m" in done.stdout
+    assert (tmp_path / "sets" / "hull-speckle-none" / "frames.npz").exists()
+    again = mitsonar(*command, "--method", "zero", "--resume", "--json")
+    rows = json.loads(again.stdout)["rows"]
+    assert [row["method"] for row in rows] == ["zero", "flow"]
+    assert rows[1]["command"] == "--set hull --texture speckle --noise none --method flow"
+    assert "| flow " in (tmp_path / "table.md").read_text()
