@@ -30,7 +30,9 @@ def by_block(maps: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.f
 
 def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[int, int]) -> Floats:
     """Interpolate values of blocks ``(rows, columns)`` linearly to cells of this shape ``(bins, beams)``."""
-    row, column = (((np.arange(size) + 0.5) / edge - 0.5).astype(np.float32) for size, edge in zip(shape, block, strict=True))
+    row, column = (
+        ((np.arange(size) + 0.5) / edge - 0.5).astype(np.float32) for size, edge in zip(shape, block, strict=True)
+    )
     column, row = (np.ascontiguousarray(axis) for axis in np.broadcast_arrays(column[None], row[:, None]))
     drawn = cv2.remap(table.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(drawn, dtype=np.float32)

@@ -111,7 +111,7 @@ class Cells:
     def shift(self, v: NDArray[np.float64], *, back: bool = False, lift_m: float = 0.0) -> Floats:
         """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
 
-        It is in bins and beams; with ``back``, from the second frame to the first; with ``lift_m``, of ground so much higher.
+        It is in bins and beams; ``back``: from the second frame to the first; ``lift_m``: of ground so much higher.
         """
         ground = other = self._ground(self.attitude.height_m - lift_m) if lift_m else self.ground
         if self.heave:

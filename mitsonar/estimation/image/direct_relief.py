@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from mitsonar.estimation.estimator import correlation_of, spread_of
 from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
+from mitsonar.estimation.image.direct_registration import Fit, smoothed
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, sampled, slopes_of
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["RELIEF_LEVELS", "ReliefFit", "registered_over_relief"]
+__all__ = ["registered_over_relief"]
 
 Floats = NDArray[np.float32]
 Pair = tuple[Floats, Floats]
@@ -48,8 +49,8 @@ CAUCHY = 3.0
 ALIKE = 20.0
 """Residuals that count as one: those of a block err together where its ground is not as the model has it."""
 
-SETTLED = np.array([1e-4, 1e-4, 2e-5])
-"""Steps below which an iteration ends [m, m, rad]: a tenth of what is left over relief."""
+SETTLED = np.array([3e-4, 3e-4, 6e-5])
+"""Steps below which an iteration ends [m, m, rad]: a fifth of what is left over relief."""
 
 TALLEST_STEP = 0.06
 """Largest change of a height in one iteration, as part of the sonar's."""
@@ -58,28 +59,6 @@ SMALL = (2e-3, 2e-3, 5e-4, 0.1)
 """Steps of numerical derivatives [m, m, rad, m]."""
 
 FEWEST_CELLS = 500
-
-
-class ReliefFit(NamedTuple):
-    """A motion over relief, and its quality.
-
-    Attributes:
-        motion: sideways, forward [m], yaw [rad] ``(3,)``.
-        covariance: of it, from the residuals ``(3, 3)``.
-        by_height: derivative of it by the height of the sonar over the mean of the ground ``(3,)``.
-        converged: whether the last step was small.
-        correlation: of the frames as matched.
-        independent: number of cells that count once.
-        blocks: effective number of blocks that tell the motion.
-    """
-
-    motion: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    by_height: NDArray[np.float64]
-    converged: bool
-    correlation: float
-    independent: float
-    blocks: float
 
 
 class _Equations(NamedTuple):
@@ -115,7 +94,7 @@ class _ReliefLevel:
         self.level = level
         self.cells = Cells(frames, attitude, level, heave=False)
         slow = ILLUMINATION[0] / level.step, ILLUMINATION[1]
-        self.images = tuple(one - blurred(one, *slow) for one in (_smoothed(image, level) for image in images))
+        self.images = tuple(one - blurred(one, *slow) for one in (smoothed(image, level) for image in images))
         self.shape = self.images[0].shape
         self.block = max(1, RELIEF_BLOCK[0] // level.step), RELIEF_BLOCK[1]
         self.blocks = cell_blocks(self.shape, self.block)
@@ -195,7 +174,7 @@ class _ReliefLevel:
 
 def registered_over_relief(
     images: Pair, frames: SonarFrames, attitude: Attitude, start: NDArray[np.float64]
-) -> ReliefFit | None:
+) -> tuple[NDArray[np.float64], Fit] | None:
     """Register two frames from a start that is near the motion; None where there is nothing to match.
 
     Args:
@@ -203,6 +182,9 @@ def registered_over_relief(
         frames: the same, with their axes.
         attitude: of the sonar; its height is that over the mean of what is seen.
         start: sideways, forward [m], yaw [rad] ``(3,)``.
+
+    Returns:
+        The motion ``(3,)`` and its fit, whose derivative by the height is that by the mean of the heights.
     """
     v, heights, shape = np.asarray(start, dtype=np.float64), None, (0, 0)
     prior = 1 / (RELIEF_STD * attitude.height_m) ** 2
@@ -227,33 +209,25 @@ def registered_over_relief(
             if converged:
                 break
     assert found is not None
-    return _assessed(found, v, prior, level, converged=converged)
+    return v, _assessed(found, prior, level, converged=converged)
 
 
-def _assessed(
-    found: _Equations, v: NDArray[np.float64], prior: float, level: DirectLevel, *, converged: bool
-) -> ReliefFit:
+def _assessed(found: _Equations, prior: float, level: DirectLevel, *, converged: bool) -> Fit:
     """Return the covariance, and how the motion depends on the mean height."""
     normal, _ = found.without_heights(prior, np.zeros(len(found.height)))
     undone = np.linalg.inv(normal)
-    free = found.noise * prior / (found.height + found.noise * prior)
-    alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
-    return ReliefFit(
-        v,
-        found.noise * undone,
-        undone @ (found.both @ free),
-        converged,
-        found.correlation,
-        found.cells / alike,
-        spread_of(found.height),
+    held = found.noise * prior
+    alike = 4 * np.pi * max(level.smoothing[0], 0.28) * max(level.smoothing[1], 0.28)
+    return Fit(
+        converged=converged,
+        covariance=found.noise * undone,
+        by_height=undone @ (found.both @ (held / (found.height + held))),
+        correlation=found.correlation,
+        independent=found.cells / alike,
+        blocks=spread_of(found.height),
     )
 
 
 def _split(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Separate :meth:`_ReliefLevel._summed`: by motion ``(3, 4)``; motion by height ``(3, blocks)``; height by itself, pull."""
+    """Separate what :meth:`_ReliefLevel._summed` returns: by motion, motion by height, height by itself and by residual."""
     return sums[:12].sum(axis=1).reshape(3, 4), sums[12:15], sums[15:]
-
-
-def _smoothed(image: Floats, level: DirectLevel) -> Floats:
-    """Every so many bins of the smoothed image."""
-    return np.ascontiguousarray(blurred(image, *level.smoothing)[level.step // 2 :: level.step])
