@@ -72,7 +72,7 @@ LEAST_RELIEF_M = 0.02
 CONTRAST = 0.6
 """Mean height of landmarks, as part of the height of the contrast by first echoes: these come from the tops."""
 
-ATTITUDE_STD = np.array([1e-3, np.radians(0.02), np.radians(0.02)])
+ATTITUDE_STD = np.array([2e-4, np.radians(2e-3), np.radians(2e-3)])
 """Standard deviations of heights [m], pitches and rolls [rad] that poses tell."""
 
 ROUGH_STD = np.array([0.01, np.radians(0.3), np.radians(0.3)])
@@ -96,6 +96,7 @@ class _Map:
         poses: of the keyframes ``(6,)`` each.
         links: what sensors tell between keyframes: motion and covariance, or None.
         relief_m: mean height of what is seen over the ground.
+        lean: height, pitch and roll of the last keyframe, less what was told ``(3,)``.
         drift: covariance of x, y, heading that each keyframe adds ``(3, 3)`` each.
     """
 
@@ -105,6 +106,7 @@ class _Map:
     poses: list[Array] = field(default_factory=list)
     links: list[MotionPrior | None] = field(default_factory=list)
     relief_m: float = RELIEF_M
+    lean: Array = field(default_factory=lambda: np.zeros(3))
     drift: list[Array] = field(default_factory=list)
     shown: int = 0
 
@@ -148,7 +150,8 @@ def mapped(
     state = _Map(Landmarks(_axes(source.like)), std)
     path, reasons = [attitudes[0]], [""]
     for k, (frames, image) in enumerate(_images(source, numbers)):
-        expected = attitudes[0] if k == 0 else _predicted(path[-1], estimates[k - 1], priors and priors[k - 1], attitudes[k])
+        expected = attitudes[0].copy() if k == 0 else _predicted(path[-1], estimates[k - 1], priors and priors[k - 1], attitudes[k])
+        expected[2:5] += state.lean
         answer = _register(state, image, expected, *_trust(estimates, priors, k))
         pose = _update(state, k, frames, image, answer, priors)
         if k:
@@ -339,6 +342,7 @@ def _adjust(state: _Map) -> None:
     except LinAlgError:
         return  # the keyframes stay as they were registered
     landmarks.refine(number, new.points, new.point_covariance, new.faults)
+    state.lean += new.poses[-1, 2:5] - poses[-1, 2:5]
     state.poses[first:] = list(new.poses[first - oldest :])
     state.drift[-1] = new.last_covariance / (last - first)
 
