@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from mitsonar.mapping.mosaic import build_mosaic
     from mitsonar.mapping.odometry import odometry
     from mitsonar.mapping.open_frames import load_frames
+    from mitsonar.mapping.sensor_files import load_sensors, save_sensors
+    from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+    from mitsonar.mapping.vehicle_sensors import VehicleSensors
     from mitsonar.motion.composition import Motion
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
@@ -58,11 +61,13 @@ __all__ = [
     "Motion",
     "Pose",
     "RenderedPairs",
+    "SensorNoise",
     "Simulator",
     "Sonar",
     "SonarFrames",
     "SonarPairs",
     "Trajectory",
+    "VehicleSensors",
     "build_mosaic",
     "cramer_rao_bound",
     "create_estimator",
@@ -71,10 +76,13 @@ __all__ = [
     "load_noise",
     "load_recipe",
     "load_scene",
+    "load_sensors",
     "load_sonar",
     "make_dataset",
     "odometry",
     "open_recording",
+    "save_sensors",
+    "simulated_sensors",
     "write_mcap",
 ]
 
@@ -90,11 +98,13 @@ _MODULES = {
     "Motion": "motion.composition",
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered_pairs",
+    "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.imaging_sonar",
     "SonarFrames": "records.sonar_frames",
     "SonarPairs": "datasets.torch_pairs",
     "Trajectory": "motion.trajectory",
+    "VehicleSensors": "mapping.vehicle_sensors",
     "build_mosaic": "mapping.mosaic",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
@@ -103,9 +113,12 @@ _MODULES = {
     "load_noise": "acoustics.noise",
     "load_recipe": "config.data_recipe",
     "load_scene": "simulation.scene",
+    "load_sensors": "mapping.sensor_files",
     "load_sonar": "instruments.named_sonars",
     "make_dataset": "datasets.generation",
     "odometry": "mapping.odometry",
+    "save_sensors": "mapping.sensor_files",
+    "simulated_sensors": "mapping.simulated_sensors",
     "open_recording": "recordings.open_recording",
     "write_mcap": "recordings.mcap_writer",
 }

@@ -28,11 +28,13 @@ def sway(frames: int) -> Trajectory:
     return path_of(velocity * step[:, None], START, time)
 
 
-def over_ground(path: Trajectory, sonar: Sonar = SONAR, noise: float = 0.01) -> SonarFrames:
-    """Frames of a flat floor of smooth random reflectivity, drawn by geometry alone."""
+def over_ground(path: Trajectory, sonar: Sonar = SONAR, noise: float = 0.01, tile_m: float = 14.0) -> SonarFrames:
+    """Frames of a flat floor of smooth random reflectivity that repeats after 14 m, or a tile, drawn by geometry alone."""
     cell, rng = 0.02, np.random.default_rng(7)
     floor = ndimage.gaussian_filter(rng.uniform(0, 1, (700, 700)), 3)
     floor = np.clip(0.4 + (floor - floor.mean()) / floor.std() * 0.15, 0.02, 1)
+    tile = round(tile_m / cell)
+    floor = floor[:tile, :tile]
     images = []
     for pose in path.poses:
         geometry = GroundGeometry(sonar.range_m, sonar.bearing_rad, sonar.bearing, pose[2], pose[3], pose[4])

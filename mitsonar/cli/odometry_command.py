@@ -74,6 +74,17 @@ def odometry(
             "with contrast, else 0."
         ),
     ] = None,
+    sensors: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with their unit and noise. "
+            "They join with the frames in a pose graph.",
+            dir_okay=False,
+        ),
+    ] = None,
+    loops: Annotated[
+        bool, typer.Option("--loops", help="Search for places that are seen again, and close the path there.")
+    ] = False,
     sequence: Annotated[
         int | None, typer.Option(help="Sequence of a data set, or part of a recording (default: the longest).")
     ] = None,
@@ -97,12 +108,13 @@ def odometry(
     """Estimate the motion between consecutive frames, and integrate the path.
 
     OUT holds estimated.tum, true.tum if poses are known, motions.csv, covariances.npz, table.md, table.json, path.png,
-    run.json, and estimates.jsonl, from which --resume continues.
+    run.json, and estimates.jsonl, from which --resume continues. With --loops also loops.csv.
     """
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.closure import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at
+    from mitsonar.mapping.sensor_files import load_sensors
     from mitsonar.motion.pose import Pose
     from mitsonar.records.sonar_frames import SonarFrames
 
@@ -118,14 +130,15 @@ def odometry(
         if images:
             frames_for(frames, reading)  # faults of the frames are reported first
         raise
+    vehicle = None if sensors is None else load_sensors(sensors)
     source = open_source(frames, method, reading)
     if source.note:
         say(source.note)
     pairs = max(0, len(source) - 1) // max(1, every)
     processes = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
     steps = (0 if getattr(source, "contrast", None) is None else LOOP) if closure is None else closure
-    loops = len(loop_starts(pairs, steps)) if steps > 1 else 0
-    with progress_bar("estimating", pairs + loops, "pairs") as progress:
+    closing = len(loop_starts(pairs, steps)) if steps > 1 else 0
+    with progress_bar("estimating", pairs + closing, "pairs") as progress:
         found = run_odometry(
             source,
             estimator,
@@ -137,6 +150,8 @@ def odometry(
             frame=frame,
             every=every,
             closure=steps,
+            sensors=vehicle,
+            loops=loops,
             workers=processes,
             overwrite=overwrite,
             resume=resume,
@@ -147,5 +162,7 @@ def odometry(
     for sentence in found.warnings():
         warn(sentence)
     count, lost = len(found.estimates), int((~found.believed).sum())
+    if found.graph is not None and found.graph.sensors:
+        say(f"sensors: {', '.join(found.graph.sensors)}")
     say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")

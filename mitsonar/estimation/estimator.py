@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
@@ -107,8 +108,12 @@ class Estimator(Protocol[Record_contra]):
     def digest(self) -> str:
         """Return the digest of the weights of a trained one; empty for the others."""
 
-    def estimate(self, records: Record_contra, /) -> Estimate:
+    def estimate(self, records: Record_contra, /, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion from the first to the last record.
+
+        Args:
+            records: consecutive ones.
+            prior: what is expected of the motion before; an estimator that searches from no motion ignores it.
 
         Raises:
             MitsonarError: too few or too many records, or records without what the estimator needs.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from mitsonar.estimation.channel.pings import pings_of
 from mitsonar.estimation.estimator import Estimate, Record, two_frames
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -23,8 +24,8 @@ class Zero:
     inputs = "nothing"
     digest = ""
 
-    def estimate(self, records: Record, /) -> Estimate:
-        """Return no motion.
+    def estimate(self, records: Record, /, prior: MotionPrior | None = None) -> Estimate:
+        """Return no motion; a prior is ignored.
 
         Raises:
             MitsonarError: records that no other estimator takes.

@@ -1,7 +1,8 @@
 """The odometry: frames and an estimator become a path.
 
 The stages are: select the frames, estimate the motion of each pair of consecutive frames, resolve ambiguous motions, scale,
-bridge or smooth the motions, and compose them to a path (Almanza-Medina, eq. 3.4).
+bridge or smooth the motions, and compose them to a path (Almanza-Medina, eq. 3.4). With sensors or loops a pose graph takes
+the place of the composition.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -20,12 +21,15 @@ from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, graph_path
+from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops
 from mitsonar.mapping.mode_continuity import continued
 from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
 from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
+from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import AXES, in_units, motion_errors
 from mitsonar.motion.pose import Pose
@@ -60,6 +64,7 @@ class Odometry:
         factors: by which the estimates were multiplied, for sideways, forward, yaw ``(3,)``.
         fitted: whether these factors come from the true path.
         closure: what loops of motions leave over, where it was asked for.
+        graph: the pose graph's path, where sensors or loops were asked for.
     """
 
     frames: Index
@@ -71,6 +76,7 @@ class Odometry:
     factors: Array
     fitted: bool
     closure: Closure | None = None
+    graph: GraphPath | None = None
 
     @property
     def believed(self) -> NDArray[np.bool_]:
@@ -87,8 +93,11 @@ class Odometry:
         """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
 
         Errors of different motions count as independent. Common errors, such as a wrong scale by a wrong height, are not
-        included. None where the covariances of the motions are not known.
+        included. None where the covariances of the motions are not known. With sensors or loops they are the marginal
+        covariances of the pose graph, which includes common errors.
         """
+        if self.graph is not None:
+            return self.graph.covariances
         if self.series.covariances is None:
             return None
         return pose_covariances(self.series, Pose(*self.path.poses[0]))
@@ -107,6 +116,7 @@ class Odometry:
             rows += _by_axis(f"closure over {self.closure.steps} motions, rms", in_units(self.closure.rms))
             rows += _by_axis(f"closure over {self.closure.steps} motions, mean", in_units(self.closure.mean))
         true = self.true_at_frames
+        rows += [] if self.graph is None else self.graph.rows(true)
         if self.true is None or true is None:
             return [*rows, ("estimated path length", path_length(self.path), "m")]
         errors = motion_errors(self.series.motions, motions(true.poses), np.ones(count, dtype=bool), self.series.covariances)
@@ -137,9 +147,13 @@ def odometry(
     start: Pose | None = None,
     every: int = 1,
     closure: int = 0,
+    sensors: VehicleSensors | None = None,
+    loops: bool = False,
     workers: int = 1,
     known: Mapping[int, Estimate] | None = None,
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
+    known_loops: KnownLoops | None = None,
+    keep_loop: KeepLoop = lambda first, second, motion, estimate: None,
     progress: Callable[[int], None] = lambda pairs: None,
 ) -> Odometry:
     """Estimate the path of a sonar from its frames.
@@ -156,26 +170,51 @@ def odometry(
         start: the first pose; default: the true one, or the origin with the height, pitch and roll of the first frame.
         every: use every so many frames only.
         closure: motions over which loops are closed; covariances are raised to what the loops leave over. 0: none.
+        sensors: of the vehicle: they tell estimators where to begin, and join in a pose graph.
+        loops: search for places that are seen again, and close the path there, in a pose graph.
         workers: processes beside this one; 1: none. The result is the same, to the bit.
         known: estimates of an earlier run, by the number of their pair.
         keep: called with the number and the estimate of each new pair.
+        known_loops: registrations of loops of an earlier run.
+        keep_loop: called with the frames, the first guess and the estimate of each new one.
         progress: called with the number of pairs that were added.
 
     Raises:
         MitsonarError: fewer than two frames, times that do not increase, frames without what the estimator needs, no valid
-            motion, ``fit`` without true poses.
+            motion, ``fit`` without true poses, loops of records that are not sonar frames, smoothing of a pose graph.
     """
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     numbers = _frames_used(source, smooth, scale, every, closure)
-    estimates = estimate_motions(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
+    time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops)
+    estimate = partial(estimate_motions, priors=None if sensors is None else sensors.priors(time_s))
+    estimates = estimate(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
     estimates = continued(estimates)
-    loops = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
-    estimates = estimates if loops is None else loops.honest(estimates)
-    measured = series_of(estimates, source.time_s[numbers])
+    closing = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
+    estimates = estimates if closing is None else closing.honest(estimates)
+    measured = series_of(estimates, time_s)
     factors = _scale_factors(measured, source.true, numbers, scale)
-    series = _SMOOTHED[smooth](scaled(measured, factors))
-    path = path_of(series.motions, start or _start(source, int(numbers[0])), series.time_s)
-    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str), loops)
+    measured, first = scaled(measured, factors), start or _start(source, int(numbers[0]))
+    series = _SMOOTHED[smooth](measured)
+    path = path_of(series.motions, first, series.time_s)
+    plain = Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str), closing)
+    if sensors is None and not loops:
+        return plain
+    task = LoopTask(shown, estimator, numbers, known_loops, keep_loop) if loops and shown is not None else None
+    known_start = start is not None or source.poses is not None
+    graph = graph_path(measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown)
+    return replace(plain, series=graph.series, path=graph.path, graph=graph)
+
+
+def _ground_shown(source: Source, sensors: VehicleSensors | None, smooth: str, loops: bool) -> FrameSource | None:
+    """Return the source where its frames show ground from above. Reject what a pose graph cannot do."""
+    if smooth != "none" and (loops or sensors is not None):
+        raise MitsonarError(
+            f"{argument('smooth')} {smooth} and a pose graph of sensors or loops exclude each other: give one"
+        )
+    shown = source if isinstance(source, FrameSource) else None
+    if loops and shown is None:
+        raise MitsonarError(f"loops are searched in sonar frames, and {source.name} holds other records: leave loops out")
+    return shown
 
 
 def _frames_used(source: Source, smooth: str, scale: ArrayLike | str | None, every: int, closure: int) -> Index:

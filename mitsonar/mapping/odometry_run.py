@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
 import time
 import warnings
 from collections.abc import Callable
@@ -18,11 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
-from mitsonar.io.plain_data import finite_number, parse_json, whole_number
+from mitsonar.io.plain_data import finite_number
 from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import read_bytes, write_json, write_whole
+from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.mapping.estimate_journal import add_to_journal, read_journal
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source
+from mitsonar.mapping.pose_graph import PoseEdges
+from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.conventions import convention_named
 from mitsonar.motion.motion_errors import AXES, in_units
@@ -38,7 +40,7 @@ __all__ = ["OdometryFolder", "run_odometry", "table_lines"]
 ODOMETRY = RunKind(
     "odometry",
     outputs=(
-        *("estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
+        *("estimates.jsonl", "loops.jsonl", "loops.csv", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
         *("table.md", "table.json", "path.png"),
     ),
     notes={
@@ -48,11 +50,8 @@ ODOMETRY = RunKind(
     packages=("mitsonar", "numpy", "scipy", "opencv-python-headless"),
     deciding=("mitsonar",),
 )
-"""The files of an odometry: ``true.tum`` where poses are known; ``estimates.jsonl``, a line a pair."""
-
-
-LARGEST_JOURNAL = 2**30
-"""Bytes: some three million pairs."""
+"""The files of an odometry: ``true.tum`` where poses are known; ``estimates.jsonl``, a line a pair. Of a search for loops,
+``loops.jsonl``, a line a registration, and ``loops.csv``."""
 
 
 class OdometryFolder:
@@ -115,22 +114,7 @@ class OdometryFolder:
         Raises:
             MitsonarError: the journal is damaged.
         """
-        journal = self.path / "estimates.jsonl"
-        if not journal.exists():
-            return {}
-        content = read_bytes(journal, "journal", LARGEST_JOURNAL)
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) < len(content):
-            with journal.open("r+b") as file:
-                file.truncate(len(whole))
-        estimates = {}
-        for number, line in enumerate(whole.splitlines(), start=1):
-            try:
-                pair, estimate = _estimate_in(line)
-            except Exception:  # a line leads to whatever its bytes do
-                raise MitsonarError(f"{journal}, line {number} is damaged: start over with --overwrite") from None
-            estimates[pair] = estimate
-        return estimates
+        return {of["pair"]: estimate for of, estimate in read_journal(self.path / "estimates.jsonl", "pair")}
 
     def keep(self, pair: int, estimate: Estimate) -> None:
         """Add an estimate to the journal; the folder is made with the first one.
@@ -139,8 +123,25 @@ class OdometryFolder:
             MitsonarError: it cannot be made.
         """
         self.run.start()
-        with (self.path / "estimates.jsonl").open("a", encoding="utf-8") as file:
-            file.write(_line_of(pair, estimate))
+        add_to_journal(self.path / "estimates.jsonl", {"pair": pair}, estimate)
+
+    def kept_loops(self) -> dict[tuple[int, int, Motion], Estimate]:
+        """Return the registrations of loops of an earlier run, as :meth:`kept` does.
+
+        Raises:
+            MitsonarError: the journal is damaged.
+        """
+        journal = read_journal(self.path / "loops.jsonl", "first", "second")
+        return {(of["first"], of["second"], of["guess"]): estimate for of, estimate in journal}
+
+    def keep_loop(self, first: int, second: int, guess: Motion, estimate: Estimate) -> None:
+        """Add the registration of a loop to its journal.
+
+        Raises:
+            MitsonarError: the folder cannot be made.
+        """
+        self.run.start()
+        add_to_journal(self.path / "loops.jsonl", {"first": first, "second": second, "guess": list(guess)}, estimate)
 
     # ---------------------------------------------------------------- results
 
@@ -155,6 +156,8 @@ class OdometryFolder:
             _save_tum(self.path / "true.tum", found.true, frame)
         write_whole(self.path / "motions.csv", _motions_csv(found).encode())
         write_whole(self.path / "covariances.npz", _covariances(found))
+        if found.graph is not None and found.graph.search is not None:
+            write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.kept).encode())
         rows = found.rows()
         write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
         table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
@@ -175,6 +178,8 @@ def run_odometry(
     frame: str = "mitsonar",
     every: int = 1,
     closure: int = 0,
+    sensors: VehicleSensors | None = None,
+    loops: bool = False,
     workers: int = 1,
     overwrite: bool = False,
     resume: bool = False,
@@ -193,6 +198,8 @@ def run_odometry(
         frame: convention of ``estimated.tum`` and ``true.tum``: ``mitsonar``, ``ros-enu`` or ``ned``.
         every: as above.
         closure: as above.
+        sensors: as above.
+        loops: as above.
         workers: as above.
         overwrite: replace an odometry in the folder.
         resume: go on with an interrupted one.
@@ -202,12 +209,16 @@ def run_odometry(
         MitsonarError: as ``odometry`` does; the folder holds something else, or cannot be written.
     """
     convention_named(frame)
-    run = RunDirectory.begin(out, ODOMETRY, _asked(source, name, estimator, every), resume=resume, overwrite=overwrite)
+    run = RunDirectory.begin(
+        out, ODOMETRY, _asked(source, name, estimator, every, sensors), resume=resume, overwrite=overwrite
+    )
     folder = OdometryFolder(run)
     kept, begun = folder.kept() if folder.run.resumed else {}, time.perf_counter()
     asked = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, closure=closure)
-    pipeline = partial(asked, workers=workers, progress=progress)
-    found = pipeline(source, estimator, known=kept, keep=folder.keep)
+    pipeline = partial(asked, sensors=sensors, loops=loops, workers=workers, progress=progress)
+    known_loops = folder.kept_loops() if folder.run.resumed else {}
+    journals = partial(pipeline, known=kept, keep=folder.keep, known_loops=known_loops, keep_loop=folder.keep_loop)
+    found = journals(source, estimator)
     settings = {
         **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": _named(scale), "frame": frame},
         **{**_found(found), "seconds": time.perf_counter() - begun},
@@ -227,7 +238,7 @@ def _found(found: Odometry) -> PlainTable:
     return {"factors": found.factors, "from": found.path.poses[0], "not_believed": lost, "warnings": found.warnings()}
 
 
-def _asked(source: Source, name: str, estimator: AnyEstimator, every: int) -> PlainTable:
+def _asked(source: Source, name: str, estimator: AnyEstimator, every: int, sensors: VehicleSensors | None) -> PlainTable:
     """Return what decides the estimates: a run is resumed only with the same."""
     options: PlainTable = dataclasses.asdict(estimator) if dataclasses.is_dataclass(estimator) else {}
     return {
@@ -235,36 +246,11 @@ def _asked(source: Source, name: str, estimator: AnyEstimator, every: int) -> Pl
         "height_m": source.told_height_m,
         "pitch_deg": None if source.pitch_rad is None else float(np.degrees(source.pitch_rad)),
         "noise": None if source.noise is None else {**source.noise.model_dump(), "seed": source.seed},
+        **({} if sensors is None else {"sensors_sha256": sensors.digest()}),
     }
 
 
 # ---------------------------------------------------------------- files
-
-
-def _line_of(pair: int, estimate: Estimate) -> str:
-    covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
-    motion = [float(value) for value in estimate.motion]
-    line = {"pair": pair, "motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
-    alike = {name: estimate.about[name] for name in ("modes", "spreads") if name in estimate.about}
-    return json.dumps(line | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
-
-
-def _estimate_in(line: bytes) -> tuple[int, Estimate]:
-    """Parse the number of a pair and its estimate; a damaged line raises."""
-    table = parse_json(line, "the line")
-    covariance = None if table["covariance"] is None else np.array(table["covariance"], dtype=float)
-    motion = np.array(table["motion"], dtype=float)
-    if motion.shape != (3,) or not isinstance(table["reason"], str) or type(table["valid"]) is not bool:
-        raise ValueError("motion, reason or valid is of another type")
-    if table["valid"] and not np.isfinite(motion).all():
-        raise ValueError("the motion is not finite")
-    if covariance is not None and (covariance.shape != (3, 3) or (np.diagonal(covariance) < 0).any()):
-        raise ValueError("covariance is not a covariance")
-    about = table.get("about", {})
-    if not isinstance(about, dict):
-        raise ValueError("about is no table")
-    pair = whole_number(table["pair"], "pair", 0, 2**40)
-    return pair, Estimate(Motion(*(float(value) for value in motion)), covariance, table["valid"], table["reason"], about)
 
 
 def _save_tum(path: Path, trajectory: Trajectory, frame: str) -> None:
@@ -287,6 +273,19 @@ def _motions_csv(found: Odometry) -> str:
         numbers = [f"{value:.6f}" for value in moved[k]]
         frames = [int(found.frames[k]), int(found.frames[k + 1]), f"{found.series.time_s[k + 1]:.9g}"]
         table.writerow([*frames, *numbers, *deviations, int(estimate.valid), estimate.reason])
+    return text.getvalue()
+
+
+def _loops_csv(found: Odometry, loops: PoseEdges, kept: NDArray[np.bool_]) -> str:
+    """Write a line a loop, in mm and deg."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    names = [f"{axis.name}_{axis.unit}" for axis in AXES]
+    table.writerow(["from_frame", "frame", *names, *(f"{axis.name}_std_{axis.unit}" for axis in AXES), "kept"])
+    moved, std = in_units(loops.motions), in_units(np.sqrt(np.diagonal(loops.covariances, axis1=1, axis2=2)))
+    for k, (first, second) in enumerate(zip(loops.first, loops.second, strict=True)):
+        numbers = [f"{value:.6f}" for value in moved[k]] + [f"{value:.6g}" for value in std[k]]
+        table.writerow([int(found.frames[first]), int(found.frames[second]), *numbers, int(kept[k])])
     return text.getvalue()
 
 

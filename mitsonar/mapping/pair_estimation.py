@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
@@ -20,10 +20,14 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record, rejected
 from mitsonar.mapping.measured_heights import without_height
 from mitsonar.mapping.open_source import Source
+from mitsonar.motion.motion_prior import MotionPrior
 
 __all__ = ["estimate_motions"]
 
 Index = NDArray[np.intp]
+
+Priors = list[MotionPrior | None]
+"""What is expected of each pair's motion."""
 
 PAIRS_A_BATCH = 8
 """Pairs that a worker gets at a time, and that a kill may cost."""
@@ -37,6 +41,7 @@ def estimate_motions(
     frames: ArrayLike,
     *,
     workers: int = 1,
+    priors: Sequence[MotionPrior] | None = None,
     known: Mapping[int, Estimate] | None = None,
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
     progress: Callable[[int], None] = lambda pairs: None,
@@ -48,20 +53,25 @@ def estimate_motions(
         estimator: estimates the motion between two frames.
         frames: numbers of the frames ``(n,)``; pair k holds the k-th and the next of them.
         workers: processes beside this one, with one thread each; 1: none.
+        priors: what is expected of each pair's motion ``(n - 1,)``; default: nothing.
         known: estimates of an earlier run, by the number of their pair.
         keep: called with the number and the estimate of each new pair, in order.
         progress: called with the number of pairs that were added.
 
     Raises:
-        MitsonarError: frames that cannot be read, or that lack what the estimator needs; a worker that was lost.
+        MitsonarError: frames that cannot be read, or that lack what the estimator needs; a worker that was lost; not one
+            prior a pair.
     """
     numbers = np.asarray(frames, dtype=np.intp)
+    if priors is not None and len(priors) != len(numbers) - 1:
+        raise MitsonarError(f"{len(numbers)} frames make {len(numbers) - 1} pairs, each with one prior: got {len(priors)}")
     estimates = {pair: estimate for pair, estimate in (known or {}).items() if pair < len(numbers) - 1}
     if estimates:
         progress(len(estimates))
     batches = _batches([pair for pair in range(len(numbers) - 1) if pair not in estimates])
     made = _made_here if workers <= 1 else _made_beside
-    with closing(made(source, estimator, numbers, batches, workers)) as found:
+    told: Priors = [None] * (len(numbers) - 1) if priors is None else list(priors)
+    with closing(made(source, estimator, numbers, told, batches, workers)) as found:
         for batch, answers in found:
             for pair, answer in zip(batch, answers, strict=True):
                 estimates[pair] = answer
@@ -82,16 +92,16 @@ def _batches(pairs: list[int]) -> list[range]:
 
 
 def _made_here(
-    source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
+    source: Source, estimator: AnyEstimator, numbers: Index, priors: Priors, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimate in this process."""
     with _one_opencv_thread():
         for batch in batches:
-            yield batch, _estimates(estimator, source.read(numbers[batch.start : batch.stop + 1]))
+            yield batch, _estimates(estimator, _frames_of(source, numbers, batch), priors[batch.start : batch.stop])
 
 
 def _made_beside(
-    source: Source, estimator: AnyEstimator, numbers: Index, batches: list[range], workers: int
+    source: Source, estimator: AnyEstimator, numbers: Index, priors: Priors, batches: list[range], workers: int
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimate in new processes; this one reads the frames."""
     with _one_thread_each():
@@ -101,7 +111,8 @@ def _made_beside(
         waiting: deque[tuple[range, Future[list[Estimate]]]] = deque()
         try:
             for batch in batches:
-                waiting.append((batch, pool.submit(_in_worker, source.read(numbers[batch.start : batch.stop + 1]))))
+                task = pool.submit(_in_worker, _frames_of(source, numbers, batch), priors[batch.start : batch.stop])
+                waiting.append((batch, task))
                 if len(waiting) > 2 * workers:
                     first, answers = waiting.popleft()
                     yield first, answers.result()
@@ -116,10 +127,18 @@ def _made_beside(
             pool.shutdown(cancel_futures=True)
 
 
-def _estimates(estimator: AnyEstimator, frames: Record) -> list[Estimate]:
+def _frames_of(source: Source, numbers: Index, batch: range) -> Record:
+    """Read the frames of a batch of pairs."""
+    return source.read(numbers[batch.start : batch.stop + 1])
+
+
+def _estimates(estimator: AnyEstimator, frames: Record, priors: Priors) -> list[Estimate]:
     """Estimate each pair of consecutive frames or pings."""
     pairs = [frames.select(slice(k, k + 2)) for k in range(len(frames) - 1)]
-    return [rejected("no height was found in the frames") if without_height(p) else estimator.estimate(p) for p in pairs]
+    return [
+        rejected("no height was found in the frames") if without_height(pair) else estimator.estimate(pair, prior)
+        for pair, prior in zip(pairs, priors, strict=True)
+    ]
 
 
 @contextmanager
@@ -168,5 +187,5 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _in_worker(frames: Record) -> list[Estimate]:
-    return _estimates(_worker, frames)
+def _in_worker(frames: Record, priors: Priors) -> list[Estimate]:
+    return _estimates(_worker, frames, priors)

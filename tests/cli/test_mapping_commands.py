@@ -22,6 +22,8 @@ from PIL import Image
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry_run import OdometryFolder
+from mitsonar.mapping.sensor_files import save_sensors
+from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
@@ -122,6 +124,24 @@ def test_the_pictures_are_pictures(mitsonar: Command, drawn: Path, tmp_path: Pat
         assert len(np.unique(np.array(Image.open(path)))) > 50
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.png"), "exists and is kept", "--overwrite")
     assert mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.png", "--no-flatten", "--overwrite").returncode == 0
+
+
+def test_sensors_and_loops_make_a_graph(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
+    path = sway(20)
+    save_sensors(tmp_path / "gyro.csv", simulated_sensors(path, SensorNoise(gyro_deg_rth=0.1)))
+    command = ("odometry", drawn, "-o", tmp_path / "out", "--sensors", tmp_path / "gyro.csv", "--loops")
+    done = mitsonar(*command)
+    assert done.returncode == 0, done
+    assert "sensors: gyroscope" in done.stdout
+    found = table(tmp_path / "out")
+    assert found["loops"] == 0
+    assert abs(found["heading error at the end"]) < 0.05
+    assert found["standard deviation of the end as told"] > 0
+    assert (tmp_path / "out" / "loops.csv").exists()
+    (tmp_path / "bad.csv").write_text("time_s,yaw_rate\n0,1\n")
+    refused(mitsonar("odometry", drawn, "-o", tmp_path / "no", "--sensors", tmp_path / "bad.csv"), "yaw_rate_deg_s")
+    refused(mitsonar("odometry", drawn, "-o", tmp_path / "no", "--sensors", tmp_path / "none.csv"), "none.csv")
+    refused(mitsonar("odometry", drawn, "-o", tmp_path / "no", "--loops", "--smooth", "kalman"), "smooth", "exclude")
 
 
 def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
 from mitsonar.estimation.zero import Zero  # noqa: E402
 from mitsonar.motion.composition import Motion  # noqa: E402
+from mitsonar.motion.motion_prior import MotionPrior  # noqa: E402
 from mitsonar.records.sonar_frames import SonarFrames  # noqa: E402
 
 
@@ -65,7 +66,7 @@ class Oracle:
         self.pairs, self.asked = pairs, 0
         self.truth = {float(pairs.pose[pairs.first[k], 0]): pairs.target(k) for k in range(len(pairs))}
 
-    def estimate(self, frames: SonarFrames, /) -> Estimate:
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
         self.asked += 1
         assert frames.poses is not None
         motion = Motion(*self.truth[float(frames.poses[0, 0])])

@@ -17,6 +17,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.motion.composition import Motion, motions
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 FRAMES, STEPS = 129, 8
@@ -47,7 +48,7 @@ class Known:
     inputs = "nothing"
     digest = ""
 
-    def estimate(self, frames: SonarFrames, /) -> Estimate:
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
         first, second = (int(number) for number in frames.image[:, 0, 0])
         answer = motions(self.poses[[first, second]])[0] * (1 - self.pull * (second - first == 1))
         answer = answer + np.random.default_rng([first, second]).normal(0, self.std)

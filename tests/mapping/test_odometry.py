@@ -30,6 +30,7 @@ from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_li
 from mitsonar.mapping.open_frames import open_frames
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, motions
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
@@ -69,7 +70,7 @@ class Told:
     inputs = "nothing"
     digest = ""
 
-    def estimate(self, frames: SonarFrames, /) -> Estimate:
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
         first, second = (int(number) for number in frames.image[:, 0, 0])
         if first == self.deadly:
             os._exit(9)

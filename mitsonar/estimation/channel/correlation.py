@@ -22,6 +22,7 @@ from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["Correlation"]
@@ -80,8 +81,8 @@ class Correlation:
     inputs = "height"
     digest = ""
 
-    def estimate(self, responses: ImpulseResponses) -> Estimate:
-        """Estimate the motion.
+    def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; a prior is ignored: the search covers all motions up to ``speed``.
 
         Raises:
             MitsonarError: records of :func:`mitsonar.estimation.channel.pings.pings_of`, or no height.

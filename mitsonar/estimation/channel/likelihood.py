@@ -28,6 +28,7 @@ from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.estimator import Estimate, PlainTable, rejected
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["Likelihood"]
@@ -120,8 +121,8 @@ class Likelihood:
     inputs = "height"
     digest = ""
 
-    def estimate(self, responses: ImpulseResponses) -> Estimate:
-        """Estimate the motion and its covariance.
+    def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion and its covariance; a prior is ignored: the search covers all motions up to ``speed``.
 
         Raises:
             MitsonarError: records of :func:`mitsonar.estimation.channel.pings.pings_of`, or no height.

@@ -31,6 +31,7 @@ from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Direct"]
@@ -118,7 +119,7 @@ class Direct:
                 f"{self.height_m} and {self.heave_std_m:g}"
             )
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance; reject frames without anything to match.
 
         Raises:

@@ -13,6 +13,7 @@ from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_reje
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Ecc"]
@@ -58,8 +59,8 @@ class Ecc:
         spacing = float(np.ptp(frames.bearing_rad)) / (len(frames.bearing_rad) - 1)
         return float(f"{FINE * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2:.1e}")
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
-        """Estimate the motion; reject frames for which OpenCV finds none.
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; reject frames for which OpenCV finds none. A prior is ignored.
 
         Raises:
             MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.

@@ -36,6 +36,7 @@ from mitsonar.estimation.image.displacement_match import STILL, TINY, WindowFlow
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Flow"]
@@ -109,8 +110,8 @@ class Flow:
         if self.height_std is not None and not self.height_std >= 0:
             raise MitsonarError(f"height_std must be 0 or more, a part of the height: got {self.height_std:g}")
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
-        """Estimate the motion and its covariance; reject frames without anything to match.
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion and its covariance; reject frames without anything to match. A prior is ignored.
 
         Raises:
             MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.

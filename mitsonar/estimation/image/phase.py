@@ -16,6 +16,7 @@ from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_reje
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Phase"]
@@ -54,8 +55,8 @@ class Phase:
     inputs = INPUTS
     digest = ""
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
-        """Estimate the motion; reject frames without anything to match.
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
+        """Estimate the motion; reject frames without anything to match. A prior is ignored: all motions are searched.
 
         Raises:
             MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.

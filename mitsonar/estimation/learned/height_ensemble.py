@@ -11,6 +11,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.learned.image_network import ImageNetwork
 from mitsonar.estimation.learned.view_network import ViewNetwork
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
@@ -57,7 +58,7 @@ class HeightEnsemble:
         """Return the digests of all networks."""
         return " ".join(one.digest for one in self.networks)
 
-    def estimate(self, frames: SonarFrames | ViewFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames | ViewFrames, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion with the chosen network.
 
         Raises:
@@ -70,7 +71,7 @@ class HeightEnsemble:
             )
         height = float(known.mean())
         network: AnyEstimator = self.chosen(height)
-        return network.estimate(frames)
+        return network.estimate(frames, prior)
 
     def chosen(self, height_m: float) -> ImageNetwork | ViewNetwork:
         """Return the network whose heights of training are nearest in ratio; of several, that whose middle is nearest."""

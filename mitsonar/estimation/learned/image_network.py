@@ -18,6 +18,7 @@ from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, r
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.warp_grid import Ground, WarpGrid
@@ -87,7 +88,7 @@ class ImageNetwork(Trained):
                 "`mitsonar evaluate`, or another checkpoint"
             )
 
-    def estimate(self, frames: SonarFrames) -> Estimate:
+    def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance.
 
         Raises:

@@ -15,6 +15,7 @@ from mitsonar.estimation.estimator import Estimate, Record, rejected
 from mitsonar.estimation.learned.trained_network import Trained, answer_of, one_thread
 from mitsonar.instruments.views import SEGMENTS
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.view_frames import ViewFrames
 
@@ -71,11 +72,12 @@ class ViewNetwork(Trained):
         """Return the names of the views that it reads."""
         return tuple(self._checkpoint.arrangement["views"])
 
-    def estimate(self, records: Record) -> Estimate:
+    def estimate(self, records: Record, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion between two pings, with the covariance of validation.
 
         Args:
             records: two :class:`~mitsonar.records.view_frames.ViewFrames`.
+            prior: ignored: the network answers in the range of its training.
 
         Raises:
             MitsonarError: not two pings of these views, another sonar than that of training.

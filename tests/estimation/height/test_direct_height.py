@@ -28,6 +28,7 @@ from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.view_source import open_views
 from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 from mitsonar.simulation.imaging import Simulator
@@ -204,7 +205,7 @@ class Told:
     inputs = "height"
     digest = ""
 
-    def estimate(self, frames: SonarFrames, /) -> Estimate:
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
         assert frames.height_m is not None
         assert np.isfinite(frames.height_m).any()
         return Estimate(Motion(0.0, 0.0, 0.0))

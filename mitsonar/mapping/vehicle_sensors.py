@@ -1,0 +1,355 @@
+"""Other sensors of a vehicle along a run: gyroscope, velocities (DVL), depth, compass, dead reckoning; all may be missing.
+
+Readings are put together over the time from frame to frame: they become motions with covariances, and headings and depths.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.mapping.pose_graph import Headings, wrapped
+from mitsonar.motion.composition import Motion, motions
+from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.trajectory import Trajectory
+
+__all__ = ["DeadReckoning", "Readings", "SensorMotions", "VehicleSensors"]
+
+Array = NDArray[np.float64]
+
+UNKNOWN_STD = np.array([10.0, 10.0, np.pi])
+"""Standard deviations of what a sensor does not tell of a motion [m, m, rad]."""
+
+LONGEST_GAP_S = 1.0
+"""Time between two readings beyond which nothing is known in between, unless they are slower throughout."""
+
+SLOWER = 3.0
+"""Gaps of so many usual steps count as gaps."""
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of one quantity.
+
+    Attributes:
+        time_s: of the readings ``(n,)``, increasing.
+        values: ``(n,)``.
+        std: of their independent errors ``(n,)``; of a gyroscope the noise density (rad/s per root Hz, which is rad per root
+            second).
+
+    Raises:
+        MitsonarError: other shapes, numbers that are not finite, times that do not increase, deviations not above 0.
+    """
+
+    time_s: Array
+    values: Array
+    std: Array
+
+    def __post_init__(self) -> None:
+        shapes = {self.time_s.shape, self.values.shape, self.std.shape}
+        if shapes != {(len(self.time_s),)} or not self.time_s.size:
+            raise MitsonarError(f"readings need a time, a value and a standard deviation each: got {sorted(shapes)}")
+        if not all(np.isfinite(numbers).all() for numbers in (self.time_s, self.values, self.std)):
+            raise MitsonarError("readings must be finite: leave out those that are missing")
+        if not (np.diff(self.time_s) > 0).all():
+            where = int(np.flatnonzero(~(np.diff(self.time_s) > 0))[0])
+            raise MitsonarError(
+                f"times of readings must increase: got {self.time_s[where + 1]:g} s after {self.time_s[where]:g}"
+            )
+        if not (self.std > 0).all():
+            raise MitsonarError(f"standard deviations of readings must be above 0: got {self.std.min():g}")
+
+    @property
+    def edges_s(self) -> Array:
+        """Return the times at which one reading gives way to the next ``(n + 1,)``: each holds around its own time."""
+        step = np.diff(self.time_s)
+        if not step.size:
+            return np.asarray(self.time_s[0] + np.array([-0.5, 0.5]) * LONGEST_GAP_S)
+        middle = self.time_s[:-1] + step / 2
+        return np.concatenate([[self.time_s[0] - step[0] / 2], middle, [self.time_s[-1] + step[-1] / 2]])
+
+    def means(self, time_s: Array) -> Array:
+        """Return the mean between consecutive times ``(times - 1,)``, of use where readings cover them."""
+        return np.asarray(_between(self.edges_s, self.values, time_s) / np.diff(time_s))
+
+    def variances(self, time_s: Array, *, density: bool) -> Array:
+        """Return the variance of the integral between consecutive times ``(times - 1,)``.
+
+        Args:
+            time_s: of the frames.
+            density: whether ``std`` is a noise density, per root Hz; else it is that of each reading, and readings average.
+        """
+        edges = self.edges_s
+        power = np.asarray(self.std**2 if density else self.std**2 * np.diff(edges))
+        return _between(edges, power, time_s)
+
+    def covers(self, time_s: Array) -> NDArray[np.bool_]:
+        """Return between which consecutive times readings are without a gap ``(times - 1,)``."""
+        edges, step = self.edges_s, np.diff(self.time_s)
+        widest = max(LONGEST_GAP_S, SLOWER * float(np.median(step))) if step.size else LONGEST_GAP_S
+        within = (time_s[:-1] >= edges[0] - 1e-6) & (time_s[1:] <= edges[-1] + 1e-6)
+        for gap in np.flatnonzero(step > widest):
+            within &= (time_s[1:] <= self.time_s[gap]) | (time_s[:-1] >= self.time_s[gap + 1])
+        return np.asarray(within)
+
+    def at(self, time_s: Array) -> tuple[Array, Array]:
+        """Return values and standard deviations at times, interpolated; nan where no reading is near ``(times,)`` each.
+
+        A reading is near where it is the nearest to that time, and no other time is nearer to it: none counts twice.
+        """
+        after = np.clip(np.searchsorted(self.time_s, time_s), 1, max(1, len(self.time_s) - 1)) - 1
+        nearest = np.where(
+            np.abs(self.time_s[np.minimum(after + 1, len(self.time_s) - 1)] - time_s) < np.abs(self.time_s[after] - time_s),
+            np.minimum(after + 1, len(self.time_s) - 1),
+            after,
+        )
+        off = np.abs(self.time_s[nearest] - time_s)
+        best = np.full(len(self.time_s), np.inf)
+        np.minimum.at(best, nearest, off)
+        near = (off <= best[nearest]) & (off <= LONGEST_GAP_S / 2)
+        value = np.interp(time_s, self.time_s, self.values)
+        return np.where(near, value, np.nan), np.where(near, self.std[nearest], np.nan)
+
+
+def _between(edges: Array, rate: Array, time_s: Array) -> Array:
+    """Return the integral of steps ``rate`` (n,) between their ``edges`` (n + 1,), from each time to the next."""
+    whole = np.concatenate([[0.0], np.cumsum(rate * np.diff(edges))])
+    return np.asarray(np.diff(np.interp(time_s, edges, whole)))
+
+
+@dataclass(frozen=True)
+class DeadReckoning:
+    """Poses by the vehicle's own navigation, whose errors grow as a random walk.
+
+    Attributes:
+        path: its poses.
+        walk_m: standard deviation of the position after a second [m per root second].
+        walk_rad: of the heading after a second [rad per root second].
+
+    Raises:
+        MitsonarError: a walk that is not above 0, or times that do not increase.
+    """
+
+    path: Trajectory
+    walk_m: float
+    walk_rad: float
+
+    def __post_init__(self) -> None:
+        if not (0 < self.walk_m < np.inf and 0 < self.walk_rad < np.inf):
+            raise MitsonarError(
+                f"dead reckoning needs a random walk above 0 m and rad: got {self.walk_m:g} and {self.walk_rad:g}"
+            )
+        if len(self.path) < 2 or not (np.diff(self.path.time_s) > 0).all():
+            raise MitsonarError("dead reckoning needs two poses or more, at times that increase: sort them")
+
+    def poses_at(self, time_s: Array) -> Array:
+        """Return poses at times, interpolated; held before the first and after the last ``(times, 6)``."""
+        table = self.path.poses.copy()
+        table[:, 5] = np.unwrap(table[:, 5])
+        return np.column_stack([np.interp(time_s, self.path.time_s, column) for column in table.T])
+
+
+class SensorMotions(NamedTuple):
+    """Motions between frames by one sensor.
+
+    Attributes:
+        pair: numbers of the pairs of frames that it covers ``(n,)``.
+        motions: sideways, forward [m], yaw [rad] ``(n, 3)``.
+        covariances: ``(n, 3, 3)``; what the sensor does not tell has the variance of ``UNKNOWN_STD``.
+        bias: error of each motion by a standard deviation of the gyroscope's bias ``(n, 3)``.
+    """
+
+    pair: NDArray[np.intp]
+    motions: Array
+    covariances: Array
+    bias: Array
+
+
+@dataclass(frozen=True)
+class VehicleSensors:
+    """Readings of a vehicle's sensors, all in the vehicle's level axes; None where there is no such sensor.
+
+    Attributes:
+        yaw_rate: of a gyroscope [rad/s], clockwise seen from above; ``std`` is its noise density.
+        sideways: velocity to starboard, of a DVL [m/s].
+        forward: velocity forward [m/s].
+        depth: below the surface [m].
+        heading: of a compass [rad], clockwise from north.
+        dead_reckoning: by other navigation.
+        bias_std: standard deviation of the gyroscope's constant bias [rad/s]; 0: none.
+        name: of the file, for messages.
+
+    Raises:
+        MitsonarError: no sensor at all, or a bias below 0.
+    """
+
+    yaw_rate: Readings | None = None
+    sideways: Readings | None = None
+    forward: Readings | None = None
+    depth: Readings | None = None
+    heading: Readings | None = None
+    dead_reckoning: DeadReckoning | None = None
+    bias_std: float = 0.0
+    name: str = "the sensors"
+
+    def __post_init__(self) -> None:
+        if not self.names:
+            raise MitsonarError(f"{self.name} hold no reading: give a gyroscope, velocities, depths, headings or poses")
+        if not 0 <= self.bias_std < np.inf:
+            raise MitsonarError(
+                f"the bias of a gyroscope needs a standard deviation of 0 or more: got {self.bias_std:g} rad/s"
+            )
+
+    @property
+    def names(self) -> list[str]:
+        """Return what sensors there are, in words."""
+        there = {
+            "gyroscope": self.yaw_rate,
+            "DVL": self.sideways or self.forward,
+            "depth": self.depth,
+            "compass": self.heading,
+            "dead reckoning": self.dead_reckoning,
+        }
+        return [name for name, sensor in there.items() if sensor is not None]
+
+    def digest(self) -> str:
+        """Return the SHA-256 of all readings."""
+        digest = hashlib.sha256(repr(self.bias_std).encode())
+        for one in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading):
+            for values in () if one is None else (one.time_s, one.values, one.std):
+                digest.update(values.astype(float).tobytes())
+            digest.update(b";")
+        if self.dead_reckoning is not None:
+            dead = self.dead_reckoning
+            digest.update(
+                dead.path.poses.tobytes() + dead.path.time_s.tobytes() + repr((dead.walk_m, dead.walk_rad)).encode()
+            )
+        return digest.hexdigest()
+
+    def motions(self, time_s: Array) -> list[SensorMotions]:
+        """Return the motions between frames at ``time_s`` ``(frames,)`` [s], one item a sensor; errors are independent.
+
+        Raises:
+            MitsonarError: no sensor covers the time of any frame.
+        """
+        found = [one for one in self._motions(time_s) if one.pair.size]
+        if not found and self.headings(time_s).pose.size == 0 and self.rises(time_s) is None:
+            first, last = time_s[0], time_s[-1]
+            raise MitsonarError(f"{self.name} hold no reading between {first:g} and {last:g} s, the times of the frames")
+        return found
+
+    def _motions(self, time_s: Array) -> Iterator[SensorMotions]:
+        if self.yaw_rate is not None:
+            yield self._turned(self.yaw_rate, time_s)
+        if self.sideways is not None or self.forward is not None:
+            yield self._moved(time_s)
+        if self.dead_reckoning is not None:
+            yield _reckoned(self.dead_reckoning, time_s)
+
+    def _turned(self, gyro: Readings, time_s: Array) -> SensorMotions:
+        """Return what the gyroscope tells: the yaw."""
+        pair, step = np.flatnonzero(gyro.covers(time_s)), np.diff(time_s)
+        table = np.zeros((len(step), 3))
+        table[:, 2] = gyro.means(time_s) * step
+        covariances = np.tile(np.diag(UNKNOWN_STD**2), (len(step), 1, 1))
+        covariances[:, 2, 2] = gyro.variances(time_s, density=True)
+        bias = np.zeros((len(step), 3))
+        bias[:, 2] = self.bias_std * step
+        return SensorMotions(pair, table[pair], covariances[pair], bias[pair])
+
+    def _moved(self, time_s: Array) -> SensorMotions:
+        """Return what velocities tell: the displacement, in axes of the second heading.
+
+        Velocities are in axes that turn: the displacement lies half a turn before the last axes. The turn is that of the
+        gyroscope or the dead reckoning. Without them it is unknown, and the covariance tells how it bends the displacement.
+        """
+        step = np.diff(time_s)
+        moved, variance = np.zeros((2, len(step))), np.tile(UNKNOWN_STD[:2, None] ** 2, (1, len(step)))
+        covered = np.zeros(len(step), dtype=bool)
+        for axis, sensor in enumerate((self.sideways, self.forward)):
+            if sensor is not None:
+                there = sensor.covers(time_s)
+                moved[axis] = np.where(there, sensor.means(time_s) * step, 0.0)
+                variance[axis] = np.where(there, sensor.variances(time_s, density=False), variance[axis])
+                covered |= there
+        yaw = self._yaws(time_s)
+        sin, cos = np.sin(yaw / 2), np.cos(yaw / 2)
+        sideways, forward = moved[0] * cos - moved[1] * sin, moved[0] * sin + moved[1] * cos
+        none, one = np.zeros_like(sin), np.ones_like(sin)
+        turn = np.array([[cos, -sin, -forward / 2], [sin, cos, sideways / 2], [none, none, one]]).transpose(2, 0, 1)
+        own = np.stack([*variance, UNKNOWN_STD[2] ** 2 * one], axis=1)
+        covariances = (turn * own[:, None]) @ turn.swapaxes(1, 2)
+        pair = np.flatnonzero(covered)
+        table = np.column_stack([sideways, forward, yaw])
+        return SensorMotions(pair, table[pair], covariances[pair], np.zeros((len(pair), 3)))
+
+    def _yaws(self, time_s: Array) -> Array:
+        """Return the yaw between frames by the gyroscope, or else by dead reckoning or the compass; else 0."""
+        step = np.diff(time_s)
+        if self.yaw_rate is not None:
+            return np.where(self.yaw_rate.covers(time_s), self.yaw_rate.means(time_s) * step, 0.0)
+        if self.dead_reckoning is not None:
+            return np.diff(self.dead_reckoning.poses_at(time_s)[:, 5])
+        return np.zeros_like(step)
+
+    def priors(self, time_s: Array) -> list[MotionPrior] | None:
+        """Return what the sensors tell of each motion together ``(frames - 1,)``; None where they tell of none.
+
+        Raises:
+            MitsonarError: as :meth:`motions`.
+        """
+        told = self.motions(time_s)
+        if not told:
+            return None
+        information = np.tile(np.diag(1 / UNKNOWN_STD**2), (len(time_s) - 1, 1, 1))
+        weighted = np.zeros((len(time_s) - 1, 3, 1))
+        for one in told:
+            inverse = _inverse(one.covariances + one.bias[:, :, None] * one.bias[:, None])
+            information[one.pair] += inverse
+            weighted[one.pair] += inverse @ one.motions[..., None]
+        covariances = _inverse(information)
+        means = (covariances @ weighted)[..., 0]
+        return [
+            MotionPrior(Motion(*(float(value) for value in mean)), covariance)
+            for mean, covariance in zip(means, covariances, strict=True)
+        ]
+
+    def headings(self, time_s: Array) -> Headings:
+        """Return the headings of frames by the compass; frames without a reading near are left out."""
+        if self.heading is None:
+            return Headings.none()
+        smooth = Readings(self.heading.time_s, np.unwrap(self.heading.values), self.heading.std)
+        heading, std = smooth.at(time_s)
+        known = np.flatnonzero(np.isfinite(heading))
+        return Headings(known, wrapped(heading[known]), std[known])
+
+    def rises(self, time_s: Array) -> Array | None:
+        """Return how far each frame is above the first, by the depth ``(frames,)`` [m]; None where it is not known."""
+        if self.depth is None:
+            return None
+        depth = np.interp(time_s, self.depth.time_s, self.depth.values)
+        covered = time_s[0] >= self.depth.edges_s[0] - 1e-6 and time_s[-1] <= self.depth.edges_s[-1] + 1e-6
+        return depth[0] - depth if covered else None
+
+
+def _inverse(matrices: Array) -> Array:
+    """Invert covariances or information ``(n, 3, 3)`` whose components differ by many orders."""
+    scale = 1 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    both = scale[:, :, None] * scale[:, None]
+    return np.asarray(both * np.linalg.inv(matrices * both))
+
+
+def _reckoned(dead: DeadReckoning, time_s: Array) -> SensorMotions:
+    """Return what dead reckoning tells: whole motions."""
+    step, known = np.diff(time_s), dead.path.time_s
+    table = motions(dead.poses_at(time_s))
+    covered = (time_s[:-1] >= known[0] - 1e-6) & (time_s[1:] <= known[-1] + 1e-6)
+    pair = np.flatnonzero(covered)
+    walk = np.diag([dead.walk_m**2, dead.walk_m**2, dead.walk_rad**2])
+    return SensorMotions(pair, table[pair], step[pair, None, None] * walk, np.zeros((len(pair), 3)))

@@ -1,0 +1,66 @@
+"""Priors reach the pairs that they belong to, in this process and in others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate, rejected
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
+from mitsonar.motion.composition import Motion
+from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.records.sonar_frames import SonarFrames
+
+FRAMES = 2 * PAIRS_A_BATCH + 4
+SONAR = Sonar(range_bins=16, beams=8)
+
+
+@dataclass(frozen=True)
+class Believer:
+    """Estimates what it is told, plus the number of the first frame as yaw."""
+
+    consumes = SonarFrames
+    inputs = "nothing"
+    digest = ""
+
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
+        if prior is None:
+            return rejected("nothing told")
+        return Estimate(prior.motion._replace(yaw=float(frames.image[0, 0, 0])), prior.covariance)
+
+
+def numbered() -> FrameSource:
+    """Frames whose pixels are their numbers."""
+    image = np.broadcast_to(np.arange(FRAMES, dtype=np.float32)[:, None, None], (FRAMES, 16, 8)).copy()
+    return FrameSource.of(SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, np.linspace(0, 1, FRAMES), SONAR))
+
+
+def told() -> list[MotionPrior]:
+    return [MotionPrior(Motion(1e-3 * k, 0.0, 0.0), np.eye(3) * (1 + k)) for k in range(FRAMES - 1)]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_each_pair_gets_its_own_prior(workers: int) -> None:
+    """Also where pairs of an earlier run are left out, so that batches do not begin where the table does."""
+    known = {0: rejected("known"), 5: rejected("known")}
+    found = estimate_motions(numbered(), Believer(), np.arange(FRAMES), workers=workers, priors=told(), known=known)
+    assert {k for k, one in enumerate(found) if one.reason == "known"} == {0, 5}
+    for k, one in enumerate(found):
+        if k not in known:
+            assert one.motion == Motion(1e-3 * k, 0.0, float(k))
+            assert one.covariance is not None
+            assert one.covariance[0, 0] == 1 + k
+
+
+def test_without_priors_none_is_told() -> None:
+    assert {one.reason for one in estimate_motions(numbered(), Believer(), np.arange(3))} == {"nothing told"}
+
+
+def test_one_prior_a_pair() -> None:
+    with pytest.raises(MitsonarError, match=f"{FRAMES} frames make {FRAMES - 1} pairs, each with one prior: got 3"):
+        estimate_motions(numbered(), Believer(), np.arange(FRAMES), priors=told()[:3])

@@ -1,0 +1,264 @@
+"""The pose graph: closed forms, marginals by the dense inverse and by draws, wrong loops, and gtsam on the same graph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.mapping.error_correlation import ErrorCorrelation
+from mitsonar.mapping.graph_solver import GraphSolution, solved
+from mitsonar.mapping.motion_series import MotionSeries, path_of
+from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions
+from mitsonar.motion.composition import motions
+from mitsonar.motion.pose import Pose
+
+Array = NDArray[np.float64]
+
+STD = np.array([2e-3, 1e-3, 1e-3])
+REACH_M = 3.5
+
+
+def square(side: int = 10, step: float = 0.2) -> Array:
+    """Motions around a square, back to where they began ``(4 * side + 4, 3)``; corners are turned on the spot."""
+    leg = [[0.0, step, 0.0]] * side + [[0.0, 0.0, np.pi / 2]]
+    return np.array(leg * 4)
+
+
+def composed(moved: Array) -> Array:
+    """The poses x, y, heading from the origin along motions."""
+    poses: Array = path_of(moved, Pose(0, 0, 0), np.arange(len(moved) + 1.0)).poses[:, [0, 1, 5]]
+    return poses
+
+
+def graph_of(moved: Array, std: Array = STD) -> PoseGraph:
+    return PoseGraph(composed(moved), PoseEdges.chain(moved, np.tile(np.diag(std**2), (len(moved), 1, 1))))
+
+
+def edge(first: int, second: int, motion: Array, std: Array = STD) -> PoseEdges:
+    return PoseEdges(np.array([first]), np.array([second]), np.array([motion]), np.diag(std**2)[None])
+
+
+def joined(*edges: PoseEdges) -> PoseEdges:
+    return PoseEdges(*(np.concatenate(parts) for parts in zip(*edges, strict=True)))
+
+
+# ---------------------------------------------------------------- closed forms
+
+
+def test_motions_alone_give_their_composition_and_its_covariance() -> None:
+    """Two routes to one number: the graph's marginals and the covariances that are carried along a path."""
+    moved = square() + STD * np.random.default_rng(0).normal(size=(44, 3))
+    graph = graph_of(moved)
+    found = solved(replace(graph, start=graph.start + [0, 0, 0.01] * (np.arange(45) > 0)[:, None]))
+    np.testing.assert_allclose(found.poses, graph.start, atol=1e-9)
+    own, following = found.covariances()
+    series = MotionSeries(moved, np.arange(45.0), graph.chain.covariances)
+    np.testing.assert_allclose(own, pose_covariances(series, Pose(0, 0, 0)), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.motion_covariances(own, following), graph.chain.covariances, rtol=1e-6, atol=1e-12)
+
+
+def test_one_biased_edge_of_a_closed_square_is_shared_out_by_variance() -> None:
+    """Along a line, a loop and n motions share an error by their variances; an exact loop closes the square."""
+    moved = np.tile([0.0, 0.2, 0.0], (9, 1))
+    biased = moved.copy()
+    biased[4, 1] += 0.02
+    graph = replace(graph_of(biased), loops=edge(0, 9, np.array([0, 1.8, 0.0])))
+    found = solved(replace(graph, loops=graph.loops._replace(covariances=np.diag((10 * STD) ** 2)[None])))
+    # the loop has 100 times the variance of each of 9 motions: it takes 100/109 of the error
+    assert found.poses[9, 1] == pytest.approx(1.8 + 0.02 * 100 / 109, abs=1e-6)
+    one = graph_of(square())
+    turned = square()
+    turned[10, 2] += 0.01  # the first corner
+    closing = replace(one, chain=one.chain._replace(motions=turned), start=composed(turned))
+    closed = solved(replace(closing, loops=edge(0, 44, np.zeros(3), 1e-6 * STD)))
+    assert np.hypot(*closing.start[-1, :2]) > 0.01
+    assert np.hypot(*closed.poses[-1, :2]) < 1e-6
+    assert closed.poses[-1, 2] == pytest.approx(2 * np.pi, abs=1e-6)
+
+
+def test_headings_join_with_motions_by_variance() -> None:
+    """One heading after n motions of yaw variance s^2: the mean by weight, and its variance."""
+    graph = replace(
+        graph_of(np.tile([0.0, 0.1, 0.0], (4, 1))), headings=Headings(np.array([4]), np.array([0.03]), np.array([2e-3]))
+    )
+    found = solved(graph)
+    assert found.poses[4, 2] == pytest.approx(0.03 / 2)
+    own, _ = found.covariances()
+    assert own[4, 2, 2] == pytest.approx(2e-6)
+    unknown = np.diag([0, 0, 1.0])
+    loose = solved(replace(graph, at_start=unknown))
+    assert loose.poses[0, 2] == pytest.approx(0.03, abs=1e-6)
+    assert loose.covariances()[0][0, 2, 2] == pytest.approx(8e-6, rel=1e-4)
+
+
+def test_a_bias_of_a_sensor_is_found_by_a_heading_and_counts_in_the_covariance() -> None:
+    """Four motions at rest that each show a turn of b: the heading at the end says what of it is bias."""
+    still, loose = np.zeros((4, 3)), np.array([1e-3, 1e-3, 1.0])
+    turning = still + np.array([0, 0, 0.01])
+    graph = replace(graph_of(still, loose), others=PoseEdges.chain(turning, np.tile(np.diag(loose**2 * 1e-6), (4, 1, 1))))
+    graph = replace(graph, bias=np.tile([0, 0, 0.02], (4, 1)))
+    own, _ = solved(graph).covariances()
+    # four independent errors of 1e-3, and four times a common one of 0.02
+    assert own[4, 2, 2] == pytest.approx(4e-6 + (4 * 0.02) ** 2, rel=5e-3)
+    found = solved(replace(graph, headings=Headings(np.array([4]), np.zeros(1), np.array([1e-4]))))
+    np.testing.assert_allclose(found.poses[:, 2], 0, atol=1e-4)
+    with pytest.raises(MitsonarError, match="for each of 4 motions"):
+        replace(graph, bias=np.zeros((3, 3)))
+
+
+def test_a_wrong_loop_is_left_out_and_right_ones_are_kept() -> None:
+    rng = np.random.default_rng(1)
+    true = composed(square())
+    moved = square() + STD * rng.normal(size=(44, 3))
+    pairs = [(0, 44), (1, 43), (3, 44), (2, 43)]
+    right = [edge(i, j, relative_motions(true, [i], [j])[0] + STD * rng.normal(size=3)) for i, j in pairs]
+    wrong = [edge(5, 26, np.zeros(3)), edge(0, 20, np.array([0.5, 0, 0]))]
+    found = solved(replace(graph_of(moved), loops=joined(*right, *wrong)))
+    assert found.kept.tolist() == [True] * 4 + [False] * 2
+    assert (found.squared[4:] > 100).all()
+    only = solved(replace(graph_of(moved), loops=joined(*right)))
+    np.testing.assert_allclose(found.poses, only.poses, atol=1e-9)
+
+
+# ---------------------------------------------------------------- marginals
+
+
+def tangled(rng: np.random.Generator, share: float = 0.8, slope: float = 0.01) -> tuple[PoseGraph, Array]:
+    """A square with correlated errors, loops, a second sensor and headings, drawn from its own model; and the true poses."""
+    moved = square()
+    true = composed(moved)
+    model = ErrorCorrelation(share, length=0.2, slope=slope)
+    correlated = model.of(moved, REACH_M)
+    wander = rng.normal(size=(44, 3))
+    for k in range(1, 44):
+        wander[k] = correlated.onward[k - 1] * wander[k - 1] + np.sqrt(1 - correlated.onward[k - 1] ** 2) * wander[k]
+    error = np.sqrt(share) * wander + np.sqrt(1 - share) * rng.normal(size=(44, 3))
+    slopes = correlated.slope_std * rng.normal(size=(3, 3))
+    measured = moved + STD * error + moved @ slopes.T
+    chain = PoseEdges.chain(measured, np.tile(np.diag(STD**2), (44, 1, 1)))
+    gyro_std = np.array([0.02, 0.02, 2e-3])
+    others = PoseEdges.chain(moved + gyro_std * rng.normal(size=(44, 3)), np.tile(np.diag(gyro_std**2), (44, 1, 1)))
+    pairs = [(0, 44), (1, 43), (2, 43)]
+    loops = joined(*(edge(i, j, relative_motions(true, [i], [j])[0] + STD * rng.normal(size=3)) for i, j in pairs))
+    headings = Headings(np.array([20, 30]), true[[20, 30], 2] + 5e-3 * rng.normal(size=2), np.full(2, 5e-3))
+    return PoseGraph(composed(measured), chain, others, loops=loops, headings=headings, correlated=correlated), true
+
+
+def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
+    graph, _ = tangled(np.random.default_rng(2))
+    found = solved(graph)
+    size = found.factor.shape[0]
+    dense = found.factor.solve(np.eye(size))
+    normal = np.linalg.inv(dense)
+    np.testing.assert_allclose(normal @ dense, np.eye(size), atol=1e-5)
+    own, following = found.covariances()
+    assert not own[0].any()
+    for pose in (1, 17, 44):
+        place = found.states[3 * pose : 3 * pose + 3]
+        np.testing.assert_allclose(own[pose], dense[np.ix_(place, place)], rtol=1e-6, atol=1e-15)
+    there = found.states[3 * 17 : 3 * 19]
+    np.testing.assert_allclose(following[17], dense[np.ix_(there[:3], there[3:])], rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(found.columns([18])[17, :, 0], following[17], rtol=1e-9)
+
+
+def test_errors_over_covariances_are_one_by_draws() -> None:
+    """60 draws of the whole model; the mean of 60 chi-squares of three, a third, scatters by 11 %."""
+    normalised = []
+    for seed in range(60):
+        graph, true = tangled(np.random.default_rng([3, seed]))
+        found = solved(replace(graph, loops=graph.loops))
+        off = found.poses - true
+        own, _ = found.covariances()
+        normalised.append([off[k] @ np.linalg.solve(own[k], off[k]) / 3 for k in (10, 22, 44)])
+    assert np.mean(normalised, axis=0) == pytest.approx(np.ones(3), abs=0.35)
+
+
+def test_correlated_errors_make_a_long_path_s_covariance_larger_than_independent_ones() -> None:
+    moved = np.tile([0.0, 0.01, 0.0], (200, 1))
+    graph = graph_of(moved)
+    alone = solved(graph).covariances()[0][-1]
+    model = ErrorCorrelation(share=0.9, length=0.2, slope=1e-6)
+    alike = solved(replace(graph, correlated=model.of(moved, REACH_M))).covariances()[0][-1]
+    # a chain of correlation r sums to (1 + r)/(1 - r) times the variance of independent ones, up to its ends
+    r = np.exp(-0.01 / 0.7)
+    n = 200
+    expected = 0.1 + 0.9 * ((1 + r) / (1 - r) - 2 * r * (1 - r**n) / (n * (1 - r) ** 2))
+    assert alike[2, 2] / alone[2, 2] == pytest.approx(expected, rel=1e-6)
+    assert alike[1, 1] / alone[1, 1] == pytest.approx(expected, rel=1e-3)
+
+
+# ---------------------------------------------------------------- faults and gtsam
+
+
+def test_what_is_no_graph_is_refused() -> None:
+    graph = graph_of(square())
+    with pytest.raises(MitsonarError, match="leads to pose 99, and there are 45"):
+        replace(graph, loops=edge(0, 99, np.zeros(3)))
+    with pytest.raises(MitsonarError, match="two poses"):
+        replace(graph, start=np.zeros((1, 3)))
+    with pytest.raises(MitsonarError, match="positive"):
+        solved(replace(graph, loops=edge(0, 9, np.zeros(3), np.zeros(3))))
+    with pytest.raises(MitsonarError, match="tied by nothing"):
+        solved(replace(graph, chain=graph.chain.at(np.arange(44) != 7)))
+    for share, length, slope in ((1.0, 1, 1), (0.5, 0, 1), (0.5, 1, 0), (np.nan, 1, 1)):
+        with pytest.raises(MitsonarError, match="share must be"):
+            ErrorCorrelation(share, length, slope)
+
+
+def by_gtsam(graph: PoseGraph) -> tuple[Array, Array]:
+    """Poses and marginals of the same graph by gtsam, whose axes are forward and starboard of the first pose of an edge."""
+    gtsam = pytest.importorskip("gtsam")
+    swap = np.array([1, 0, 2])
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, (x, y, heading) in enumerate(graph.start):
+        values.insert(k, gtsam.Pose2(y, x, heading))
+    known = gtsam.noiseModel.Diagonal.Sigmas(np.full(3, 1e-9))
+    factors.add(gtsam.PriorFactorPose2(0, values.atPose2(0), known))
+    for edges in (graph.chain, graph.others, graph.loops):
+        for i, j, (sideways, forward, yaw), covariance in zip(*edges, strict=True):
+            sin, cos = np.sin(yaw), np.cos(yaw)
+            turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])  # gtsam's errors are in axes of the first pose
+            noise = gtsam.noiseModel.Gaussian.Covariance(turn @ covariance[np.ix_(swap, swap)] @ turn.T)
+            # eq. 3.4 is in axes of the second heading: the way back from there
+            factors.add(gtsam.BetweenFactorPose2(int(j), int(i), gtsam.Pose2(-forward, -sideways, -yaw), noise))
+    result = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    marginals = gtsam.Marginals(factors, result)
+    poses, covariances = [], []
+    for k in range(len(graph.start)):
+        pose = result.atPose2(k)
+        sin, cos = np.sin(pose.theta()), np.cos(pose.theta())
+        world = np.array([[sin, cos, 0], [cos, -sin, 0], [0, 0, 1]])  # forward, starboard to x, y
+        poses.append([pose.y(), pose.x(), pose.theta()])
+        covariances.append(world @ marginals.marginalCovariance(k) @ world.T)
+    return np.array(poses), np.array(covariances)
+
+
+def test_gtsam_finds_the_same_poses_and_marginals() -> None:
+    graph, _ = tangled(np.random.default_rng(4), share=0.0, slope=1e-9)
+    plain = replace(graph, correlated=None, headings=Headings.none())
+    found = solved(plain)
+    assert found.kept.all()
+    own, _ = found.covariances()
+    poses, covariances = by_gtsam(plain)
+    off = found.poses - poses
+    off[:, 2] -= 2 * np.pi * np.rint(off[:, 2] / (2 * np.pi))
+    std = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    assert (np.abs(off) <= 0.02 * std + 1e-9).all()
+    np.testing.assert_allclose(covariances[1:], own[1:], rtol=0.02, atol=1e-9)
+
+
+def test_motions_of_the_graph_are_those_of_paths() -> None:
+    poses = composed(square() + 0.01)
+    six = np.zeros((45, 6))
+    six[:, [0, 1, 5]] = poses
+    np.testing.assert_allclose(relative_motions(poses, np.arange(44), np.arange(1, 45)), motions(six), atol=1e-12)
+
+
+def test_a_solution_answers_for_known_poses() -> None:
+    found: GraphSolution = solved(graph_of(square()))
+    assert not found.columns([0]).any()

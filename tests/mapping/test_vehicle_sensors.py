@@ -1,0 +1,204 @@
+"""Sensors of a vehicle: readings become motions with covariances; files go round, and hostile ones are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_frames import sway
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.mapping.sensor_files import ROOT_HOUR, load_sensors, save_sensors
+from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.vehicle_sensors import Readings, VehicleSensors
+from mitsonar.motion.composition import motions
+
+Array = NDArray[np.float64]
+
+EXACT = SensorNoise(0.01, 0.0, 1e-3, 1e-6, 1e-6, (1e-4, 1e-2), rate_hz=200.0)
+
+
+def readings(time: Array, values: Array, std: float) -> Readings:
+    return Readings(time, values, np.full(len(time), std))
+
+
+# ---------------------------------------------------------------- motions
+
+
+def test_exact_readings_give_the_true_motions() -> None:
+    path = sway(60)
+    sensors = simulated_sensors(path, EXACT)
+    assert sensors.names == ["gyroscope", "DVL", "depth", "compass", "dead reckoning"]
+    true = motions(path.poses)
+    gyro, dvl, dead = sensors.motions(path.time_s)
+    assert gyro.pair.tolist() == dvl.pair.tolist() == dead.pair.tolist() == list(range(59))
+    # readings of 5 ms straddle the frames, at which the velocity changes
+    np.testing.assert_allclose(gyro.motions[:, 2], true[:, 2], atol=2e-4)
+    np.testing.assert_allclose(dvl.motions[:, :2], true[:, :2], atol=2e-4)
+    np.testing.assert_allclose(dead.motions, true, atol=2e-4)
+    fused = sensors.priors(path.time_s)
+    assert fused is not None
+    np.testing.assert_allclose([one.motion for one in fused], true, atol=2e-4)
+    risen = sensors.rises(path.time_s)
+    assert risen is not None
+    np.testing.assert_allclose(risen, 0, atol=1e-5)
+    told = sensors.headings(path.time_s)
+    off = told.heading - path.poses[told.pose, 5]
+    np.testing.assert_allclose(off - 2 * np.pi * np.rint(off / (2 * np.pi)), 0, atol=1e-3)
+
+
+def test_a_gyroscope_s_noise_grows_with_the_root_of_time() -> None:
+    """1 deg/h^0.5 is 1 deg after an hour, 1/60 deg after a second."""
+    assert np.degrees(ROOT_HOUR) * 60 == pytest.approx(1)
+    time = np.arange(0, 3600.0, 0.5)
+    gyro = VehicleSensors(yaw_rate=readings(time, np.zeros(len(time)), ROOT_HOUR))
+    (hour,) = gyro.motions(np.array([0.0, 3599.5]))
+    assert np.degrees(np.sqrt(hour.covariances[0, 2, 2])) == pytest.approx(1, rel=1e-3)
+    (second,) = gyro.motions(np.array([10.0, 11.0]))
+    assert np.degrees(np.sqrt(second.covariances[0, 2, 2])) == pytest.approx(1 / 60, rel=1e-6)
+    assert np.sqrt(second.covariances[0, 0, 0]) >= 10
+
+
+def test_readings_average_and_draws_have_the_variance_that_is_told() -> None:
+    path = sway(200)
+    errors, squared = [], []
+    for seed in range(5):
+        sensors = simulated_sensors(path, SensorNoise(20.0, 0.0, 0.05, rate_hz=50), seed)
+        gyro, dvl = sensors.motions(path.time_s)
+        true = motions(path.poses)
+        errors.append((gyro.motions - true)[:, 2] / np.sqrt(gyro.covariances[:, 2, 2]))
+        off = dvl.motions - true
+        off[:, 2] -= gyro.motions[:, 2] - true[:, 2]  # the turn that the DVL borrowed
+        squared.append((off[:, None] @ np.linalg.inv(dvl.covariances) @ off[..., None]).ravel())
+    assert np.std(errors) == pytest.approx(1, abs=0.1)
+    assert np.mean(squared) / 2 == pytest.approx(1, abs=0.2)
+
+
+def test_draws_of_a_bias_and_of_dead_reckoning_are_as_told() -> None:
+    path = sway(40)
+    drift = [simulated_sensors(path, SensorNoise(1e-6, 1000.0), seed).motions(path.time_s)[0] for seed in range(40)]
+    whole = np.array([(one.motions[:, 2] - motions(path.poses)[:, 2]).sum() / one.bias[:, 2].sum() for one in drift])
+    assert np.sqrt((whole**2).mean()) == pytest.approx(1, abs=0.35)
+    off = []
+    for seed in range(30):
+        (dead,) = simulated_sensors(path, SensorNoise(walk=(0.01, 0.5)), seed).motions(path.time_s)
+        off.append((dead.motions - motions(path.poses)) / np.sqrt(np.diagonal(dead.covariances, axis1=1, axis2=2)))
+    assert np.std(off, axis=(0, 1)) == pytest.approx(np.ones(3), abs=0.2)
+
+
+def test_gaps_and_ends_are_not_bridged() -> None:
+    time = np.concatenate([np.arange(0, 5, 0.1), np.arange(10, 15, 0.1)])
+    gyro = VehicleSensors(yaw_rate=readings(time, np.ones(len(time)), 1e-3))
+    frames = np.arange(-2.0, 20.0)
+    (told,) = gyro.motions(frames)
+    covered = [(frames[k], frames[k + 1]) for k in told.pair]
+    assert covered == [(float(t), float(t + 1)) for t in (0, 1, 2, 3, 10, 11, 12, 13)]
+    np.testing.assert_allclose(told.motions[:, 2], 1, rtol=1e-6)
+    with pytest.raises(MitsonarError, match="no reading between 50 and 52 s"):
+        gyro.motions(np.array([50.0, 51, 52]))
+
+
+def test_no_compass_reading_counts_for_two_frames() -> None:
+    compass = VehicleSensors(heading=readings(np.arange(0, 10, 1.0), np.linspace(6.1, 6.5, 10), 0.02))
+    frames = np.arange(0, 9, 0.1)
+    told = compass.headings(frames)
+    assert told.pose.tolist() == [*range(0, 90, 10), 89]
+    np.testing.assert_allclose(np.unwrap(told.heading)[:9], np.linspace(6.1, 6.5, 10)[:9] - 2 * np.pi, atol=1e-9)
+    assert compass.priors(frames) is None
+
+
+def test_priors_join_sensors_by_their_information() -> None:
+    time = np.arange(0, 10, 0.1)
+    yaw_rate, forward, none = (
+        readings(time, np.full(100, value), std) for value, std in ((0.2, 0.01), (0.5, 0.1), (0.0, 0.1))
+    )
+    both = VehicleSensors(yaw_rate, none, forward)
+    told = both.priors(np.array([2.0, 3.0]))
+    assert told is not None
+    (one,) = told
+    np.testing.assert_allclose(one.motion[2], 0.2, rtol=1e-3)
+    np.testing.assert_allclose(one.motion[:2], [-0.5 * np.sin(0.1), 0.5 * np.cos(0.1)], rtol=2e-3)
+    assert one.std[2] == pytest.approx(0.01, rel=1e-3)
+    # ten readings of 0.1 m/s over a second
+    np.testing.assert_allclose(one.std[:2], 0.1 * np.sqrt(0.1), rtol=0.02)
+
+
+# ---------------------------------------------------------------- files
+
+
+def test_a_file_holds_all_readings(tmp_path: Path) -> None:
+    path = sway(20)
+    for noise in (SensorNoise(1.0, 5.0, 0.02, 0.1, 2.0, (0.01, 0.1)), SensorNoise(gyro_deg_rth=1.0)):
+        sensors = simulated_sensors(path, noise, 3)
+        save_sensors(tmp_path / "s.csv", sensors)
+        read = load_sensors(tmp_path / "s.csv")
+        assert read.names == sensors.names
+        assert read.bias_std == pytest.approx(sensors.bias_std)
+        for one, two in zip(sensors.motions(path.time_s), read.motions(path.time_s), strict=True):
+            np.testing.assert_allclose(one.motions, two.motions, atol=1e-9)
+            np.testing.assert_allclose(one.covariances, two.covariances, rtol=1e-6)
+        np.testing.assert_array_equal(read.headings(path.time_s).pose, sensors.headings(path.time_s).pose)
+
+
+def test_sensors_of_other_times_share_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "two.csv"
+    file.write_text(
+        "time,yaw_rate_deg_s,yaw_rate_noise_deg_rth,depth_m,depth_std_m,by\n0,1,0.1,,,x\n1,2,,5,0.1,y\n2,,,6,,z\n"
+    )
+    read = load_sensors(file)
+    assert read.yaw_rate is not None
+    assert read.depth is not None
+    assert read.yaw_rate.time_s.tolist() == [0, 1]
+    np.testing.assert_allclose(np.degrees(read.yaw_rate.values), [1, 2])
+    np.testing.assert_allclose(read.yaw_rate.std, 0.1 * ROOT_HOUR)
+    assert read.depth.values.tolist() == [5, 6]
+    assert read.sideways is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no table"),
+        ("time_s,depth\n0,1\n", "no column of a sensor"),
+        ("depth_m,depth_std_m\n0,1\n", "needs one column of times"),
+        ("time_s,time,depth_m,depth_std_m\n0,0,1,1\n", "needs one column of times"),
+        ("time_s,depth_m\n0,1\n", "add the column depth_std_m"),
+        ("time_s,depth_m,depth_std_m\n0,1,\n", "depth_std_m is empty"),
+        ("time_s,depth_m,depth_std_m\n0,1,0\n", "above 0"),
+        ("time_s,depth_m,depth_std_m\n0,1,-1\n", "above 0"),
+        ("time_s,depth_m,depth_std_m\n0,one,1\n", "row 2: depth_m must be a number: got 'one'"),
+        ("time_s,depth_m,depth_std_m\n0,nan,1\n", "must be a number"),
+        ("time_s,depth_m,depth_std_m\n0,inf,1\n", "must be a number"),
+        ("time_s,depth_m,depth_std_m\n0,1_0,1\n", "must be a number"),
+        ("time_s,depth_m,depth_std_m\n,1,1\n", "time_s must be a number"),
+        ("time_s,depth_m,depth_std_m\n1,1,1\n0,1,1\n", "column depth_m: times of readings must increase"),
+        ("time_s,depth_m,depth_std_m\n0,,1\n", "hold no reading"),
+        ("time_s,depth_m,depth_m,depth_std_m\n0,1,1,1\n", "more than once"),
+        ("time_s,depth_m,depth_std_m\n0,1\n", "words"),
+        ("time_s,reckoned_x_m\n0,1\n", "no column reckoned_y_m"),
+    ],
+)
+def test_files_that_tell_no_sensors_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "s.csv").write_text(text)
+    with pytest.raises(MitsonarError, match=message):
+        load_sensors(tmp_path / "s.csv")
+
+
+def test_readings_that_are_none_are_refused() -> None:
+    time = np.arange(3.0)
+    good = readings(time, time, 1.0)
+    for change, message in (
+        ({"values": np.zeros(2)}, "a time, a value"),
+        ({"values": np.array([0, np.nan, 0])}, "finite"),
+        ({"time_s": np.zeros(3)}, "increase"),
+        ({"std": np.zeros(3)}, "above 0"),
+    ):
+        with pytest.raises(MitsonarError, match=message):
+            replace(good, **change)
+    with pytest.raises(MitsonarError, match="hold no reading"):
+        VehicleSensors()
+    with pytest.raises(MitsonarError, match="too short"):
+        simulated_sensors(sway(3), SensorNoise(gyro_deg_rth=1.0, rate_hz=1.0))
