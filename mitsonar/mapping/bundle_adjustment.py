@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from mitsonar.geometry.sonar_projection import Views, projection_of
 from mitsonar.instruments.imaging_sonar import Bearing
 
-__all__ = ["Adjusted", "Links", "Observations", "adjusted", "cauchy", "track_weight"]
+__all__ = ["Adjusted", "Observations", "adjusted", "cauchy", "track_weight"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -29,14 +29,17 @@ STILL = 1e-6
 OUTLYING = 4.0
 """Squared errors, in covariances, of so much have half the weight."""
 
-TRACK = 1.5
+TRACK = 1.0
 """Landmarks whose mean squared error is so many times the usual one have half the weight: what moves with a shadow."""
+
+HARSH = 4
+"""Power by which landmarks that fit worse lose weight. With 2 sideways paths over rocks drift twice as far."""
 
 BELOW_M = 0.02
 """Mean of the errors of heights below the ground [m]."""
 
 UNKNOWN_M = 0.1
-"""Heights that the observations tell no better than this are held to the mean of the law as well [m]: its mode is no mean."""
+"""Heights that the observations tell no better than this are held to the mean of the law too [m]: its mode is no mean."""
 
 NEAREST_M = 0.01
 """Heights nearer to the ground than this count as so far: the law has a corner there [m]."""
@@ -69,18 +72,6 @@ class Observations(NamedTuple):
     def take(self, index: Index | NDArray[np.bool_]) -> Observations:
         """Return some of the observations."""
         return Observations(*(values[index] for values in self))
-
-
-class Links(NamedTuple):
-    """What other sensors tell of the motions between consecutive poses.
-
-    Attributes:
-        motion: sideways, forward [m], yaw [rad] from each pose to the next ``(poses - 1, 3)`` (eq. 3.4).
-        information: inverse covariance of these ``(poses - 1, 3, 3)``; zeros where nothing is known.
-    """
-
-    motion: Array
-    information: Array
 
 
 class Adjusted(NamedTuple):
@@ -119,7 +110,7 @@ def cauchy(squared: Array) -> Array:
 
 def track_weight(faults: Array) -> Array:
     """Return the weights of landmarks with these mean squared errors, in those of the usual one."""
-    return np.asarray(1 / (1 + (faults / TRACK) ** 2))
+    return np.asarray(1 / (1 + (faults / TRACK) ** HARSH))
 
 
 def adjusted(
@@ -130,7 +121,6 @@ def adjusted(
     seen: Observations,
     bearing: Bearing,
     relief_m: float,
-    links: Links | None = None,
 ) -> Adjusted:
     """Adjust poses and landmarks.
 
@@ -142,7 +132,6 @@ def adjusted(
         seen: observations of them.
         bearing: kind of the bearings.
         relief_m: mean height of what is seen over the ground.
-        links: of consecutive poses.
 
     Raises:
         LinAlgError: observations that do not suffice.
@@ -152,8 +141,6 @@ def adjusted(
         blocks = _normal_equations(found, held, place, seen, bearing)
         _add_heights(blocks, place[:, 2], relief_m)
         _add_attitudes(blocks, found[held:], told[held:], attitude_std)
-        if links is not None:
-            _add_links(blocks, found, held, links)
         inverse = np.linalg.inv(blocks.landmarks)
         crossed = _crossed(blocks.between, inverse)
         reduced = blocks.poses - crossed @ blocks.between.T
@@ -221,36 +208,8 @@ def _add_attitudes(blocks: _Blocks, poses: Array, told: Array, std: Array) -> No
     blocks.pull[:] += (information * (told - poses)).ravel()
 
 
-def _add_links(blocks: _Blocks, poses: Array, held: int, links: Links) -> None:
-    """Hold the motions between consecutive poses to what sensors tell."""
-    for k in range(max(held, 1), len(poses)):
-        information = links.information[k - 1]
-        if not information.any():
-            continue
-        before, after = poses[k - 1], poses[k]
-        sin, cos = np.sin(after[5]), np.cos(after[5])
-        x, y = after[:2] - before[:2]
-        motion = np.array([x * cos - y * sin, x * sin + y * cos, _within_half_turn(after[5] - before[5])])
-        error = links.motion[k - 1] - motion
-        error[2] = _within_half_turn(error[2])
-        of_after = np.array([[cos, -sin, -motion[1]], [sin, cos, motion[0]], [0, 0, 1]])
-        of_before = np.array([[-cos, sin, 0], [-sin, -cos, 0], [0, 0, -1]])
-        sides = [(k - held, of_after), (k - 1 - held, of_before)]
-        for place, derivative in sides:
-            for other, second in sides:
-                if place >= 0 and other >= 0:
-                    rows, columns = (6 * one + np.array([0, 1, 5]) for one in (place, other))
-                    blocks.poses[np.ix_(rows, columns)] += derivative.T @ information @ second
-            if place >= 0:
-                blocks.pull[6 * place + np.array([0, 1, 5])] += derivative.T @ information @ error
-
-
 def _summed(values: Array, group: Index, groups: int) -> Array:
     """Sum rows of equal group ``(groups, ...)``."""
     flat = values.reshape(len(values), -1)
     sums = np.stack([np.bincount(group, column, minlength=groups) for column in flat.T], axis=1)
     return np.asarray(sums.reshape(groups, *values.shape[1:]))
-
-
-def _within_half_turn(angle: float) -> float:
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.image.patches import COLUMNS, ROWS, PatchImage, Patches, align, corners, cut
+from mitsonar.estimation.image.patches import COLUMNS, ROWS, Patches, PatchImage, align, corners, cut
 from mitsonar.geometry.sonar_projection import Views, points_at, polar_of, projection_of
 from mitsonar.instruments.imaging_sonar import Bearing
 from mitsonar.mapping.bundle_adjustment import Observations

@@ -21,11 +21,10 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.patches import PatchImage, patch_image
 from mitsonar.geometry.attitude import STD_GIVEN, attitude_of
 from mitsonar.geometry.sonar_projection import Views, polar_of, projection_of
-from mitsonar.mapping.bundle_adjustment import Links, adjusted, cauchy, track_weight
+from mitsonar.mapping.bundle_adjustment import adjusted, cauchy, track_weight
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.landmarks import Found, ImageAxes, Landmarks
 from mitsonar.motion.composition import Motion, compose, motions
-from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -62,6 +61,9 @@ PAIR_STD = np.array([1e-3, 1e-3, np.radians(0.03)])
 """Share of the information of the motion between two frames that counts: the map has seen the same frames; least standard
 deviations of that motion [m, m, rad]."""
 
+HELD = 1e12
+"""Information by which the first frame stays where it is."""
+
 WORST = 25.0
 """Squared error beyond which a keyframe does not show a landmark."""
 
@@ -94,7 +96,6 @@ class _Map:
         attitude_std: of heights [m], pitches and rolls [rad] ``(3,)``.
         keyframes: their number among the frames.
         poses: of the keyframes ``(6,)`` each.
-        links: what sensors tell between keyframes: motion and covariance, or None.
         relief_m: mean height of what is seen over the ground.
         lean: height, pitch and roll of the last keyframe, less what was told ``(3,)``.
         drift: covariance of x, y, heading that each keyframe adds ``(3, 3)`` each.
@@ -104,7 +105,6 @@ class _Map:
     attitude_std: Array
     keyframes: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
-    links: list[MotionPrior | None] = field(default_factory=list)
     relief_m: float = RELIEF_M
     lean: Array = field(default_factory=lambda: np.zeros(3))
     drift: list[Array] = field(default_factory=list)
@@ -125,7 +125,6 @@ def mapped(
     source: FrameSource,
     numbers: Index,
     estimates: Sequence[Estimate],
-    priors: Sequence[MotionPrior] | None = None,
     progress: Callable[[int], None] = lambda frames: None,
 ) -> list[Estimate]:
     """Estimate the motions anew, with a map of the last metres.
@@ -137,7 +136,6 @@ def mapped(
         source: of the frames; it tells heights, and pitches or poses.
         numbers: of the frames used ``(n,)``.
         estimates: of each pair of consecutive frames: where a frame's landmarks are looked for.
-        priors: what other sensors tell of each of these motions.
         progress: called with the number of frames that were added.
 
     Returns:
@@ -150,10 +148,10 @@ def mapped(
     state = _Map(Landmarks(_axes(source.like)), std)
     path, reasons = [attitudes[0]], [""]
     for k, (frames, image) in enumerate(_images(source, numbers)):
-        expected = attitudes[0].copy() if k == 0 else _predicted(path[-1], estimates[k - 1], priors and priors[k - 1], attitudes[k])
+        expected = attitudes[0].copy() if k == 0 else _predicted(path[-1], estimates[k - 1], attitudes[k])
         expected[2:5] += state.lean
-        answer = _register(state, image, expected, *_trust(estimates, priors, k))
-        pose = _update(state, k, frames, image, answer, priors)
+        answer = _register(state, image, expected, _trust(estimates, k))
+        pose = _update(state, k, frames, image, answer)
         if k:
             path.append(pose)
             reasons.append(answer.reason)
@@ -177,8 +175,8 @@ def _attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
     heights = None if source.height_m is None else source.height_m[numbers]
     if heights is None or not np.isfinite(heights).any():
         raise MitsonarError(
-            f"{source.name}: the local map needs the height over the ground, and the frames tell none: give it, or leave the "
-            "map out"
+            f"{source.name}: the local map needs the height over the ground, and the frames tell none: give it, or "
+            "leave the map out"
         )
     heights = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
     if source.poses is not None and np.isfinite(source.poses[numbers, 2:5]).all():
@@ -205,30 +203,28 @@ def _images(source: FrameSource, numbers: Index) -> Iterator[tuple[SonarFrames, 
             yield frames.select(slice(k, k + 1)), patch_image(values[k])
 
 
-def _predicted(before: Array, estimate: Estimate, prior: MotionPrior | None, attitude: Array) -> Array:
+def _predicted(before: Array, estimate: Estimate, attitude: Array) -> Array:
     """Return the pose after a motion, at the height and attitude that are told."""
-    motion = estimate.motion if estimate.valid or prior is None else prior.motion
-    pose = np.array(compose(Pose(*(float(value) for value in before)), motion))
+    pose = np.array(compose(Pose(*(float(value) for value in before)), estimate.motion))
     pose[2:5] = attitude[2:5]
     return pose
 
 
-def _trust(estimates: Sequence[Estimate], priors: Sequence[MotionPrior] | None, k: int) -> tuple[Array, Array]:
-    """Return the information of x, y and heading ``(3, 3)`` that the prediction of frame ``k`` has, and its covariance."""
-    if k == 0:
-        return np.eye(3) * 1e12, np.zeros((3, 3))
-    one = estimates[k - 1]
+def _trust(estimates: Sequence[Estimate], frame: int) -> Array:
+    """Return the information on starboard, forward and heading that the prediction of a frame has ``(3, 3)``."""
+    if frame == 0:
+        return np.eye(3) * HELD
+    one = estimates[frame - 1]
+    if not one.valid:
+        return np.eye(3)
     covariance = np.diag((10 * PAIR_STD) ** 2) if one.covariance is None else np.asarray(one.covariance, dtype=float)
-    information = PAIR_SHARE * np.linalg.inv(covariance + np.diag(PAIR_STD**2)) if one.valid else np.zeros((3, 3))
-    if priors is not None:
-        information = information + np.linalg.inv(priors[k - 1].covariance)
-    return information + np.diag([1.0, 1.0, 1.0]), covariance
+    return np.asarray(PAIR_SHARE * np.linalg.inv(covariance + np.diag(PAIR_STD**2)) + np.eye(3))
 
 
 # ---------------------------------------------------------------- register
 
 
-def _register(state: _Map, image: PatchImage, expected: Array, information: Array, covariance: Array) -> _Registered:
+def _register(state: _Map, image: PatchImage, expected: Array, information: Array) -> _Registered:
     """Find the landmarks, and the pose from which the sonar receives them there."""
     landmarks, bearing = state.landmarks, state.landmarks.axes.bearing
     found = landmarks.find(image, Views.of(expected))
@@ -274,14 +270,11 @@ def _update(
     frames: SonarFrames,
     image: PatchImage,
     answer: _Registered,
-    priors: Sequence[MotionPrior] | None,
 ) -> Array:
     """Make a keyframe where the sonar has moved on, adjust the last ones, and return the pose of the frame."""
     if state.keyframes and not _moved_on(state, answer):
         return answer.pose
     number, landmarks = len(state.keyframes), state.landmarks
-    if number:
-        state.links.append(None if priors is None else _composed(priors[state.keyframes[-1] : frame]))
     state.keyframes.append(frame)
     state.poses.append(answer.pose.copy())
     state.drift.append(state.drift[-1] if state.drift else np.diag(PAIR_STD**2))
@@ -308,16 +301,6 @@ def _moved_on(state: _Map, answer: _Registered) -> bool:
     return bool((np.median(np.abs(now - then), axis=0) > MOVED).any())
 
 
-def _composed(priors: Sequence[MotionPrior]) -> MotionPrior:
-    """Return what sensors tell of several consecutive motions together."""
-    pose = Pose(0.0, 0.0, 0.0)
-    for prior in priors:
-        pose = compose(pose, prior.motion)
-    motion = motions(np.array([Pose(0.0, 0.0, 0.0), pose]))[0]
-    motion[2] = pose.heading
-    return MotionPrior(Motion(*motion.tolist()), np.sum([prior.covariance for prior in priors], axis=0))
-
-
 def _adjust(state: _Map) -> None:
     """Adjust the last keyframes and the landmarks that they show."""
     last, landmarks = len(state.poses), state.landmarks
@@ -327,7 +310,6 @@ def _adjust(state: _Map) -> None:
         return
     oldest = int(seen.view.min())
     poses = np.array(state.poses[oldest:])
-    links = None if not any(state.links[oldest:]) else _links(state.links[oldest:])
     try:
         new = adjusted(
             poses,
@@ -337,7 +319,6 @@ def _adjust(state: _Map) -> None:
             seen._replace(view=seen.view - oldest),
             landmarks.axes.bearing,
             state.relief_m,
-            links,
         )
     except LinAlgError:
         return  # the keyframes stay as they were registered
@@ -345,15 +326,6 @@ def _adjust(state: _Map) -> None:
     state.lean += new.poses[-1, 2:5] - poses[-1, 2:5]
     state.poses[first:] = list(new.poses[first - oldest :])
     state.drift[-1] = new.last_covariance / (last - first)
-
-
-def _links(links: Sequence[MotionPrior | None]) -> Links:
-    """Return what sensors tell as arrays."""
-    motion, information = np.zeros((len(links), 3)), np.zeros((len(links), 3, 3))
-    for k, link in enumerate(links):
-        if link is not None:
-            motion[k], information[k] = link.motion, np.linalg.inv(link.covariance)
-    return Links(motion, information)
 
 
 def _relief(frames: SonarFrames, pose: Array, before: float) -> float:

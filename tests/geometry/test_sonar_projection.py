@@ -33,7 +33,7 @@ def test_derivatives_are_those_of_the_projection(bearing: Bearing) -> None:
 
 @pytest.mark.parametrize("bearing", ["azimuth", "cone"])
 def test_points_come_back_from_range_bearing_and_height(bearing: Bearing) -> None:
-    views = Views.of(np.stack([POSE, POSE + [0.1, 0.2, 0.05, 0.01, -0.02, 0.1], POSE]))
+    views = Views.of(np.stack([POSE, POSE + np.array([0.1, 0.2, 0.05, 0.01, -0.02, 0.1]), POSE]))
     polar = polar_of(POINTS, views, bearing)
     np.testing.assert_allclose(points_at(polar, POINTS[:, 2], views, bearing), POINTS, atol=1e-9)
     assert np.isnan(points_at(np.array([[1.0, 0.0]]), np.zeros(1), Views.of(POSE), bearing)).all(), "too near for the ground"

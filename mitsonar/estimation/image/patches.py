@@ -47,7 +47,7 @@ FAINTEST = 1e-6
 ROUNDS = 8
 LONGEST = np.array([2.0, 0.7])
 STILL = np.array([0.004, 0.002])
-"""Gauss-Newton iterations of an alignment, the longest step of one and the step below which a patch is done [bins, beams]."""
+"""Gauss-Newton iterations, the longest step of one and the step below which a patch is done [bins, beams]."""
 
 ALIKE = 3.0
 """Neighbouring pixels whose errors are alike."""
