@@ -79,6 +79,13 @@ def odometry(
             dir_okay=False,
         ),
     ] = None,
+    local_map: Annotated[
+        bool,
+        typer.Option(
+            "--map",
+            help="Register frames to a map of the last metres, not to the last frame alone: over rocks paths drift a tenth.",
+        ),
+    ] = False,
     loops: Annotated[
         bool, typer.Option("--loops", help="Search for places that are seen again, and close the path there.")
     ] = False,
@@ -149,6 +156,7 @@ def odometry(
             closure=steps,
             sensors=vehicle,
             loops=loops,
+            local_map=local_map,
             workers=processes,
             overwrite=overwrite,
             resume=resume,

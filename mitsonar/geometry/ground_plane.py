@@ -14,7 +14,7 @@ from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Bearing
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
-__all__ = ["GroundGeometry", "moved", "nearest_known"]
+__all__ = ["GroundGeometry", "arc_elevation", "moved", "nearest_known"]
 
 
 @dataclass(frozen=True)
@@ -49,17 +49,7 @@ class GroundGeometry:
         An arc can meet the ground in two points. The one nearer to the sonar's axis in elevation counts.
         """
         radius, b = np.meshgrid(self.range_m, self.bearing_rad, indexing="ij")
-        starboard, forward, up = self.turn[2]  # how much of each points up
-        if self.bearing == "azimuth":
-            fixed, ahead, upward = 0.0, starboard * np.sin(b) + forward * np.cos(b), np.broadcast_to(up, b.shape)
-        else:
-            fixed, ahead, upward = starboard * np.sin(b), forward * np.cos(b), up * np.cos(b)
-        # fixed + ahead cos e + upward sin e = -height / radius
-        lean = np.arctan2(upward, ahead)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            swing = np.arccos((-self.height_m / radius - fixed) / np.hypot(ahead, upward))
-        one, other = (_within_pi(lean + sign * swing) for sign in (-1, 1))
-        e = np.where(np.abs(one) <= np.abs(other), one, other)
+        e = arc_elevation(self.bearing, b, -self.height_m / radius, self.turn[2])
         return np.asarray((directions(self.bearing, b, e) * radius[..., None] @ self.turn.T)[..., :2])
 
     def to_polar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -114,6 +104,33 @@ class GroundGeometry:
         below = points.dtype.type(self.height_m)
         starboard, forward, up = (x * turn[0, k] + y * turn[1, k] - below * turn[2, k] for k in range(3))
         return starboard, forward, up
+
+
+def arc_elevation(
+    bearing: Bearing, angle: NDArray[np.float64], rise: NDArray[np.float64], upward: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Compute the elevation [rad] at which the arc of a cell meets a level.
+
+    Args:
+        bearing: kind of the angle, ``azimuth`` or ``cone``.
+        angle: bearings of the cells [rad].
+        rise: height of the level over the sonar, as part of the range of each cell; like ``angle``.
+        upward: how much of the sonar's starboard, forward and up points up ``(..., 3)``.
+
+    Returns:
+        Of the two points where an arc may meet the level, the one nearer to the sonar's axis; nan where there is none.
+    """
+    starboard, forward, up = np.moveaxis(np.asarray(upward), -1, 0)
+    if bearing == "azimuth":
+        fixed, ahead, above = 0.0, starboard * np.sin(angle) + forward * np.cos(angle), np.broadcast_to(up, angle.shape)
+    else:
+        fixed, ahead, above = starboard * np.sin(angle), forward * np.cos(angle), up * np.cos(angle)
+    # fixed + ahead cos e + above sin e = rise
+    lean = np.arctan2(above, ahead)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        swing = np.arccos((rise - fixed) / np.hypot(ahead, above))
+    one, other = (_within_pi(lean + sign * swing) for sign in (-1, 1))
+    return np.where(np.abs(one) <= np.abs(other), one, other)
 
 
 def nearest_known(known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -22,6 +22,7 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, graph_path
+from mitsonar.mapping.local_map import mapped
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops
 from mitsonar.mapping.mode_continuity import continued
 from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
@@ -149,6 +150,7 @@ def odometry(
     closure: int = 0,
     sensors: VehicleSensors | None = None,
     loops: bool = False,
+    local_map: bool = False,
     workers: int = 1,
     known: Mapping[int, Estimate] | None = None,
     keep: Callable[[int, Estimate], None] = lambda number, estimate: None,
@@ -172,6 +174,7 @@ def odometry(
         closure: motions over which loops are closed; covariances are raised to what the loops leave over. 0: none.
         sensors: of the vehicle: they tell estimators where to begin, and join in a pose graph.
         loops: search for places that are seen again, and close the path there, in a pose graph.
+        local_map: register frames to a map of the last metres as well; see :mod:`mitsonar.mapping.local_map`.
         workers: processes beside this one; 1: none. The result is the same, to the bit.
         known: estimates of an earlier run, by the number of their pair.
         keep: called with the number and the estimate of each new pair.
@@ -185,12 +188,13 @@ def odometry(
     """
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     numbers = _frames_used(source, smooth, scale, every, closure)
-    time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops)
+    time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops, local_map)
     estimate = partial(estimate_motions, priors=None if sensors is None else sensors.priors(time_s))
     estimates = estimate(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
     estimates = continued(estimates)
     closing = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
     estimates = estimates if closing is None else closing.honest(estimates)
+    estimates = mapped(shown, numbers, estimates, progress) if local_map and shown is not None else estimates
     measured = series_of(estimates, time_s)
     factors = _scale_factors(measured, source.true, numbers, scale)
     measured, first = scaled(measured, factors), start or _start(source, int(numbers[0]))
@@ -205,7 +209,9 @@ def odometry(
     return replace(plain, series=graph.series, path=graph.path, graph=graph)
 
 
-def _ground_shown(source: Source, sensors: VehicleSensors | None, smooth: str, loops: bool) -> FrameSource | None:
+def _ground_shown(
+    source: Source, sensors: VehicleSensors | None, smooth: str, loops: bool, local_map: bool
+) -> FrameSource | None:
     """Return the source where its frames show ground from above. Reject what a pose graph cannot do."""
     if smooth != "none" and (loops or sensors is not None):
         raise MitsonarError(
@@ -214,6 +220,8 @@ def _ground_shown(source: Source, sensors: VehicleSensors | None, smooth: str, l
     shown = source if isinstance(source, FrameSource) else None
     if loops and shown is None:
         raise MitsonarError(f"loops are searched in sonar frames, and {source.name} holds other records: leave loops out")
+    if local_map and shown is None:
+        raise MitsonarError(f"a map is made of sonar frames, and {source.name} holds other records: leave the map out")
     return shown
 
 

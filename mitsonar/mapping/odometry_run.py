@@ -180,6 +180,7 @@ def run_odometry(
     closure: int = 0,
     sensors: VehicleSensors | None = None,
     loops: bool = False,
+    local_map: bool = False,
     workers: int = 1,
     overwrite: bool = False,
     resume: bool = False,
@@ -200,6 +201,7 @@ def run_odometry(
         closure: as above.
         sensors: as above.
         loops: as above.
+        local_map: as above.
         workers: as above.
         overwrite: replace an odometry in the folder.
         resume: go on with an interrupted one.
@@ -215,7 +217,7 @@ def run_odometry(
     folder = OdometryFolder(run)
     kept, begun = folder.kept() if folder.run.resumed else {}, time.perf_counter()
     asked = partial(odometry, smooth=smooth, scale=scale, start=start, every=every, closure=closure)
-    pipeline = partial(asked, sensors=sensors, loops=loops, workers=workers, progress=progress)
+    pipeline = partial(asked, sensors=sensors, loops=loops, local_map=local_map, workers=workers, progress=progress)
     known_loops = folder.kept_loops() if folder.run.resumed else {}
     journals = partial(pipeline, known=kept, keep=folder.keep, known_loops=known_loops, keep_loop=folder.keep_loop)
     found = journals(source, estimator)

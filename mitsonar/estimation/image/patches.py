@@ -1,0 +1,216 @@
+"""Patches of sonar images: chosen where they can be found again, and aligned with other frames (Lucas and Kanade, 1981).
+
+Shadows move over the ground when the sonar moves. Pixels in shadow, and those at its edge, have no weight.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.estimation.image.image_slopes import blurred, central_differences
+
+__all__ = ["COLUMNS", "ROWS", "Alignment", "PatchImage", "Patches", "align", "corners", "cut", "patch_image"]
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Index = NDArray[np.intp]
+
+REACH = (8, 3)
+"""Bins and beams of a patch to each side of its middle."""
+
+SMOOTHING = (1.0, 0.6)
+"""Standard deviations by which frames are smoothed [bins, beams]."""
+
+CELL = (26, 8)
+"""Bins and beams in which one patch is chosen."""
+
+SHADOW = 0.15
+AROUND = (25, 61)
+"""Level of a shadow, as part of the mean level around it [beams, bins]."""
+
+EDGE = (3, 7)
+"""Beams and bins of the neighbourhood of a shadow that is left out."""
+
+LEAST_LIT = 0.5
+"""Least part of a patch's weight outside of shadows."""
+
+BEAM = 2.0
+"""Slopes over beams count as over so many bins, where patches are chosen."""
+
+FAINTEST = 1e-6
+"""Least sum of squared slopes of a patch."""
+
+ROUNDS = 8
+LONGEST = np.array([2.0, 0.7])
+STILL = np.array([0.004, 0.002])
+"""Gauss-Newton iterations, the longest step of one and the step below which a patch is done [bins, beams]."""
+
+ALIKE = 3.0
+"""Neighbouring pixels whose errors are alike."""
+
+FLOOR = np.array([0.05, 0.04])
+"""Standard deviations of an alignment that no contrast falls below [bins, beams]: interpolation between cells."""
+
+ROWS, COLUMNS = (
+    axis.ravel().astype(float) for axis in np.meshgrid(*(np.arange(-reach, reach + 1) for reach in REACH), indexing="ij")
+)
+"""Places of a patch's pixels beside its middle ``(pixels,)`` [bins, beams]."""
+
+_TAPER = np.exp(-0.5 * ((ROWS / (0.7 * REACH[0])) ** 2 + (COLUMNS / (0.7 * REACH[1])) ** 2)).astype(np.float32)
+
+
+class PatchImage(NamedTuple):
+    """A smoothed frame, its slopes over bins and beams, and 1 where no shadow is near, each ``(bins, beams)``."""
+
+    level: Floats
+    by_bin: Floats
+    by_beam: Floats
+    lit: Floats
+
+
+class Patches(NamedTuple):
+    """Patches ``(n, pixels)``: values of weighted mean 0 and variance 1, and weights of sum 1."""
+
+    values: Floats
+    weights: Floats
+
+    def take(self, index: Index | NDArray[np.bool_]) -> Patches:
+        """Return some of the patches."""
+        return Patches(self.values[index], self.weights[index])
+
+
+class Alignment(NamedTuple):
+    """Where patches were found.
+
+    Attributes:
+        shift: beside where they were looked for ``(n, 2)`` [bins, beams].
+        covariance: of the shift ``(n, 2, 2)``.
+        correlation: of patch and frame there ``(n,)``.
+    """
+
+    shift: Array
+    covariance: Array
+    correlation: Array
+
+
+def patch_image(image: Floats) -> PatchImage:
+    """Prepare a frame ``(bins, beams)`` for :func:`corners`, :func:`cut` and :func:`align`."""
+    level = blurred(image, *SMOOTHING)
+    shadow = (level < SHADOW * cv2.blur(level, AROUND)).astype(np.uint8)
+    lit = 1 - cv2.dilate(shadow, np.ones(EDGE[::-1], np.uint8)).astype(np.float32)
+    return PatchImage(level, *central_differences(level), np.asarray(lit, dtype=np.float32))
+
+
+def corners(image: PatchImage, taken: NDArray[np.bool_]) -> tuple[Index, Index]:
+    """Choose the best patch of each cell of a grid (Shi and Tomasi, 1994).
+
+    Args:
+        image: a frame.
+        taken: cells of the image ``(bins, beams)`` that have a patch already.
+
+    Returns:
+        Row and column of the patches' middles, each ``(n,)``.
+    """
+    by_bin, by_beam = image.by_bin * image.lit, image.by_beam * (image.lit / np.float32(BEAM))
+    size = (0.7 * REACH[0], 0.7 * REACH[1])
+    one, both, other = (blurred(product, *size) for product in (by_bin**2, by_bin * by_beam, by_beam**2))
+    least = (one + other) / 2 - np.sqrt(((one - other) / 2) ** 2 + both**2)
+    rows, columns = (int(length) // cell * cell for length, cell in zip(least.shape, CELL, strict=True))
+    margin = [reach + 2 for reach in REACH]
+    inside = np.zeros_like(least)
+    inside[margin[0] : -margin[0], margin[1] : -margin[1]] = least[margin[0] : -margin[0], margin[1] : -margin[1]]
+    tiles, full = (_tiles(table[:rows, :columns]) for table in (inside, taken))
+    best = tiles.argmax(axis=1)
+    chosen = (tiles[np.arange(len(tiles)), best] > FAINTEST) & ~full.any(axis=1)
+    tile, place = np.flatnonzero(chosen), best[chosen]
+    across = columns // CELL[1]
+    return tile // across * CELL[0] + place // CELL[1], tile % across * CELL[1] + place % CELL[1]
+
+
+def cut(image: PatchImage, row: Array, column: Array, weights: Floats | None = None) -> tuple[Patches, NDArray[np.bool_]]:
+    """Cut patches out of a frame.
+
+    Args:
+        image: the frame.
+        row: of each pixel ``(n, pixels)``.
+        column: as above.
+        weights: of patches that are renewed ``(n, pixels)``; None: from the shadows of this frame.
+
+    Returns:
+        The patches, and which of them lie within the frame with enough light ``(n,)``.
+    """
+    bins, beams = image.level.shape
+    inside = (row.min(axis=1) > 1) & (row.max(axis=1) < bins - 2)
+    inside &= (column.min(axis=1) >= 0) & (column.max(axis=1) <= beams - 1)
+    if weights is None:
+        weights = _TAPER * _sampled(image.lit, row, column)
+        inside &= weights.sum(axis=1) > LEAST_LIT * _TAPER.sum()
+        weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), np.float32(1e-6))
+    values, deviation = _normalised(_sampled(image.level, row, column), weights)
+    return Patches(values / deviation, np.asarray(weights, dtype=np.float32)), inside
+
+
+def align(image: PatchImage, patches: Patches, row: Array, column: Array) -> Alignment:
+    """Shift patches until they fit a frame; gain and offset of each are free.
+
+    Args:
+        image: the frame.
+        patches: ``n`` of them.
+        row: where each pixel is expected in the frame ``(n, pixels)``.
+        column: as above.
+    """
+    count = len(row)
+    shift, normal = np.zeros((count, 2)), np.tile(np.eye(2), (count, 1, 1))
+    residual, correlation = np.ones(count), np.zeros(count)
+    moving = np.arange(count)
+    for _ in range(ROUNDS):
+        weights, template = patches.weights[moving], patches.values[moving]
+        there = row[moving] + shift[moving, :1], column[moving] + shift[moving, 1:]
+        level, deviation = _normalised(_sampled(image.level, *there), weights)
+        by_bin, by_beam = (_centred(_sampled(slope, *there), weights) for slope in (image.by_bin, image.by_beam))
+        alike = (level * template * weights).sum(axis=1) / deviation[:, 0]
+        rest = level - template * alike[:, None] * deviation
+        aa, ab, bb = (
+            (one * other * weights).sum(axis=1).astype(float)
+            for one, other in ((by_bin, by_bin), (by_bin, by_beam), (by_beam, by_beam))
+        )
+        pull_a, pull_b = (-(slope * rest * weights).sum(axis=1).astype(float) for slope in (by_bin, by_beam))
+        det = aa * bb - ab * ab + 1e-14
+        step = np.stack([(bb * pull_a - ab * pull_b) / det, (aa * pull_b - ab * pull_a) / det], axis=1)
+        step = np.clip(step, -LONGEST, LONGEST)
+        shift[moving] += step
+        normal[moving] = np.stack([np.stack([aa, ab], axis=-1), np.stack([ab, bb], axis=-1)], axis=-2)
+        residual[moving], correlation[moving] = (rest * rest * weights).sum(axis=1), alike
+        moving = moving[(np.abs(step) > STILL).any(axis=1)]
+        if not len(moving):
+            break
+    independent = 1 / ((patches.weights**2).sum(axis=1) * ALIKE)
+    covariance = np.linalg.inv(normal + 1e-9 * np.eye(2)) * (residual / independent)[:, None, None]
+    return Alignment(shift, covariance + np.diag(FLOOR**2), correlation)
+
+
+def _tiles(table: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return the cells of the grid as rows ``(cells, bins * beams of a cell)``."""
+    rows, columns = (length // cell for length, cell in zip(table.shape, CELL, strict=True))
+    return table.reshape(rows, CELL[0], columns, CELL[1]).swapaxes(1, 2).reshape(rows * columns, -1)
+
+
+def _sampled(image: Floats, row: Array, column: Array) -> Floats:
+    """Interpolate between pixels by cubic polynomials: linear ones smooth what lies between beams."""
+    places = column.astype(np.float32), row.astype(np.float32)
+    return np.asarray(cv2.remap(image, *places, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
+
+
+def _centred(values: Floats, weights: Floats) -> Floats:
+    return np.asarray(values - (values * weights).sum(axis=1, keepdims=True), dtype=np.float32)
+
+
+def _normalised(values: Floats, weights: Floats) -> tuple[Floats, Floats]:
+    """Return values less their mean, and their standard deviations ``(n, 1)``."""
+    centred = _centred(values, weights)
+    deviation = np.sqrt((centred * centred * weights).sum(axis=1, keepdims=True)) + np.float32(1e-6)
+    return centred, np.asarray(deviation, dtype=np.float32)

@@ -1,0 +1,392 @@
+"""The local map: frames are registered to landmarks of the last metres, not to the last frame alone.
+
+Motions between two frames take the relief of the ground as one number, and the path drifts as long as the same rocks are in
+view. A map holds the height of each landmark, which many frames together tell. For each frame: predict its pose from the
+motion between two frames, register it to the landmarks, update the map where the sonar has moved on, and decide whether the
+answer is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
+from scipy.ndimage import percentile_filter
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.image.patches import PatchImage, patch_image
+from mitsonar.geometry.attitude import STD_GIVEN, attitude_of
+from mitsonar.geometry.sonar_projection import Views, polar_of, projection_of
+from mitsonar.mapping.bundle_adjustment import adjusted, cauchy, track_weight
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.landmarks import Found, ImageAxes, Landmarks
+from mitsonar.motion.composition import Motion, compose, motions
+from mitsonar.motion.pose import Pose
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["mapped"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+FRAMES_A_READ = 16
+
+WINDOW = 30
+"""Keyframes whose poses are adjusted."""
+
+KEPT = 60
+"""Keyframes whose observations are kept: older ones hold no landmark in view."""
+
+MOVED = np.array([10.0, 2.2])
+"""Median displacement of the landmarks since the last keyframe that makes another one [bins, beams]."""
+
+FEWEST = 12
+"""Fewest landmarks by which a frame is registered."""
+
+FEWEST_VIEWS = 3
+"""Keyframes that must show a landmark that is adjusted."""
+
+LOST = 0.6
+"""Part of the landmarks of the last keyframe below which another one is made."""
+
+ROUNDS, STILL = 8, 1e-6
+"""Gauss-Newton iterations of a registration, and the step below which they end [m, rad]."""
+
+PAIR_SHARE = 0.1
+PAIR_STD = np.array([1e-3, 1e-3, np.radians(0.03)])
+"""Share of the information of the motion between two frames that counts: the map has seen the same frames; least standard
+deviations of that motion [m, m, rad]."""
+
+HELD = 1e12
+"""Information by which the first frame stays where it is."""
+
+WORST = 25.0
+"""Squared error beyond which a keyframe does not show a landmark."""
+
+RELIEF_M = 0.1
+LEAST_RELIEF_M = 0.02
+"""Mean height of what is seen over the ground: where first echoes do not tell it, and at least [m]."""
+
+CONTRAST = 0.6
+"""Mean height of landmarks, as part of the height of the contrast by first echoes: these come from the tops."""
+
+ATTITUDE_STD = np.array([2e-4, np.radians(2e-3), np.radians(2e-3)])
+"""Standard deviations of heights [m], pitches and rolls [rad] that poses tell."""
+
+ROUGH_STD = np.array([0.01, np.radians(0.3), np.radians(0.3)])
+"""The same where they are given for a whole run: heave and tilt are then estimated."""
+
+HEIGHT_FRAMES = 101
+"""Frames among which the greatest heights are those over the ground, not over a rock."""
+
+SAFETY = 8.0
+"""Squared errors over the covariance of the map's normal equations, measured over rocks: the errors of patches are alike."""
+
+
+@dataclass
+class _Map:
+    """The state that goes from frame to frame.
+
+    Attributes:
+        landmarks: of the last metres.
+        attitude_std: of heights [m], pitches and rolls [rad] ``(3,)``.
+        keyframes: their number among the frames.
+        poses: of the keyframes ``(6,)`` each.
+        relief_m: mean height of what is seen over the ground.
+        lean: height, pitch and roll of the last keyframe, less what was told ``(3,)``.
+        drift: covariance of x, y, heading that each keyframe adds ``(3, 3)`` each.
+    """
+
+    landmarks: Landmarks
+    attitude_std: Array
+    keyframes: list[int] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+    relief_m: float = RELIEF_M
+    lean: Array = field(default_factory=lambda: np.zeros(3))
+    drift: list[Array] = field(default_factory=list)
+    shown: int = 0
+
+
+@dataclass(frozen=True)
+class _Registered:
+    """A frame's pose by the map, what it shows, and why it is not used where it is not."""
+
+    pose: Array
+    found: Found
+    squared: Array
+    reason: str = ""
+
+
+def mapped(
+    source: FrameSource,
+    numbers: Index,
+    estimates: Sequence[Estimate],
+    progress: Callable[[int], None] = lambda frames: None,
+) -> list[Estimate]:
+    """Estimate the motions anew, with a map of the last metres.
+
+    The time a frame is constant, and so is the memory but for the answer. The result is a function of the frames and the
+    estimates: a run that was stopped gives the same bits again.
+
+    Args:
+        source: of the frames; it tells heights, and pitches or poses.
+        numbers: of the frames used ``(n,)``.
+        estimates: of each pair of consecutive frames: where a frame's landmarks are looked for.
+        progress: called with the number of frames that were added.
+
+    Returns:
+        An estimate a motion; those that the map does not tell are as they were.
+
+    Raises:
+        MitsonarError: no height over the ground.
+    """
+    attitudes, std = _attitudes(source, numbers)
+    state = _Map(Landmarks(_axes(source.like)), std)
+    path, reasons = [attitudes[0]], [""]
+    for k, (frames, image) in enumerate(_images(source, numbers)):
+        expected = attitudes[0].copy() if k == 0 else _predicted(path[-1], estimates[k - 1], attitudes[k])
+        expected[2:5] += state.lean
+        answer = _register(state, image, expected, _trust(estimates, k))
+        pose = _update(state, k, frames, image, answer)
+        if k:
+            path.append(pose)
+            reasons.append(answer.reason)
+        progress(1)
+    corrected = _corrected(np.array(path), state)
+    found = motions(corrected)
+    drift = _drift_a_frame(state, len(path))
+    return [_decided(one, found[k], reasons[k + 1], drift[k + 1], corrected[k + 1]) for k, one in enumerate(estimates)]
+
+
+# ---------------------------------------------------------------- predict
+
+
+def _axes(like: SonarFrames) -> ImageAxes:
+    return ImageAxes(like.range_m, like.bearing_rad, like.sonar.bearing)
+
+
+def _attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
+    """Return height over the ground, pitch and roll of the frames, as poses ``(n, 6)``, and their standard deviations."""
+    table = np.zeros((len(numbers), 6))
+    heights = None if source.height_m is None else source.height_m[numbers]
+    if heights is None or not np.isfinite(heights).any():
+        raise MitsonarError(
+            f"{source.name}: the local map needs the height over the ground, and the frames tell none: give it, or "
+            "leave the map out"
+        )
+    heights = np.where(np.isfinite(heights), heights, np.nanmedian(heights))
+    if source.poses is not None and np.isfinite(source.poses[numbers, 2:5]).all():
+        poses = source.poses[numbers]
+        # an altimeter over a rock tells less than the height over the ground
+        ground = float(np.percentile(poses[:, 2] - heights, 5))
+        table[:, 2:5] = poses[:, 2:5] - np.array([ground, 0, 0])
+        table[0, 5] = poses[0, 5]
+        return table, ATTITUDE_STD
+    table[:, 2] = percentile_filter(heights, 90, size=min(HEIGHT_FRAMES, len(heights)), mode="nearest")
+    measured = None if source.attitude_rad is None else source.attitude_rad[numbers, :2]
+    table[:, 3] = source.pitch_rad or 0.0
+    if measured is not None and np.isfinite(measured).all():
+        table[:, 3:5] = measured
+    return table, ROUGH_STD
+
+
+def _images(source: FrameSource, numbers: Index) -> Iterator[tuple[SonarFrames, PatchImage]]:
+    """Read the frames, one after another, some at a time."""
+    for start in range(0, len(numbers), FRAMES_A_READ):
+        frames = source.read(numbers[start : start + FRAMES_A_READ])
+        values = frames.matching_values()
+        for k in range(len(frames)):
+            yield frames.select(slice(k, k + 1)), patch_image(values[k])
+
+
+def _predicted(before: Array, estimate: Estimate, attitude: Array) -> Array:
+    """Return the pose after a motion, at the height and attitude that are told."""
+    pose = np.array(compose(Pose(*(float(value) for value in before)), estimate.motion))
+    pose[2:5] = attitude[2:5]
+    return pose
+
+
+def _trust(estimates: Sequence[Estimate], frame: int) -> Array:
+    """Return the information on starboard, forward and heading that the prediction of a frame has ``(3, 3)``."""
+    if frame == 0:
+        return np.eye(3) * HELD
+    one = estimates[frame - 1]
+    if not one.valid:
+        return np.eye(3)
+    covariance = np.diag((10 * PAIR_STD) ** 2) if one.covariance is None else np.asarray(one.covariance, dtype=float)
+    return np.asarray(PAIR_SHARE * np.linalg.inv(covariance + np.diag(PAIR_STD**2)) + np.eye(3))
+
+
+# ---------------------------------------------------------------- register
+
+
+def _register(state: _Map, image: PatchImage, expected: Array, information: Array) -> _Registered:
+    """Find the landmarks, and the pose from which the sonar receives them there."""
+    landmarks, bearing = state.landmarks, state.landmarks.axes.bearing
+    found = landmarks.find(image, Views.of(expected))
+    number = found.landmark
+    nothing = np.zeros(len(number))
+    if len(number) < FEWEST:
+        return _Registered(expected, found, nothing, f"the map finds {len(number)} landmarks, {FEWEST} are needed")
+    turn = np.eye(3)
+    turn[:2, :2] = _level_turn(expected[5])
+    prior = turn.T @ information @ turn
+    pose, squared = expected.copy(), nothing
+    free = np.array([0, 1, 5])
+    for _ in range(ROUNDS):
+        projected = projection_of(landmarks.points[number], Views.of(pose), bearing)
+        error = found.polar - projected.polar
+        spread = projected.by_point @ landmarks.covariance[number] @ projected.by_point.transpose(0, 2, 1)
+        inverse = np.linalg.inv(found.covariance + spread)
+        squared = np.einsum("ni,nij,nj->n", error, inverse, error)
+        weight = cauchy(squared) * track_weight(landmarks.faults[number])
+        by_pose = projected.by_pose[:, :, free]
+        weighted = by_pose.transpose(0, 2, 1) @ (inverse * weight[:, None, None])
+        normal = (weighted @ by_pose).sum(axis=0) + prior
+        pull = (weighted @ error[:, :, None])[:, :, 0].sum(axis=0) - prior @ (pose - expected)[free]
+        step = np.linalg.solve(normal, pull)
+        pose[free] += step
+        if np.abs(step).max() < STILL:
+            break
+    return _Registered(pose, found, squared)
+
+
+def _level_turn(heading: float) -> Array:
+    """Return what turns x and y of the world into starboard and forward ``(2, 2)``."""
+    sin, cos = np.sin(heading), np.cos(heading)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+# ---------------------------------------------------------------- update
+
+
+def _update(
+    state: _Map,
+    frame: int,
+    frames: SonarFrames,
+    image: PatchImage,
+    answer: _Registered,
+) -> Array:
+    """Make a keyframe where the sonar has moved on, adjust the last ones, and return the pose of the frame."""
+    if state.keyframes and not _moved_on(state, answer):
+        return answer.pose
+    number, landmarks = len(state.keyframes), state.landmarks
+    state.keyframes.append(frame)
+    state.poses.append(answer.pose.copy())
+    state.drift.append(state.drift[-1] if state.drift else np.diag(PAIR_STD**2))
+    good = answer.found.take(answer.squared < WORST)
+    if number:
+        landmarks.observe(number, good)
+        landmarks.renew(image, Views.of(answer.pose), good)
+        _adjust(state)
+    state.relief_m = _relief(frames, state.poses[-1], state.relief_m)
+    view = Views.of(state.poses[-1])
+    landmarks.choose(image, view, number, _usual_height(state))
+    landmarks.forget(number - KEPT)
+    state.shown = int(landmarks.used.sum())
+    return state.poses[-1].copy()
+
+
+def _moved_on(state: _Map, answer: _Registered) -> bool:
+    """Return whether the landmarks of the last keyframe have moved by much, or are lost."""
+    number = answer.found.landmark
+    if len(number) < max(FEWEST, LOST * state.shown):
+        return bool(np.abs(answer.pose - state.poses[-1]).max() > 1e-6)
+    axes, points = state.landmarks.axes, state.landmarks.points[number]
+    now, then = (axes.cells(polar_of(points, Views.of(pose), axes.bearing)) for pose in (answer.pose, state.poses[-1]))
+    return bool((np.median(np.abs(now - then), axis=0) > MOVED).any())
+
+
+def _adjust(state: _Map) -> None:
+    """Adjust the last keyframes and the landmarks that they show."""
+    last, landmarks = len(state.poses), state.landmarks
+    first = max(1, last - WINDOW)
+    number, seen = landmarks.holding(first, FEWEST_VIEWS)
+    if len(number) < FEWEST:
+        return
+    oldest = int(seen.view.min())
+    poses = np.array(state.poses[oldest:])
+    try:
+        new = adjusted(
+            poses,
+            first - oldest,
+            state.attitude_std,
+            landmarks.points[number],
+            seen._replace(view=seen.view - oldest),
+            landmarks.axes.bearing,
+            state.relief_m,
+        )
+    except LinAlgError:
+        return  # the keyframes stay as they were registered
+    landmarks.refine(number, new.points, new.point_covariance, new.faults)
+    state.lean += new.poses[-1, 2:5] - poses[-1, 2:5]
+    state.poses[first:] = list(new.poses[first - oldest :])
+    state.drift[-1] = new.last_covariance / (last - first)
+
+
+def _relief(frames: SonarFrames, pose: Array, before: float) -> float:
+    """Return the mean height of what is seen over the ground, by first echoes where there are any."""
+    attitude = attitude_of(frames, "the local map", float(pose[2]), float(pose[3]))
+    if attitude.reason or attitude.height_std_m >= STD_GIVEN * attitude.height_m:
+        return before
+    measured = max(LEAST_RELIEF_M, CONTRAST * (float(pose[2]) - attitude.height_m))
+    return 0.9 * before + 0.1 * measured
+
+
+def _usual_height(state: _Map) -> float:
+    """Return the height at which new landmarks are taken to lie."""
+    known = state.landmarks.used & (state.landmarks.faults < 1.0)
+    return float(np.median(state.landmarks.points[known, 2])) if known.sum() >= 4 * FEWEST else state.relief_m
+
+
+# ---------------------------------------------------------------- decide
+
+
+def _corrected(path: Array, state: _Map) -> Array:
+    """Return the poses of all frames ``(n, 6)``: keyframes as adjusted last, and the frames between them carried along."""
+    corrected = path.copy()
+    for number, start in enumerate(state.keyframes):
+        end = state.keyframes[number + 1] if number + 1 < len(state.keyframes) else len(path) - 1
+        near = _carried(path[start : end + 1], path[start], state.poses[number])
+        if number + 1 < len(state.keyframes):
+            far = _carried(path[start : end + 1], path[end], state.poses[number + 1])
+            share = np.linspace(0, 1, end - start + 1)[:, None]
+            near = near + share * (far - near)
+        corrected[start : end + 1] = near
+    return corrected
+
+
+def _drift_a_frame(state: _Map, frames: int) -> Array:
+    """Return the covariance of x, y, heading that each frame adds ``(frames, 3, 3)``: that of its keyframe, shared."""
+    drift = np.zeros((frames, 3, 3))
+    ends = [*state.keyframes[1:], frames - 1]
+    for number, (start, end) in enumerate(zip(state.keyframes, ends, strict=True)):
+        there = min(number + 1, len(state.drift) - 1)
+        drift[start + 1 : end + 1] = SAFETY * state.drift[there] / max(end - start, 1)
+    return drift
+
+
+def _carried(path: Array, old: Array, new: Array) -> Array:
+    """Move poses rigidly, in the plane, by what takes one pose to another."""
+    turn = new[5] - old[5]
+    sin, cos = np.sin(turn), np.cos(turn)
+    x, y = (path[:, :2] - old[:2]).T
+    moved = path.copy()
+    moved[:, 0], moved[:, 1] = new[0] + cos * x + sin * y, new[1] - sin * x + cos * y
+    moved[:, 5] += turn
+    return moved
+
+
+def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose: Array) -> Estimate:
+    """Return the map's answer, or the estimate where it has none."""
+    if reason:
+        about = {**estimate.about, "map": reason}
+        return replace(estimate, about=about)
+    turn = np.eye(3)
+    turn[:2, :2] = _level_turn(float(pose[5]))
+    covariance = turn @ drift @ turn.T
+    return Estimate(Motion(*motion.tolist()), (covariance + covariance.T) / 2, True, "", {"map": "used"})
