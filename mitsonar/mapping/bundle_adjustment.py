@@ -29,11 +29,11 @@ STILL = 1e-6
 OUTLYING = 4.0
 """Squared errors, in covariances, of so much have half the weight."""
 
-TRACK = 1.0
+TRACK = 1.2
 """Landmarks whose mean squared error is so many times the usual one have half the weight: what moves with a shadow."""
 
-HARSH = 4
-"""Power by which landmarks that fit worse lose weight. With 2 sideways paths over rocks drift twice as far."""
+HARSH = 3
+"""Power by which landmarks that fit worse lose weight: 2 leaves sideways paths over rocks more drift, 4 forward ones."""
 
 BELOW_M = 0.02
 """Mean of the errors of heights below the ground [m]."""

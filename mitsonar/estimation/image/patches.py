@@ -201,6 +201,8 @@ def _tiles(table: NDArray[np.generic]) -> NDArray[np.generic]:
 
 def _sampled(image: Floats, row: Array, column: Array) -> Floats:
     """Interpolate between pixels by cubic polynomials: linear ones smooth what lies between beams."""
+    if not row.size:
+        return np.zeros(row.shape, dtype=np.float32)
     places = column.astype(np.float32), row.astype(np.float32)
     return np.asarray(cv2.remap(image, *places, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
 

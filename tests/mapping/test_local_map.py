@@ -1,0 +1,122 @@
+"""The local map: a path over relief whose pair motions are wrong in one way comes back straight and as long as it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.geometry.sonar_projection import Views, polar_of
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.landmarks import ImageAxes
+from mitsonar.mapping.local_map import mapped
+from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.odometry import series_of
+from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.motion.composition import Motion, motions
+from mitsonar.motion.pose import Pose
+from mitsonar.records.sonar_frames import SonarFrames
+
+FRAMES, STEP_M = 48, 0.02
+WRONG = np.array([0.0, 0.97, np.radians(0.03)])
+"""What is wrong with the motions between two frames: too short by 3 %, and a turn of 0.03 deg each."""
+
+
+@lru_cache(maxsize=1)
+def run() -> SonarFrames:
+    """Return frames of a path straight on over bright points: half on the ground, half on a relief of 0.25 m."""
+    rng = np.random.default_rng(7)
+    points = np.column_stack([rng.uniform(-2, 2, 9000), rng.uniform(1, 8, 9000), rng.exponential(0.25, 9000)])
+    points[::2, 2] = 0
+    bright = rng.uniform(0.2, 1, 9000).astype(np.float32)
+    sonar = Sonar(
+        range_min=3.2, range_max=5.6, range_bins=400, beams=96, azimuth_fov_deg=29, bearing="cone", model="physical"
+    )
+    poses = np.zeros((FRAMES, 6))
+    poses[:, 1], poses[:, 2], poses[:, 3] = STEP_M * np.arange(FRAMES), 2.5, np.radians(35)
+    ranges, bearings = sonar.range_m, sonar.bearing_rad
+    axes, images = ImageAxes(ranges, bearings, "cone"), []
+    for pose in poses:
+        cells = axes.cells(polar_of(points, Views.of(pose), "cone"))
+        images.append(_drawn(cells, bright))
+    image = np.stack(images) / np.max(images)
+    return SonarFrames(
+        image=image.astype(np.float32),
+        range_m=ranges,
+        bearing_rad=bearings,
+        time_s=np.arange(FRAMES) / 10,
+        sonar=sonar,
+        poses=poses,
+        height_m=np.full(FRAMES, 2.5),
+    )
+
+
+def _drawn(cells: NDArray[np.float64], bright: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Draw points between cells: each shares its brightness with its four neighbours, and the image is smoothed."""
+    image = np.zeros((404, 100), dtype=np.float32)
+    low = np.floor(cells).astype(int)
+    part = cells - low
+    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = np.abs(1 - row - part[:, 0]) * np.abs(1 - column - part[:, 1])
+        r, c = low[:, 0] + row + 2, low[:, 1] + column + 2
+        inside = (r >= 0) & (r < 404) & (c >= 0) & (c < 100)
+        np.add.at(image, (r[inside], c[inside]), (share * bright)[inside])
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=0.8, sigmaY=1.5)[2:-2, 2:-2])
+
+
+def wrong_estimates() -> list[Estimate]:
+    """Return motions that are wrong in one way, with covariances that believe them to half of that."""
+    true = motions(run().poses)
+    wrong = true * [1, WRONG[1], 1] + [0, 0, WRONG[2]]
+    return [Estimate(Motion(*one.tolist()), np.diag([3e-4, 3e-4, 3e-4]) ** 2) for one in wrong]
+
+
+def test_the_map_takes_out_what_pairs_of_frames_get_wrong() -> None:
+    frames = run()
+    found = mapped(FrameSource.of(frames), np.arange(FRAMES), wrong_estimates())
+    assert all(one.about["map"] == "used" for one in found)
+    series = series_of(found, frames.time_s)
+    assert frames.poses is not None
+    start = Pose(*frames.poses[0])
+    path, before = (
+        path_of(moves, start, frames.time_s).poses
+        for moves in (series.motions, series_of(wrong_estimates(), frames.time_s).motions)
+    )
+    error, plain = path[-1] - frames.poses[-1], before[-1] - frames.poses[-1]
+    length = STEP_M * (FRAMES - 1)
+    assert abs(plain[1]) > 0.025 * length
+    assert abs(error[1]) < 0.008 * length, "the length of the path"
+    assert abs(error[5]) < 0.15 * abs(plain[5])
+    assert abs(error[0]) < 0.01 * length
+    covariance = pose_covariances(series, start)[-1]
+    assert 1e-4 < np.sqrt(covariance[0, 0]) < 0.02
+
+
+def test_the_answer_is_a_function_of_frames_and_estimates() -> None:
+    frames = run().select(slice(0, 20))
+    first, second = (mapped(FrameSource.of(frames), np.arange(20), wrong_estimates()[:19]) for _ in range(2))
+    assert [one.motion for one in first] == [one.motion for one in second]
+
+
+def test_frames_that_show_nothing_keep_the_motion_of_the_pair() -> None:
+    frames = run().select(slice(0, 12))
+    dark = frames.image.copy()
+    dark[6:] = 0
+    estimates = wrong_estimates()[:11]
+    found = mapped(FrameSource.of(replace(frames, image=dark)), np.arange(12), estimates)
+    assert [one.about["map"] == "used" for one in found[:5]] == [True] * 5
+    assert all("landmarks" in one.about["map"] for one in found[5:])
+    assert found[8].motion == estimates[8].motion
+
+
+def test_frames_without_a_height_are_refused() -> None:
+    frames = replace(run().select(slice(0, 4)), height_m=None)
+    with pytest.raises(MitsonarError, match="height over the ground"):
+        mapped(FrameSource.of(frames), np.arange(4), wrong_estimates()[:3])
