@@ -25,6 +25,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from datetime import date
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,9 @@ from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.motion_series import MotionSeries, path_of
+from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import motion_errors
@@ -77,6 +80,8 @@ from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 Array = NDArray[np.float64]
 PARTS = ("table21", "trajectories")
 WORKERS = 2
+GYRO = SensorNoise(gyro_deg_rth=1.0)
+"""A gyroscope of 1 deg/h^0.5, as a good one of a vehicle has it."""
 
 Result = dict[str, Any]
 """Numbers and texts of one job, as a line of ``results.jsonl`` holds them."""
@@ -329,6 +334,7 @@ def run_trajectory(job: Job, out: Path) -> Result:
         path = path_of(series.motions, start, series.time_s)
         path.save_tum(out / f"{job.name}-{name}.tum")
         row["paths"][name] = path_errors(path, true, series, start)
+    row["paths"] |= mapped_paths(job, frames, found)
     if job.method == "direct":
         frames.save(out / f"{job.name}-frames.npz")
     return row
@@ -341,6 +347,15 @@ def smoothed(found: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
     known = None if series.covariances is None else np.where(series.believed[:, None, None], series.covariances, 0)
     raw = MotionSeries(motion, time_s, known)
     return {"raw": raw, "Kalman": kalman_smoothed(series), "spline": spline_smoothed(series)}
+
+
+def mapped_paths(job: Job, frames: SonarFrames, found: list[Estimate]) -> dict[str, dict[str, float]]:
+    """Return the errors with a local map, and with a gyroscope beside it."""
+    assert frames.poses is not None
+    true, start = Trajectory(frames.poses, frames.time_s), Pose(*frames.poses[0])
+    pipeline = partial(odometry, frames, create_estimator(job.method), known=dict(enumerate(found)), local_map=True)
+    ways = {"map": pipeline(), "map, gyroscope": pipeline(sensors=simulated_sensors(true, GYRO, seed=0))}
+    return {name: path_errors(way.path, true, way.series, start) for name, way in ways.items()}
 
 
 def path_errors(path: Trajectory, true: Trajectory, series: MotionSeries, start: Pose) -> dict[str, float]:

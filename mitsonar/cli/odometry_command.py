@@ -142,7 +142,8 @@ def odometry(
     processes = workers or max(1, min(len(os.sched_getaffinity(0)), pairs // PAIRS_A_WORKER))
     steps = usual_loop(source) if closure is None else closure
     closing = len(loop_starts(pairs, steps)) if steps > 1 else 0
-    with progress_bar("estimating", pairs + closing, "pairs") as progress:
+    frames_mapped = pairs + 1 if local_map else 0
+    with progress_bar("estimating", pairs + closing + frames_mapped, "pairs") as progress:
         found = run_odometry(
             source,
             estimator,

@@ -118,11 +118,11 @@ class Landmarks:
         default_factory=lambda: Observations(np.zeros(0, np.intp), np.zeros(0, np.intp), _empty(2), _empty(2, 2))
     )
 
-    def find(self, image: PatchImage, view: Views) -> Found:
-        """Find the landmarks in a frame that a view is expected to have taken."""
+    def find(self, image: PatchImage, view: Views) -> tuple[Found, int]:
+        """Find the landmarks in a frame that a view is expected to have taken; and count those that it should show."""
         number = np.flatnonzero(self.used)
         if not len(number):
-            return Found(number, _empty(2), _empty(2, 2), _empty())
+            return Found(number, _empty(2), _empty(2, 2), _empty()), 0
         middle = polar_of(self.points[number], view, self.axes.bearing)
         place = self.axes.cells(middle)
         inside = (np.abs(place - self._middle) < self._half).all(axis=1)
@@ -134,7 +134,8 @@ class Landmarks:
         good = (there.correlation > LEAST_ALIKE) & (np.abs(there.shift) < FARTHEST).all(axis=1)
         spacing = self.axes.spacing(middle)
         covariance = there.covariance * spacing[:, :, None] * spacing[:, None, :]
-        return Found(number, middle + there.shift * spacing, covariance, there.correlation).take(good)
+        found = Found(number, middle + there.shift * spacing, covariance, there.correlation)
+        return found.take(good), len(number)
 
     @property
     def _middle(self) -> Array:
@@ -152,6 +153,10 @@ class Landmarks:
         self.missed += self.used
         self.missed[found.landmark] = 0
         self.used &= self.missed < MISSED
+
+    def give_up(self) -> None:
+        """Look for none of the landmarks any more: the map is begun anew."""
+        self.used[:] = False
 
     def renew(self, image: PatchImage, view: Views, found: Found) -> None:
         """Cut the patches anew of landmarks that look otherwise than when they were chosen."""

@@ -20,18 +20,22 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.patches import PatchImage, patch_image
 from mitsonar.geometry.attitude import STD_GIVEN, attitude_of
-from mitsonar.geometry.sonar_projection import Views, polar_of, projection_of
-from mitsonar.mapping.bundle_adjustment import adjusted, cauchy, track_weight
+from mitsonar.geometry.sonar_projection import Views, polar_of
+from mitsonar.mapping.bundle_adjustment import adjusted
 from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.landmarks import Found, ImageAxes, Landmarks
+from mitsonar.mapping.landmarks import ImageAxes, Landmarks
+from mitsonar.mapping.map_registration import FEWEST, PAIR_STD, Registered, level_turn, registered
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["mapped"]
+__all__ = ["USED", "mapped"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+USED = "used"
+"""What ``about["map"]`` of an estimate says where the map tells the motion; else it says why not."""
 
 FRAMES_A_READ = 16
 
@@ -44,25 +48,14 @@ KEPT = 60
 MOVED = np.array([10.0, 2.2])
 """Median displacement of the landmarks since the last keyframe that makes another one [bins, beams]."""
 
-FEWEST = 12
-"""Fewest landmarks by which a frame is registered."""
-
 FEWEST_VIEWS = 3
 """Keyframes that must show a landmark that is adjusted."""
 
 LOST = 0.6
 """Part of the landmarks of the last keyframe below which another one is made."""
 
-ROUNDS, STILL = 8, 1e-6
-"""Gauss-Newton iterations of a registration, and the step below which they end [m, rad]."""
-
-PAIR_SHARE = 0.1
-PAIR_STD = np.array([1e-3, 1e-3, np.radians(0.03)])
-"""Share of the information of the motion between two frames that counts: the map has seen the same frames; least standard
-deviations of that motion [m, m, rad]."""
-
-HELD = 1e12
-"""Information by which the first frame stays where it is."""
+LOST_STD = np.array([0.05, 0.05, np.radians(1)])
+"""Standard deviations of a prediction without a valid motion [m, m, rad]."""
 
 WORST = 25.0
 """Squared error beyond which a keyframe does not show a landmark."""
@@ -111,16 +104,6 @@ class _Map:
     shown: int = 0
 
 
-@dataclass(frozen=True)
-class _Registered:
-    """A frame's pose by the map, what it shows, and why it is not used where it is not."""
-
-    pose: Array
-    found: Found
-    squared: Array
-    reason: str = ""
-
-
 def mapped(
     source: FrameSource,
     numbers: Index,
@@ -150,7 +133,7 @@ def mapped(
     for k, (frames, image) in enumerate(_images(source, numbers)):
         expected = attitudes[0].copy() if k == 0 else _predicted(path[-1], estimates[k - 1], attitudes[k])
         expected[2:5] += state.lean
-        answer = _register(state, image, expected, _trust(estimates, k))
+        answer = registered(state.landmarks, image, expected, _spread(estimates, k))
         pose = _update(state, k, frames, image, answer)
         if k:
             path.append(pose)
@@ -210,55 +193,15 @@ def _predicted(before: Array, estimate: Estimate, attitude: Array) -> Array:
     return pose
 
 
-def _trust(estimates: Sequence[Estimate], frame: int) -> Array:
-    """Return the information on starboard, forward and heading that the prediction of a frame has ``(3, 3)``."""
+def _spread(estimates: Sequence[Estimate], frame: int) -> Array:
+    """Return the covariance of starboard, forward and heading of the prediction of a frame ``(3, 3)``."""
     if frame == 0:
-        return np.eye(3) * HELD
+        return np.diag(PAIR_STD**2)
     one = estimates[frame - 1]
     if not one.valid:
-        return np.eye(3)
-    covariance = np.diag((10 * PAIR_STD) ** 2) if one.covariance is None else np.asarray(one.covariance, dtype=float)
-    return np.asarray(PAIR_SHARE * np.linalg.inv(covariance + np.diag(PAIR_STD**2)) + np.eye(3))
-
-
-# ---------------------------------------------------------------- register
-
-
-def _register(state: _Map, image: PatchImage, expected: Array, information: Array) -> _Registered:
-    """Find the landmarks, and the pose from which the sonar receives them there."""
-    landmarks, bearing = state.landmarks, state.landmarks.axes.bearing
-    found = landmarks.find(image, Views.of(expected))
-    number = found.landmark
-    nothing = np.zeros(len(number))
-    if len(number) < FEWEST:
-        return _Registered(expected, found, nothing, f"the map finds {len(number)} landmarks, {FEWEST} are needed")
-    turn = np.eye(3)
-    turn[:2, :2] = _level_turn(expected[5])
-    prior = turn.T @ information @ turn
-    pose, squared = expected.copy(), nothing
-    free = np.array([0, 1, 5])
-    for _ in range(ROUNDS):
-        projected = projection_of(landmarks.points[number], Views.of(pose), bearing)
-        error = found.polar - projected.polar
-        spread = projected.by_point @ landmarks.covariance[number] @ projected.by_point.transpose(0, 2, 1)
-        inverse = np.linalg.inv(found.covariance + spread)
-        squared = np.einsum("ni,nij,nj->n", error, inverse, error)
-        weight = cauchy(squared) * track_weight(landmarks.faults[number])
-        by_pose = projected.by_pose[:, :, free]
-        weighted = by_pose.transpose(0, 2, 1) @ (inverse * weight[:, None, None])
-        normal = (weighted @ by_pose).sum(axis=0) + prior
-        pull = (weighted @ error[:, :, None])[:, :, 0].sum(axis=0) - prior @ (pose - expected)[free]
-        step = np.linalg.solve(normal, pull)
-        pose[free] += step
-        if np.abs(step).max() < STILL:
-            break
-    return _Registered(pose, found, squared)
-
-
-def _level_turn(heading: float) -> Array:
-    """Return what turns x and y of the world into starboard and forward ``(2, 2)``."""
-    sin, cos = np.sin(heading), np.cos(heading)
-    return np.array([[cos, -sin], [sin, cos]])
+        return np.diag(LOST_STD**2)
+    known = np.diag((10 * PAIR_STD) ** 2) if one.covariance is None else np.asarray(one.covariance, dtype=float)
+    return np.asarray(known + np.diag(PAIR_STD**2))
 
 
 # ---------------------------------------------------------------- update
@@ -269,17 +212,19 @@ def _update(
     frame: int,
     frames: SonarFrames,
     image: PatchImage,
-    answer: _Registered,
+    answer: Registered,
 ) -> Array:
     """Make a keyframe where the sonar has moved on, adjust the last ones, and return the pose of the frame."""
-    if state.keyframes and not _moved_on(state, answer):
+    if state.keyframes and not answer.reason and not _moved_on(state, answer):
         return answer.pose
     number, landmarks = len(state.keyframes), state.landmarks
+    if answer.reason:
+        landmarks.give_up()
     state.keyframes.append(frame)
     state.poses.append(answer.pose.copy())
     state.drift.append(state.drift[-1] if state.drift else np.diag(PAIR_STD**2))
     good = answer.found.take(answer.squared < WORST)
-    if number:
+    if number and not answer.reason:
         landmarks.observe(number, good)
         landmarks.renew(image, Views.of(answer.pose), good)
         _adjust(state)
@@ -291,7 +236,7 @@ def _update(
     return state.poses[-1].copy()
 
 
-def _moved_on(state: _Map, answer: _Registered) -> bool:
+def _moved_on(state: _Map, answer: Registered) -> bool:
     """Return whether the landmarks of the last keyframe have moved by much, or are lost."""
     number = answer.found.landmark
     if len(number) < max(FEWEST, LOST * state.shown):
@@ -387,6 +332,6 @@ def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose:
         about = {**estimate.about, "map": reason}
         return replace(estimate, about=about)
     turn = np.eye(3)
-    turn[:2, :2] = _level_turn(float(pose[5]))
+    turn[:2, :2] = level_turn(float(pose[5]))
     covariance = turn @ drift @ turn.T
-    return Estimate(Motion(*motion.tolist()), (covariance + covariance.T) / 2, True, "", {"map": "used"})
+    return Estimate(Motion(*motion.tolist()), (covariance + covariance.T) / 2, True, "", {"map": USED})

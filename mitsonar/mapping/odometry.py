@@ -22,7 +22,7 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, graph_path
-from mitsonar.mapping.local_map import mapped
+from mitsonar.mapping.local_map import USED, mapped
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops
 from mitsonar.mapping.mode_continuity import continued
 from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
@@ -107,6 +107,9 @@ class Odometry:
         """Return name, value and unit of all results: the one table for console, file and README."""
         count = len(self.estimates)
         rows: list[Row] = [("motions", count, ""), ("motions not believed, bridged", count - int(self.believed.sum()), "")]
+        by_map = [one.about["map"] for one in self.estimates if "map" in one.about]
+        if by_map:
+            rows.append(("motions by the local map", by_map.count(USED), ""))
         how = "fitted to the true path" if self.fitted else "as given"
         if self.fitted or (self.factors != 1).any():
             rows += [(f"scale of {axis.name}, {how}", float(f), "") for axis, f in zip(AXES, self.factors, strict=True)]
@@ -129,14 +132,15 @@ class Odometry:
         return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
 
     def warnings(self) -> list[str]:
-        """Return what the user should know: how many motions are invalid, and why."""
+        """Return what the user should know: how many motions are invalid or are not the map's, and why."""
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
-        if len(lost) <= MANY * len(self.estimates):
-            return []
-        part = 100 * len(lost) / len(self.estimates)
-        return [
-            f"{len(lost)} of {len(self.estimates)} motions ({part:.0f} %) are not believed and were bridged: {_usual(lost)}"
-        ]
+        without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
+        told = []
+        for reasons, what in ((lost, "are not believed and were bridged"), (without, "are those of pairs of frames")):
+            if len(reasons) > MANY * len(self.estimates):
+                part = 100 * len(reasons) / len(self.estimates)
+                told.append(f"{len(reasons)} of {len(self.estimates)} motions ({part:.0f} %) {what}: {_usual(reasons)}")
+        return told
 
 
 def odometry(
