@@ -330,3 +330,16 @@ def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Comman
         "says that it is ned, and --frame mitsonar is asked",
     )
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "y", "--frame", "nde"), "unknown frame 'nde'", "did you mean ned?")
+
+
+def test_a_local_map_resumes_to_the_same_bits(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    done = mitsonar("odometry", drawn, "--map", "-o", whole)
+    assert done.returncode == 0, done
+    assert "motions by the local map" in done.stdout
+    assert mitsonar("odometry", drawn, "-o", cut).returncode == 0
+    lines = (cut / "estimates.jsonl").read_bytes().splitlines(keepends=True)
+    (cut / "estimates.jsonl").write_bytes(b"".join(lines[:7]))
+    done = mitsonar("odometry", drawn, "--map", "-o", cut, "--resume")
+    assert done.returncode == 0, done
+    assert (cut / "estimated.tum").read_bytes() == (whole / "estimated.tum").read_bytes()

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.sonar_projection import Views, polar_of
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.landmarks import ImageAxes
 from mitsonar.mapping.local_map import mapped
 from mitsonar.mapping.motion_series import path_of
-from mitsonar.mapping.odometry import series_of
+from mitsonar.mapping.odometry import odometry, series_of
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
@@ -120,3 +121,19 @@ def test_frames_without_a_height_are_refused() -> None:
     frames = replace(run().select(slice(0, 4)), height_m=None)
     with pytest.raises(MitsonarError, match="height over the ground"):
         mapped(FrameSource.of(frames), np.arange(4), wrong_estimates()[:3])
+
+
+def test_odometry_tells_what_the_map_did() -> None:
+    frames = run().select(slice(0, 16))
+    known = dict(enumerate(wrong_estimates()[:15]))
+    found = odometry(frames, Zero(), local_map=True, known=known)
+    assert ("motions by the local map", 15, "") in found.rows()
+    assert found.warnings() == []
+    plain = odometry(frames, Zero(), known=known)
+    assert frames.poses is not None
+    errors = [np.linalg.norm((one.path.poses - frames.poses)[-1, :2]) for one in (found, plain)]
+    assert errors[0] < 0.5 * errors[1]
+    dark = frames.image.copy()
+    dark[4:] = 0
+    blind = odometry(replace(frames, image=dark), Zero(), local_map=True, known=known)
+    assert "are those of pairs of frames" in blind.warnings()[0]
