@@ -94,6 +94,7 @@ def main() -> None:
     """Run what is missing, draw, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default=",".join(PARTS), help="which parts, with commas between")
+    parser.add_argument("--models", default=",".join(RECIPES), help="of the trajectories, with commas between")
     parser.add_argument("--frames", type=int, default=0, help="so many frames of each run at most, to try")
     parser.add_argument("--out", type=Path, default=Path("out/trajectories"), help="data sets, results, estimates")
     parser.add_argument("--pictures", type=Path, help="where pictures go (default: OUT)")
@@ -116,10 +117,13 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
     if "table21" in parts:
         for model in RECIPES:
             make_pattern_runs(args.out, model, args.quick)
-    wanted = list(jobs(parts, args.frames, args.every, table, args.quick))
+    models = args.models.split(",")
+    wanted = [
+        job for job in jobs(parts, args.frames, args.every, table, args.quick) if job.part == "table21" or job.model in models
+    ]
     results = run_all(wanted, args.out)
     pictures = args.pictures or args.out
-    if "trajectories" in parts:
+    if "trajectories" in parts and set(models) == set(RECIPES):
         draw(args.out, pictures, args.frames)
     print(machine(args.frames, args.every))
     if "table21" in parts:
