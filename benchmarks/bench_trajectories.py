@@ -118,9 +118,8 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
         for model in RECIPES:
             make_pattern_runs(args.out, model, args.quick)
     models = args.models.split(",")
-    wanted = [
-        job for job in jobs(parts, args.frames, args.every, table, args.quick) if job.part == "table21" or job.model in models
-    ]
+    listed = jobs(parts, args.frames, args.every, table, args.quick)
+    wanted = [job for job in listed if job.part == "table21" or job.model in models]
     results = run_all(wanted, args.out)
     pictures = args.pictures or args.out
     if "trajectories" in parts and set(models) == set(RECIPES):
