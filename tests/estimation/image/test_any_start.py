@@ -58,7 +58,7 @@ def expected(motion: Motion, *, mm: float, deg: float) -> MotionPrior:
 
 
 def off(found: Estimate, motion: Motion) -> NDArray[np.float64]:
-    return np.abs(np.array(found.motion) - np.array(motion)) * UNITS
+    return np.asarray(np.abs(np.array(found.motion) - np.array(motion)) * UNITS, dtype=np.float64)
 
 
 @pytest.mark.usefixtures("variant")
