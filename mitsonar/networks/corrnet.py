@@ -89,12 +89,13 @@ class CorrNet(nn.Module):
         self.floor = nn.Parameter(torch.tensor([-1.0, -2.0, -1.0]))
         self.share = nn.Parameter(torch.tensor(-4.0))
 
-    def forward(self, images: Tensor, ground: Ground) -> GaussianHead:
+    def forward(self, images: Tensor, ground: Ground, start: Tensor | None = None) -> GaussianHead:
         """Estimate the motion between two frames.
 
         Args:
             images: ``(batch, 2, bins, beams)`` in 0..1.
             ground: a batch of :func:`mitsonar.datasets.ground_nodes.ground_at`.
+            start: the motion with which the iterations begin ``(batch, 3)`` [m, m, rad]; default: none.
 
         Returns:
             The distribution of the motion; in training that of each iteration.
@@ -113,7 +114,7 @@ class CorrNet(nn.Module):
         cells = self.slopes.prepared(*_pair(self.slopes.filter(frames)))
         unit, estimates = _units(ground), []
         relief = None if self.relief is None else self.relief(*blocks)
-        motion, judged = images.new_zeros(batch, 3), None
+        motion, judged = images.new_zeros(batch, 3) if start is None else start / unit, None
         warp_grid = WarpGrid(ground, unit, BLOCK, size, blocks[0].shape[-2:], relief)
         for _ in range(self.options["looks"]):
             motion, normal = self.matching(blocks, warp_grid, motion)

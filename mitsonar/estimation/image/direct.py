@@ -5,12 +5,14 @@ drawn at the cells of the other, and both differences are used: where both frame
 than a beam biases the estimate towards whole and half beams. The slopes of the mean of both frames, denoised, turn
 differences into motion. Single differences, and whole blocks that move on their own, have Cauchy weights: shadow edges and
 relief are outliers.
+
+It starts from no motion, or from a prior. Where that fails, ``phase`` finds a start. Over far motions relief decides: there
+the heights of blocks are estimated, too (:mod:`mitsonar.estimation.image.direct_relief`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,19 +24,20 @@ from mitsonar.estimation.estimator import (
     LEAST_AT_BEST,
     LEAST_CORRELATION,
     Estimate,
-    correlation_of,
     rejected,
-    spread_of,
     two_frames,
 )
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
-from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
-from mitsonar.geometry.attitude import attitude_of
+from mitsonar.estimation.image.direct_registration import Fit, register, smoothed
+from mitsonar.estimation.image.direct_relief import registered_over_relief
+from mitsonar.estimation.image.phase import Phase
+from mitsonar.estimation.prior_gate import prior_rejection
+from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["Direct"]
+__all__ = ["Direct", "is_far"]
 
 Floats = NDArray[np.float32]
 
@@ -44,46 +47,37 @@ LEVELS = (
     DirectLevel(1, (0.7, 0.5), (0.6, 0.4), 24),
 )
 
-STILL = np.array([3e-5, 3e-5, 6e-6])
-"""Steps below which an iteration ends [m, m, rad]."""
-
-CAUCHY = 3.0
-"""Residuals of so many standard deviations have half the weight."""
-
-BLOCK = (24, 8)
-"""Bins and beams within which residuals belong together: rocks and their shadows."""
-
-BLOCK_CAUCHY = 4.0
-"""Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
-
 MODEL = 4.5
 """Squared errors over the covariance of the residuals, measured on rocky fields: the ground is neither level nor finely
 sampled. With it they are 1.2 times the covariance without noise and with speckle, 0.3 times with a high noise of pixels."""
 
-REMEMBERED = 4
-LEVER_M = 4.0
-LONGEST = 4.0
-NEAR_M = 0.002
-"""Steps that are remembered for the next; metres that a turn is worth; how many times longer a step may get; how short it
-must be before."""
+FAR_MODEL = 3.0
+"""The same where heights of blocks are estimated."""
 
 FARTHEST = np.array([0.15, 0.15, np.radians(3)])
-"""Largest valid motion. Motions up to 100 mm and 2 deg are always found; a maximum far beyond is noise."""
+"""Farthest from its start that a motion is valid. Up to 100 mm and 2 deg it is always found; what is far beyond is noise."""
 
-FEWEST_CELLS = 500
+FAR, FAR_RAD = 0.02, float(np.radians(1.5))
+"""Motions beyond this part of the height, or this turn, are far: relief decides, and ``phase`` finds those missed."""
+
+NEARBY = np.array([0.05, 0.05, np.radians(1)])
+"""Farthest from a start that the registration over relief reaches."""
+
+COVERED = 2.0
+"""Standard deviations of its smoothing that a level reaches."""
+
 LARGEST_STD = np.array([0.02, 0.02, np.radians(0.5)])
-"""Fewest cells, and largest standard deviations [m, m, rad], of a valid estimate."""
+"""Largest standard deviations [m, m, rad] of a valid estimate."""
 
 
-class _Fit(NamedTuple):
-    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes."""
+@dataclass(frozen=True)
+class _Task:
+    """Two frames to be registered, and what is known of them."""
 
-    converged: bool
-    covariance: NDArray[np.float64]
-    by_height: NDArray[np.float64]
-    correlation: float
-    independent: float
-    blocks: float
+    frames: SonarFrames
+    images: tuple[Floats, Floats]
+    attitude: Attitude
+    prior: MotionPrior | None
 
 
 @dataclass(frozen=True)
@@ -122,248 +116,117 @@ class Direct:
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance; reject frames without anything to match.
 
+        Args:
+            frames: two.
+            prior: where to start and how far to search; a motion that contradicts it is rejected. Default: it starts from no
+                motion. Where that finds none, and nothing tells that the motion is near, :class:`Phase` finds the start.
+
+        Returns:
+            The estimate; ``start`` of ``about`` is ``zero``, ``prior`` or ``phase``.
+
         Raises:
             MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
-        first, second = two_frames(frames)
+        images = two_frames(frames)
         attitude = attitude_of(frames, "direct", self.height_m, self.pitch_rad, self.relief_m)
         if attitude.reason:
             return rejected(attitude.reason)
+        task = _Task(frames, images, attitude, prior)
+        start = Motion(0.0, 0.0, 0.0) if prior is None else prior.motion
+        found = self._from(task, start, "zero" if prior is None else "prior")
+        if found.valid or (prior is not None and (3 * prior.std <= FARTHEST).all()):
+            return found
+        elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
+        if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
+            return found  # a motion nearby has been looked for
+        second = self._from(replace(task, prior=None), elsewhere.motion, "phase")
+        reason = second.reason or prior_rejection(second.motion, second.covariance, prior)
+        return replace(second, valid=not reason, reason=reason)
+
+    def _from(self, task: _Task, start: Motion, named: str) -> Estimate:
+        """Register from a start: over level ground while the motion is near, over relief where it is far."""
+        height_m = task.attitude.height_m
+        if self.heave_std_m:
+            return self._over_level(task, start, named)
+        if not is_far(start, height_m):
+            near = self._over_level(task, start, named)
+            if not near.valid or not is_far(near.motion, height_m):
+                return near
+            far = self._over_relief(task, start, near.motion, named)
+            return far if far.valid else near
+        if task.prior is not None and (3 * task.prior.std > NEARBY).any():
+            near = self._over_level(task, start, named)
+            return self._over_relief(task, start, near.motion, named) if near.covariance is not None else near
+        return self._over_relief(task, start, start, named)
+
+    def _over_level(self, task: _Task, start: Motion, named: str) -> Estimate:
+        """Register from a start over level ground."""
         v = np.zeros(4 if self.heave_std_m else 3)
+        v[:3] = start
         fit = None
-        for number, level in enumerate(self.levels):
-            if len(first) < 24 * level.step and number + 1 < len(self.levels):
+        levels = self._levels(task)
+        for number, level in enumerate(levels):
+            last = number + 1 == len(levels)
+            if len(task.images[0]) < 24 * level.step and not last:
                 continue  # too few bins for so coarse a step
-            pair = _smoothed(first, level), _smoothed(second, level)
-            cells = Cells(frames, attitude, level, heave=bool(self.heave_std_m))
-            found = self._register(*pair, cells, v, level, last=number + 1 == len(self.levels))
+            pair = smoothed(task.images[0], level), smoothed(task.images[1], level)
+            cells = Cells(task.frames, task.attitude, level, heave=bool(self.heave_std_m))
+            found = register(pair, cells, v, level, last=last, heave_std_m=self.heave_std_m)
             if found is None:
-                return rejected("nothing in the frames to match")
+                return replace(rejected("nothing in the frames to match"), about={"start": named})
             v, fit = found
         assert fit is not None
-        height = fit.by_height[:3] * attitude.height_std_m
-        covariance = MODEL * fit.covariance[:3, :3] + np.outer(height, height)
-        about = {"correlation": fit.correlation, "height_m": attitude.height_m}
-        about |= {"heave_m": float(v[3])} if self.heave_std_m else {}
-        reason = _rejection(fit, covariance, v)
-        return Estimate(Motion(*(float(x) for x in v[:3])), covariance, not reason, reason, about)
+        about = {"heave_m": float(v[3])} if self.heave_std_m else {}
+        return self._judged(task, start, v[:3], fit, MODEL, {**about, "start": named})
 
-    def _register(
-        self, first: Floats, second: Floats, cells: Cells, start: NDArray[np.float64], level: DirectLevel, *, last: bool
-    ) -> tuple[NDArray[np.float64], _Fit | None] | None:
-        """Run Gauss-Newton from a start; None where there is nothing to match."""
-        v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
-        at = None
-        for _ in range(level.iterations):
-            at = _linearised(first, second, cells, v, level, last=last)
-            if at is None:
-                return None
-            held = self._held(at.scale, len(v))
-            step = np.asarray(-np.linalg.solve(at.normal + np.diag(held), at.pull + held * v), dtype=np.float64)
-            v = np.add(v, accelerate(v, step))
-            converged = bool((np.abs(step[:3]) < STILL).all())
-            if converged:
-                break
-        if not last or at is None:
-            return v, None
-        return v, _fit(at, cells, v, level, self._held(at.scale, len(v)), converged)
+    def _levels(self, task: _Task) -> tuple[DirectLevel, ...]:
+        """Return the levels that are needed: none that is coarser than one which reaches all that a prior leaves open."""
+        if task.prior is None:
+            return self.levels
+        range_m, bearing_rad = task.frames.range_m, task.frames.bearing_rad
+        step = 3 * float(np.hypot(*task.prior.std[:2]))
+        bins = step / float(np.median(np.diff(range_m)))
+        beams = (3 * task.prior.std[2] + step / float(range_m.mean())) / float(np.median(np.diff(bearing_rad)))
+        needed = [
+            number
+            for number, level in enumerate(self.levels)
+            if bins <= COVERED * level.smoothing[0] and beams <= COVERED * level.smoothing[1]
+        ]
+        return self.levels[needed[-1] if needed else 0 :]
 
-    def _held(self, scale: float, unknowns: int) -> NDArray[np.float64]:
-        """Return the prior weight of each unknown in units of the residuals' noise: only heave has one."""
-        held = np.zeros(unknowns)
-        held[3:] = scale**2 / self.heave_std_m**2 if self.heave_std_m else 0.0
-        return held
+    def _over_relief(self, task: _Task, start: Motion, near: Motion, named: str) -> Estimate:
+        """Register over relief, from a motion that is near; the result counts from the start."""
+        found = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
+        if found is None:
+            return replace(rejected("nothing in the frames to match"), about={"start": named})
+        return self._judged(task, start, *found, FAR_MODEL, {"start": named})
 
-
-class _Side(NamedTuple):
-    """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion.
-
-    ``curvature`` is the derivative of weight times residual by the residual. Outliers, whose weight falls as they grow, have
-    a negative one: a motion that the weights hold is known less well than the sum of the weights says.
-    """
-
-    before: Floats
-    after: Floats
-    inner: tuple[slice, slice]
-    slopes: tuple[Floats, Floats]
-    residual: Floats
-    jacobian: Floats
-    curvature: Floats
-    weighted: Floats
-
-    def sums(self, values: Floats) -> NDArray[np.float64]:
-        """Sum maps ``(maps, cells)`` over blocks of the whole frame ``(maps, blocks)``."""
-        rows, columns = self.before.shape
-        whole = np.zeros((len(values), rows, columns), dtype=np.float32)
-        inside = whole[:, self.inner[0], self.inner[1]]
-        inside[...] = values.reshape(inside.shape)
-        return _by_block(whole)
+    def _judged(
+        self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, model: float, about: dict[str, object]
+    ) -> Estimate:
+        """Return the estimate with its covariance, rejected where it must not be used."""
+        height = fit.by_height[:3] * task.attitude.height_std_m
+        covariance = model * fit.covariance[:3, :3] + np.outer(height, height)
+        motion = Motion(*(float(x) for x in v))
+        reason = _rejection(fit, covariance, v - np.array(start)) or prior_rejection(motion, covariance, task.prior)
+        about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
+        return Estimate(motion, covariance, not reason, reason, about)
 
 
-class _Linearisation(NamedTuple):
-    """Both sides at one motion, the noise of their differences, and the normal equations."""
-
-    sides: list[_Side]
-    scale: float
-    normal: NDArray[np.float64]
-    pull: NDArray[np.float64]
+def is_far(motion: Motion, height_m: float) -> bool:
+    """Return whether relief decides over a motion, seen from this height [m]."""
+    return bool(np.hypot(motion.sideways, motion.forward) > FAR * height_m or abs(motion.yaw) > FAR_RAD)
 
 
-def _linearised(
-    first: Floats, second: Floats, cells: Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
-) -> _Linearisation | None:
-    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains."""
-    pairs = []
-    for back in (False, True) if last else (False,):
-        there = cells.shift(v, back=back)
-        inner = _inner(there, cells.usable)
-        if inner is None:
-            return None
-        drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
-        pairs.append((drawn, second, inner) if back else (first, drawn, inner))
-    residuals = [(after - before)[inner].ravel() for before, after, inner in pairs]
-    if residuals[0].size < FEWEST_CELLS:
-        return None
-    scale = max(1.4826 * float(np.median(np.abs(residuals[0][::5]))), FAINTEST)
-    sides = []
-    for (before, after, inner), residual in zip(pairs, residuals, strict=True):
-        slopes = slopes_of((before + after) * np.float32(0.5), level, scale)
-        weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
-        curvature = weight * (2 * weight - 1)
-        if last:
-            blocks = _block_weight(slopes, residual, weight, inner)
-            weight, curvature = weight * blocks, curvature * blocks
-        jacobian = cells.along(slopes, inner)
-        sides.append(_Side(before, after, inner, slopes, residual, jacobian, curvature, jacobian * weight))
-    normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
-    pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
-    return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
-
-
-def _fit(
-    at: _Linearisation, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
-) -> _Fit:
-    """Assess the motion from the gradients of blocks, and from slopes of one frame times those of the other."""
-    true = np.sum([_cross(side, cells, level) for side in at.sides], axis=0)
-    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else at.normal) + np.diag(held))
-    pulls = np.sum([side.sums(side.weighted * side.residual) for side in at.sides], axis=0)
-    side = at.sides[0]
-    shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
-    lifted = cells.lifted_shift(v)
-    by_height = np.zeros(len(v))
-    for one in at.sides:
-        by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
-    # smoothed noise is alike in neighbouring cells: as many count once as a smoothing kernel covers
-    alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
-    return _Fit(
-        converged=converged,
-        covariance=undone @ (pulls @ pulls.T) @ undone,
-        by_height=undone @ by_height,
-        correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
-        independent=side.residual.size / alike,
-        blocks=spread_of(shares[0]),
-    )
-
-
-def _smoothed(image: Floats, level: DirectLevel) -> Floats:
-    """Every so many bins of the smoothed image."""
-    smooth = blurred(image, *level.smoothing)
-    return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
-
-
-class _AndersonAcceleration:
-    """Anderson acceleration (1965): noise in the slopes shortens steps; the last steps show by how much."""
-
-    def __init__(self) -> None:
-        self.places: list[NDArray[np.float64]] = []
-        self.steps: list[NDArray[np.float64]] = []
-
-    def __call__(self, place: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return an accelerated step; the given one where the last steps do not suffice."""
-        lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
-        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
-            return step
-        self.places.append(place)
-        self.steps.append(step)
-        if len(self.steps) < 2:
-            return step
-        places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
-        past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
-        accelerated = np.asarray(step - (places + steps) @ past)
-        lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (accelerated, step)]
-        return accelerated if lengths[0] < LONGEST * lengths[1] else step
-
-
-def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
-    """Return the cells that meet the ground and stay within both images; None where none does."""
-    _, bins, beams = half.shape
-    reach = np.abs(half).max(axis=(1, 2))
-    if not np.isfinite(reach).all():
-        return None
-    margin = [int(np.ceil(far)) + 1 for far in reach]
-    start = max(margin[0], usable.start)
-    if not (start + margin[0] < bins and 2 * margin[1] < beams):
-        return None
-    return slice(start, bins - margin[0]), slice(margin[1], beams - margin[1])
-
-
-def _singular(normal: NDArray[np.float64]) -> bool:
-    """Return whether some motion changes nothing."""
-    size = np.sqrt(np.diag(normal))
-    return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
-
-
-def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
-    """Return how the gradient changes with the motion, from slopes of one frame times slopes of the other, whose noise is
-    independent."""
-    frames = (side.before, side.after)
-    one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
-    product = ((one * side.curvature) @ other.T).astype(np.float64)
-    return (product + product.T) / 2
-
-
-def _block_weight(slopes: tuple[Floats, Floats], residual: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
-    """Return weights ``(cells,)`` of whole blocks: one that moves on its own shows relief, or a shadow.
-
-    The measure is the decrease of its squared differences by its own best shift (Lucas and Kanade, 1981).
-    """
-    along, across = slopes[0][inner], slopes[1][inner]
-    r, w = residual.reshape(along.shape), weight.reshape(along.shape)
-    terms = np.empty((5, *r.shape), dtype=np.float32)
-    products = ((along, along), (along, across), (across, across), (along, r), (across, r))
-    for k, (one, other) in enumerate(products):
-        np.multiply(one, other, out=terms[k])
-    terms *= w
-    aa, ab, bb, pull_a, pull_b = _by_block(terms)
-    aa, bb = aa + 1e-3 * aa.mean() + 1e-12, bb + 1e-3 * bb.mean() + 1e-12
-    decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
-    blocks = 1 / (1 + decrease / (BLOCK_CAUCHY**2 * float(np.median(decrease)) + 1e-12))
-    row, column = (_block_of(r.shape[k], BLOCK[k]) for k in (0, 1))
-    table = blocks.reshape(row[-1] + 1, column[-1] + 1).astype(np.float32)
-    return np.asarray(table[row][:, column]).ravel()
-
-
-def _block_of(size: int, block: int) -> NDArray[np.intp]:
-    """Return the block of each cell along an axis; cells beyond the last whole block belong to it."""
-    return np.minimum(np.arange(size) // block, max(size // block, 1) - 1)
-
-
-def _by_block(maps: Floats) -> NDArray[np.float64]:
-    """Sum over blocks ``(maps, blocks)``."""
-    starts = [np.arange(0, max(size // block, 1) * block, block) for size, block in zip(maps.shape[1:], BLOCK, strict=True)]
-    sums = np.add.reduceat(np.add.reduceat(maps, starts[0], axis=1), starts[1], axis=2)
-    return np.asarray(sums.reshape(len(maps), -1), dtype=np.float64)
-
-
-def _rejection(fit: _Fit, covariance: NDArray[np.float64], v: NDArray[np.float64]) -> str:
-    """Return the reason of a rejection; empty for a valid estimate."""
+def _rejection(fit: Fit, covariance: NDArray[np.float64], off: NDArray[np.float64]) -> str:
+    """Return the reason of a rejection; empty for a valid estimate, which is so far off its start."""
     std = np.sqrt(np.diag(covariance))
     if not fit.converged:
         return "the iteration did not settle"
     if fit.correlation < max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(fit.independent)):
         return f"the frames as matched correlate by {fit.correlation:.2f} only"
-    if (np.abs(v[:3]) > FARTHEST).any():
-        return "a motion beyond 150 mm or 3 deg is farther than the coarsest level searches"
+    if (np.abs(off) > FARTHEST).any():
+        return "a motion beyond 150 mm or 3 deg of its start is farther than the coarsest level searches"
     if fit.blocks < FEWEST_BLOCKS:
         return "too small a part of the frames holds anything to match"
     if not (std < LARGEST_STD).all():

@@ -108,12 +108,12 @@ class Cells:
         full[..., 1, :, :] /= self.grid.beam_rad
         return np.asarray(full)
 
-    def shift(self, v: NDArray[np.float64], *, back: bool = False) -> Floats:
+    def shift(self, v: NDArray[np.float64], *, back: bool = False, lift_m: float = 0.0) -> Floats:
         """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
 
-        It is in bins and beams; with ``back``, from the second frame to the first.
+        It is in bins and beams; ``back``: from the second frame to the first; ``lift_m``: of ground so much higher.
         """
-        ground = other = self.ground
+        ground = other = self._ground(self.attitude.height_m - lift_m) if lift_m else self.ground
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
             ground, other = (self._ground(self.attitude.height_m + change) for change in (half, -half))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,7 +15,10 @@ from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.datasets.ground_nodes import ground_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, rejected, two_frames
+from mitsonar.estimation.image.direct import is_far
+from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
+from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
@@ -36,6 +39,9 @@ CELL = 4
 
 BLOCK = 16
 """Such cells and beams of the blocks over which what is matched must be spread."""
+
+FAR_MODEL = 4.0
+"""Squared errors over the network's covariance for motions far beyond training, measured on rocky fields."""
 
 
 @dataclass(init=False, eq=False)
@@ -91,6 +97,17 @@ class ImageNetwork(Trained):
     def estimate(self, frames: SonarFrames, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance.
 
+        A network that is given the geometry begins at a prior, and else at no motion. Where that fails, and nothing tells
+        that the motion is near, :class:`~mitsonar.estimation.image.phase.Phase` finds the start. Other networks ignore a
+        prior.
+
+        Args:
+            frames: two.
+            prior: where to start; a motion that contradicts it is rejected.
+
+        Returns:
+            The estimate; ``start`` of ``about`` is ``zero``, ``prior`` or ``phase``.
+
         Raises:
             MitsonarError: not two frames, another sonar than that of training, frames without what the network needs.
         """
@@ -102,9 +119,22 @@ class ImageNetwork(Trained):
         attitude = self._attitude_of(frames)
         if attitude is not None and attitude.reason:
             return rejected(attitude.reason)
-        ground = {} if attitude is None else _batch(ground_of(frames, attitude))
+        if attitude is None:
+            return self._from(frames, images, {}, None)
+        ground = _batch(ground_of(frames, attitude))
+        found = self._from(frames, images, ground, None if prior is None else prior.motion)
+        found = _judged(found, prior, "zero" if prior is None else "prior", attitude)
+        if found.valid or (prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))):
+            return found
+        elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
+        if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
+            return found  # a motion nearby has been looked for
+        return _judged(self._from(frames, images, ground, elsewhere.motion), prior, "phase", attitude)
+
+    def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
+        """Estimate the motion from a start of the network's iterations; None: no motion."""
         with torch.inference_mode(), one_thread():
-            targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground))
+            targets, covariances = self._checkpoint.decode(self._answer(frames, images, ground, start))
         if not np.isfinite(targets).all():
             return rejected("the network's answer is not finite")
         if targets.shape[1] != 3:
@@ -113,7 +143,7 @@ class ImageNetwork(Trained):
             return rejected("the network's covariance is not positive: images unlike those of its training")
         motion = Motion(*targets[0].tolist())
         covariance = self._checkpoint.covariance if covariances is None else covariances[0]
-        reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion)
+        reason = self._rejection_of_geometry(frames) or self._rejection_of_size(motion, start)
         if not reason:
             reason = _rejection_of_answer(images, ground, motion) if ground else self._rejection_of_match(frames, images)
         return Estimate(motion, covariance, not reason, reason)
@@ -124,11 +154,13 @@ class ImageNetwork(Trained):
             return None
         return attitude_of(frames, self._checkpoint.network, self.height_m, self.pitch_rad, self.relief_m)
 
-    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground) -> Tensor | GaussianHead:
+    def _answer(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Tensor | GaussianHead:
         """Return the answer of the network, a batch of one."""
         (view,) = self._checkpoint.arrangement["views"]
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
-        return answer_of(self._network, (inputs, ground) if ground else inputs)
+        if not ground:
+            return answer_of(self._network, inputs)
+        return answer_of(self._network, (inputs, ground) if start is None else (inputs, ground, torch.tensor([start])))
 
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
         """From the frames to the network's input."""
@@ -157,6 +189,14 @@ class ImageNetwork(Trained):
         outward = forward + sideways * math.sin(min(math.pi / 2, np.abs(frames.bearing_rad).max()))
         across = yaw + sideways / frames.range_m[0]
         return 2 + int(outward / bin_m), 2 + int(across / beam_rad)
+
+
+def _judged(found: Estimate, prior: MotionPrior | None, named: str, attitude: Attitude) -> Estimate:
+    """Return an estimate that names its start, with the covariance of far motions, rejected where it contradicts a prior."""
+    far = found.covariance is not None and is_far(found.motion, attitude.height_m)
+    covariance = FAR_MODEL * found.covariance if far and found.covariance is not None else found.covariance
+    reason = found.reason or prior_rejection(found.motion, covariance, prior)
+    return replace(found, covariance=covariance, valid=not reason, reason=reason, about={**found.about, "start": named})
 
 
 def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:

@@ -211,15 +211,16 @@ class Trained:
                     return f"the sonar had a {name} of {angle:.1f} deg: {self._checkpoint.fixed} are fixed by training"
         return ""
 
-    def _rejection_of_size(self, motion: Motion) -> str:
-        """Whether the answer is of the size that training had."""
+    def _rejection_of_size(self, motion: Motion, start: Motion | None = None) -> str:
+        """Whether the answer, counted from the start of the iterations, is of the size that training had."""
         coder = self._checkpoint.coder
         middle, half = (coder.low + coder.high) / 2, (coder.high - coder.low) / 2
-        beyond = np.abs(np.array(motion) - middle) > BEYOND * half
+        off = np.array(motion) - (np.zeros(3) if start is None else np.array(start))
+        beyond = np.abs(off - middle) > BEYOND * half
         if not beyond.any():
             return ""
         axis = int(beyond.argmax())
-        value, low, high = in_units(np.array([motion, coder.low, coder.high]))[:, axis]
+        value, low, high = in_units(np.array([off, coder.low, coder.high]))[:, axis]
         name, unit, _ = AXES[axis]
         return f"{name} {value:.3g} {unit} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
 

@@ -1,0 +1,264 @@
+"""Gauss-Newton between two frames in polar coordinates: the steps of ``direct``, coarse to fine, and what they are worth."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.estimation.estimator import correlation_of, spread_of
+from mitsonar.estimation.image.direct_blocks import block_of, by_block
+from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
+from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
+
+__all__ = ["Fit", "register", "smoothed"]
+
+Floats = NDArray[np.float32]
+
+STILL = np.array([3e-5, 3e-5, 6e-6])
+"""Steps below which an iteration ends [m, m, rad]."""
+
+CAUCHY = 3.0
+"""Residuals of so many standard deviations have half the weight."""
+
+BLOCK = (24, 8)
+"""Bins and beams within which residuals belong together: rocks and their shadows."""
+
+BLOCK_CAUCHY = 4.0
+"""Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
+
+REMEMBERED = 4
+LEVER_M = 4.0
+LONGEST = 4.0
+NEAR_M = 0.002
+"""Steps that are remembered for the next; metres that a turn is worth; how many times longer a step may get; how short it
+must be before."""
+
+FEWEST_CELLS = 500
+"""Fewest cells that are registered."""
+
+
+class Fit(NamedTuple):
+    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes."""
+
+    converged: bool
+    covariance: NDArray[np.float64]
+    by_height: NDArray[np.float64]
+    correlation: float
+    independent: float
+    blocks: float
+
+
+def register(
+    pair: tuple[Floats, Floats],
+    cells: Cells,
+    start: NDArray[np.float64],
+    level: DirectLevel,
+    *,
+    last: bool,
+    heave_std_m: float,
+) -> tuple[NDArray[np.float64], Fit | None] | None:
+    """Run Gauss-Newton from a start; None where there is nothing to match.
+
+    Args:
+        pair: both frames at this level, smoothed.
+        cells: of this level.
+        start: sideways, forward [m], yaw [rad], and heave [m] where it is unknown ``(3,)`` or ``(4,)``.
+        level: smoothing and iterations.
+        last: whether it is the finest level: both ways are drawn, and the fit is assessed.
+        heave_std_m: prior standard deviation of the heave.
+
+    Returns:
+        The motion, and its fit at the finest level.
+    """
+    v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
+    at = None
+    for _ in range(level.iterations):
+        at = _linearised(*pair, cells, v, level, last=last)
+        if at is None:
+            return None
+        held = _held(at.scale, len(v), heave_std_m)
+        step = np.asarray(-np.linalg.solve(at.normal + np.diag(held), at.pull + held * v), dtype=np.float64)
+        v = np.add(v, accelerate(v, step))
+        converged = bool((np.abs(step[:3]) < STILL).all())
+        if converged:
+            break
+    if not last or at is None:
+        return v, None
+    return v, _fit(at, cells, v, level, _held(at.scale, len(v), heave_std_m), converged)
+
+
+def _held(scale: float, unknowns: int, heave_std_m: float) -> NDArray[np.float64]:
+    """Return the prior weight of each unknown in units of the residuals' noise: only heave has one."""
+    held = np.zeros(unknowns)
+    held[3:] = scale**2 / heave_std_m**2 if heave_std_m else 0.0
+    return held
+
+
+class _Side(NamedTuple):
+    """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion.
+
+    ``curvature`` is the derivative of weight times residual by the residual. Outliers, whose weight falls as they grow, have
+    a negative one: a motion that the weights hold is known less well than the sum of the weights says.
+    """
+
+    before: Floats
+    after: Floats
+    inner: tuple[slice, slice]
+    slopes: tuple[Floats, Floats]
+    residual: Floats
+    jacobian: Floats
+    curvature: Floats
+    weighted: Floats
+
+    def sums(self, values: Floats) -> NDArray[np.float64]:
+        """Sum maps ``(maps, cells)`` over blocks of the whole frame ``(maps, blocks)``."""
+        rows, columns = self.before.shape
+        whole = np.zeros((len(values), rows, columns), dtype=np.float32)
+        inside = whole[:, self.inner[0], self.inner[1]]
+        inside[...] = values.reshape(inside.shape)
+        return by_block(whole, BLOCK)
+
+
+class _Linearisation(NamedTuple):
+    """Both sides at one motion, the noise of their differences, and the normal equations."""
+
+    sides: list[_Side]
+    scale: float
+    normal: NDArray[np.float64]
+    pull: NDArray[np.float64]
+
+
+def _linearised(
+    first: Floats, second: Floats, cells: Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
+) -> _Linearisation | None:
+    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains."""
+    pairs = []
+    for back in (False, True) if last else (False,):
+        there = cells.shift(v, back=back)
+        inner = _inner(there, cells.usable)
+        if inner is None:
+            return None
+        drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
+        pairs.append((drawn, second, inner) if back else (first, drawn, inner))
+    residuals = [(after - before)[inner].ravel() for before, after, inner in pairs]
+    if residuals[0].size < FEWEST_CELLS:
+        return None
+    scale = max(1.4826 * float(np.median(np.abs(residuals[0][::5]))), FAINTEST)
+    sides = []
+    for (before, after, inner), residual in zip(pairs, residuals, strict=True):
+        slopes = slopes_of((before + after) * np.float32(0.5), level, scale)
+        weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
+        curvature = weight * (2 * weight - 1)
+        if last:
+            blocks = _block_weight(slopes, residual, weight, inner)
+            weight, curvature = weight * blocks, curvature * blocks
+        jacobian = cells.along(slopes, inner)
+        sides.append(_Side(before, after, inner, slopes, residual, jacobian, curvature, jacobian * weight))
+    normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
+    pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
+    return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
+
+
+def _fit(
+    at: _Linearisation, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
+) -> Fit:
+    """Assess the motion from the gradients of blocks, and from slopes of one frame times those of the other."""
+    true = np.sum([_cross(side, cells, level) for side in at.sides], axis=0)
+    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else at.normal) + np.diag(held))
+    pulls = np.sum([side.sums(side.weighted * side.residual) for side in at.sides], axis=0)
+    side = at.sides[0]
+    shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
+    lifted = cells.lifted_shift(v)
+    by_height = np.zeros(len(v))
+    for one in at.sides:
+        by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
+    # smoothed noise is alike in neighbouring cells: as many count once as a smoothing kernel covers
+    alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
+    return Fit(
+        converged=converged,
+        covariance=undone @ (pulls @ pulls.T) @ undone,
+        by_height=undone @ by_height,
+        correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
+        independent=side.residual.size / alike,
+        blocks=spread_of(shares[0]),
+    )
+
+
+def smoothed(image: Floats, level: DirectLevel) -> Floats:
+    """Every so many bins of the smoothed image."""
+    smooth = blurred(image, *level.smoothing)
+    return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
+
+
+class _AndersonAcceleration:
+    """Anderson acceleration (1965): noise in the slopes shortens steps; the last steps show by how much."""
+
+    def __init__(self) -> None:
+        self.places: list[NDArray[np.float64]] = []
+        self.steps: list[NDArray[np.float64]] = []
+
+    def __call__(self, place: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return an accelerated step; the given one where the last steps do not suffice."""
+        lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
+        if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
+            return step
+        self.places.append(place)
+        self.steps.append(step)
+        if len(self.steps) < 2:
+            return step
+        places, steps = (np.diff(np.array(values[-REMEMBERED:]), axis=0).T for values in (self.places, self.steps))
+        past, *_ = np.linalg.lstsq(lever * steps, lever[:, 0] * step, rcond=1e-3)
+        accelerated = np.asarray(step - (places + steps) @ past)
+        lengths = [float(np.linalg.norm(lever[:, 0] * one)) for one in (accelerated, step)]
+        return accelerated if lengths[0] < LONGEST * lengths[1] else step
+
+
+def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
+    """Return the cells that meet the ground and stay within both images; None where none does."""
+    _, bins, beams = half.shape
+    reach = np.abs(half).max(axis=(1, 2))
+    if not np.isfinite(reach).all():
+        return None
+    margin = [int(np.ceil(far)) + 1 for far in reach]
+    start = max(margin[0], usable.start)
+    if not (start + margin[0] < bins and 2 * margin[1] < beams):
+        return None
+    return slice(start, bins - margin[0]), slice(margin[1], beams - margin[1])
+
+
+def _singular(normal: NDArray[np.float64]) -> bool:
+    """Return whether some motion changes nothing."""
+    size = np.sqrt(np.diag(normal))
+    return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
+
+
+def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
+    """Return how the gradient changes with the motion, from slopes of one frame times slopes of the other, whose noise is
+    independent."""
+    frames = (side.before, side.after)
+    one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
+    product = ((one * side.curvature) @ other.T).astype(np.float64)
+    return (product + product.T) / 2
+
+
+def _block_weight(slopes: tuple[Floats, Floats], residual: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
+    """Return weights ``(cells,)`` of whole blocks: one that moves on its own shows relief, or a shadow.
+
+    The measure is the decrease of its squared differences by its own best shift (Lucas and Kanade, 1981).
+    """
+    along, across = slopes[0][inner], slopes[1][inner]
+    r, w = residual.reshape(along.shape), weight.reshape(along.shape)
+    terms = np.empty((5, *r.shape), dtype=np.float32)
+    products = ((along, along), (along, across), (across, across), (along, r), (across, r))
+    for k, (one, other) in enumerate(products):
+        np.multiply(one, other, out=terms[k])
+    terms *= w
+    aa, ab, bb, pull_a, pull_b = by_block(terms, BLOCK)
+    aa, bb = aa + 1e-3 * aa.mean() + 1e-12, bb + 1e-3 * bb.mean() + 1e-12
+    decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
+    blocks = 1 / (1 + decrease / (BLOCK_CAUCHY**2 * float(np.median(decrease)) + 1e-12))
+    row, column = (block_of(r.shape[k], BLOCK[k]) for k in (0, 1))
+    table = blocks.reshape(row[-1] + 1, column[-1] + 1).astype(np.float32)
+    return np.asarray(table[row][:, column]).ravel()
