@@ -160,7 +160,10 @@ class ImageNetwork(Trained):
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
         if not ground:
             return answer_of(self._network, inputs)
-        return answer_of(self._network, (inputs, ground) if start is None else (inputs, ground, torch.tensor([start])))
+        given: tuple[Tensor | Ground, ...] = (inputs, ground)
+        if start is not None:
+            given = (*given, torch.tensor([start], dtype=torch.float32))
+        return answer_of(self._network, given)
 
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
         """From the frames to the network's input."""
