@@ -222,7 +222,8 @@ def _assessed(found: _Equations, prior: float, level: DirectLevel, *, converged:
     alike = 4 * np.pi * max(level.smoothing[0], 0.28) * max(level.smoothing[1], 0.28)
     return Fit(
         converged=converged,
-        covariance=np.asarray(found.noise * undone, dtype=np.float64),
+        # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
+        covariance=np.asarray(found.noise * (undone + undone.T) / 2, dtype=np.float64),
         by_height=undone @ (found.both @ (held / (found.height + held))),
         correlation=found.correlation,
         independent=found.cells / alike,
