@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from mitsonar.mapping.graph_odometry import normalised_errors
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import Odometry, odometry
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
@@ -124,10 +125,11 @@ def rows(source: FrameSource, noise: str, seeds: int) -> Iterator[str]:
     yield row([noise, "no", "no"], [plain], time.perf_counter() - begun)
     print(f"{len(known)} motions estimated", file=sys.stderr, flush=True)
     gyros = [simulated_sensors(source.true, GYRO, seed) for seed in range(seeds)]
-    for sensors, loops in ((None, True), (gyros, False), (gyros, True)):
+    choices: list[tuple[Sequence[VehicleSensors | None], bool]] = [([None], True), (gyros, False), (gyros, True)]
+    for sensors, loops in choices:
         begun = time.perf_counter()
-        runs = [odometry(source, estimator, known=known, sensors=one, loops=loops) for one in sensors or [None]]
-        name = "no" if sensors is None else f"1 deg/h^0.5, {seeds} draws"
+        runs = [odometry(source, estimator, known=known, sensors=one, loops=loops) for one in sensors]
+        name = "no" if sensors[0] is None else f"1 deg/h^0.5, {seeds} draws"
         yield row([noise, name, "yes" if loops else "no"], runs, (time.perf_counter() - begun) / len(runs))
 
 

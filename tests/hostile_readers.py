@@ -22,6 +22,9 @@ from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
+from mitsonar.mapping.sensor_files import load_sensors, save_sensors
+from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.render_run import RENDERING, progress_of
@@ -293,22 +296,36 @@ class Nearby:
 
 def make_odometry(folder: Path) -> None:
     from mitsonar.estimation.estimator import Estimate
-    from mitsonar.mapping.odometry_run import _line_of
+    from mitsonar.mapping.estimate_journal import add_to_journal
     from mitsonar.motion.composition import Motion
 
     begun(folder, ODOMETRY, {"a": 1}, source="s", scale=None, seconds=1.5)
     estimate = Estimate(Motion(0.1, 0.2, 0.3), np.eye(3), True, "", {})
-    (folder / "estimates.jsonl").write_text("".join(_line_of(pair, estimate) for pair in range(3)))
+    for pair in range(3):
+        add_to_journal(folder / "estimates.jsonl", {"pair": pair}, estimate)
+        add_to_journal(folder / "loops.jsonl", {"first": pair, "second": 9, "guess": [0.1, 0.2, 0.3]}, estimate)
+
+
+def make_sensors(folder: Path) -> None:
+    noise = SensorNoise(1.0, 5.0, 0.02, 0.1, 2.0, (0.01, 0.1), rate_hz=5.0)
+    path = Trajectory(np.linspace(np.zeros(6), np.ones(6), 4), np.arange(4.0))
+    save_sensors(folder / "sensors.csv", simulated_sensors(path, noise))
+
+
+def read_sensors(folder: Path) -> None:
+    load_sensors(folder / "sensors.csv").motions(np.arange(4.0))
 
 
 def read_odometry(folder: Path) -> None:
-    OdometryFolder(RunDirectory.begin(folder, ODOMETRY, {"a": 1}, resume=True)).kept()
+    there = OdometryFolder(RunDirectory.begin(folder, ODOMETRY, {"a": 1}, resume=True))
+    there.kept()
+    there.kept_loops()
 
 
 def spoil_odometry(rng: Rng, folder: Path) -> None:
     if rng.random() < 0.3:
         return spoil_file("run.json", changed_json)(rng, folder)
-    path = folder / "estimates.jsonl"
+    path = folder / ("estimates.jsonl" if rng.random() < 0.5 else "loops.jsonl")
     first, *rest = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(changed_json(rng, first) + b"\n" + b"".join(rest))
 
@@ -492,6 +509,7 @@ READERS: dict[str, Reader] = {
     "material": Reader(make_materials, spoil_materials, read_materials),
     "run.json": Reader(make_run, spoil_file("run.json", changed_json), read_run),
     "odometry": Reader(make_odometry, spoil_odometry, read_odometry),
+    "sensors": Reader(make_sensors, spoil_file("sensors.csv", changed_text), read_sensors),
     "checkpoint": Reader(make_checkpoint, spoil_checkpoint, read_checkpoint),
     "mesh of a scene": Reader(make_meshes, spoil_mesh, read_meshes),
     "user's model": Reader(make_meshes, spoil_model, read_model),

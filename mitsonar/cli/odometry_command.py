@@ -74,9 +74,8 @@ def odometry(
     sensors: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with their unit and noise. "
-            "They join with the frames in a pose graph.",
-            dir_okay=False,
+            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with unit and noise; or a "
+            "ROS bag. They join with the frames in a pose graph.",
         ),
     ] = None,
     local_map: Annotated[
@@ -115,10 +114,10 @@ def odometry(
     run.json, and estimates.jsonl, from which --resume continues. With --loops also loops.csv.
     """
     from mitsonar.estimation.named_estimators import estimator_from
+    from mitsonar.mapping.bag_sensors import open_sensors
     from mitsonar.mapping.closure import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at, usual_loop
-    from mitsonar.mapping.sensor_files import load_sensors
     from mitsonar.motion.pose import Pose
     from mitsonar.records.sonar_frames import SonarFrames
 
@@ -134,7 +133,7 @@ def odometry(
         if images:
             frames_for(frames, reading)  # faults of the frames are reported first
         raise
-    vehicle = None if sensors is None else load_sensors(sensors)
+    vehicle = None if sensors is None else open_sensors(sensors)
     source = open_source(frames, method, reading)
     if source.note:
         say(source.note)

@@ -272,8 +272,14 @@ def _recorded(case: Case, estimator: AnyEstimator, frames: int | None) -> FrameS
 
 def _first(source: FrameSource, count: int) -> FrameSource:
     """Return the first frames of a source."""
-    columns = {name: getattr(source, name) for name in ("time_s", "poses", "attitude_rad", "height_m")}
-    return replace(source, **{name: None if values is None else values[:count] for name, values in columns.items()})
+    poses, attitude, height = source.poses, source.attitude_rad, source.height_m
+    return replace(
+        source,
+        time_s=source.time_s[:count],
+        poses=None if poses is None else poses[:count],
+        attitude_rad=None if attitude is None else attitude[:count],
+        height_m=None if height is None else height[:count],
+    )
 
 
 def _folder_name(case: Case) -> str:

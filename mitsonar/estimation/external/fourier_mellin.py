@@ -48,9 +48,9 @@ class FourierMellin:
         images = [np.pad(_tapered(image), square) for image in (pair.first, pair.second)]
         found = package("fourier_mellin", INSTALL).FourierMellin(images[0]).register_image(images[1])
         middle = (len(images[0]) - 1) / 2
-        warp = cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0)
+        warp = np.array(cv2.getRotationMatrix2D((middle, middle), found.rotation, 1.0), dtype=float)
         warp[:, 2] += found.x, -found.y  # it counts rows upwards
-        warp[:, 2] += warp[:, :2] @ corner - corner
+        warp[:, 2] += warp[:, :2] @ np.array(corner) - np.array(corner)
         return pair.estimate(warp)
 
 

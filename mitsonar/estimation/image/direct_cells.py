@@ -121,7 +121,9 @@ class Cells:
         radius, bearing = other.to_polar(moved(ground.points, motion))
         grid = self.grid
         nodes = np.stack([radius - grid.node_range[:, None], bearing - grid.node_bearing])
-        return self._on_all(nodes[:, self.from_node[0], self.from_node[1]].astype(np.float32))
+        # a cell that meets level ground may not meet ground that lies lower
+        row, column = nearest_known(np.isfinite(nodes).all(axis=0)) if lift_m else self.from_node
+        return self._on_all(nodes[:, row, column].astype(np.float32))
 
     def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
         """Return the derivative of :meth:`shift` by the height [1/m], to first order in the motion."""

@@ -99,8 +99,7 @@ def _held(scale: float, unknowns: int, heave_std_m: float) -> NDArray[np.float64
 class _Side(NamedTuple):
     """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion.
 
-    ``curvature`` is the derivative of weight times residual by the residual. Outliers, whose weight falls as they grow, have
-    a negative one: a motion that the weights hold is known less well than the sum of the weights says.
+    ``weight`` is that of single cells, ``blocks`` that of the block of each; None: all 1.
     """
 
     before: Floats
@@ -109,8 +108,18 @@ class _Side(NamedTuple):
     slopes: tuple[Floats, Floats]
     residual: Floats
     jacobian: Floats
-    curvature: Floats
+    weight: Floats
+    blocks: Floats | None
     weighted: Floats
+
+    def curvature(self) -> Floats:
+        """Return the derivative of weight times residual by the residual ``(cells,)``.
+
+        Outliers, whose weight falls as they grow, have a negative one: a motion that the weights hold is known less well
+        than the sum of the weights says.
+        """
+        alone = self.weight * (2 * self.weight - 1)
+        return alone if self.blocks is None else alone * self.blocks
 
     def sums(self, values: Floats) -> NDArray[np.float64]:
         """Sum maps ``(maps, cells)`` over blocks of the whole frame ``(maps, blocks)``."""
@@ -150,12 +159,10 @@ def _linearised(
     for (before, after, inner), residual in zip(pairs, residuals, strict=True):
         slopes = slopes_of((before + after) * np.float32(0.5), level, scale)
         weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
-        curvature = weight * (2 * weight - 1)
-        if last:
-            blocks = _block_weight(slopes, residual, weight, inner)
-            weight, curvature = weight * blocks, curvature * blocks
+        blocks = _block_weight(slopes, residual, weight, inner) if last else None
         jacobian = cells.along(slopes, inner)
-        sides.append(_Side(before, after, inner, slopes, residual, jacobian, curvature, jacobian * weight))
+        weighted = jacobian * (weight if blocks is None else weight * blocks)
+        sides.append(_Side(before, after, inner, slopes, residual, jacobian, weight, blocks, weighted))
     normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
     pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
     return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
@@ -231,7 +238,10 @@ def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
 def _singular(normal: NDArray[np.float64]) -> bool:
     """Return whether some motion changes nothing."""
     size = np.sqrt(np.diag(normal))
-    return not (size > 0).all() or np.linalg.cond(normal / np.outer(size, size)) > 1e8
+    if not (size > 0).all():
+        return True
+    stretch = np.linalg.eigvalsh(normal / np.outer(size, size))
+    return bool(stretch[-1] > 1e8 * stretch[0])
 
 
 def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
@@ -239,7 +249,7 @@ def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]
     independent."""
     frames = (side.before, side.after)
     one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
-    product = ((one * side.curvature) @ other.T).astype(np.float64)
+    product = ((one * side.curvature()) @ other.T).astype(np.float64)
     return (product + product.T) / 2
 
 

@@ -169,7 +169,7 @@ class _ReliefLevel:
         inside = (row >= 1) & (row <= bins - 2) & (column >= 1) & (column <= beams - 2)
         inside[: max(1, self.cells.usable.start)] = False
         inside[-1], inside[:, 0], inside[:, -1] = False, False, False
-        return inside if self.cells.seen is None else inside & (self.cells.seen > 0)
+        return inside if self.cells.seen is None else np.asarray(inside & (self.cells.seen > 0), dtype=np.bool_)
 
 
 def registered_over_relief(
@@ -197,8 +197,10 @@ def registered_over_relief(
         heights, shape = at.mean.copy() if heights is None else np.asarray(heights), at.blocks
         for _ in range(level.iterations):
             found = at.equations(v, heights)
-            normal, pull = (None, None) if found is None else found.without_heights(prior, heights - at.mean)
-            if found is None or normal is None or np.linalg.eigvalsh(normal)[0] <= 0:
+            if found is None:
+                return None
+            normal, pull = found.without_heights(prior, heights - at.mean)
+            if np.linalg.eigvalsh(normal)[0] <= 0:
                 return None
             step = -np.linalg.solve(normal, pull)
             held = found.height + found.noise * prior
@@ -220,7 +222,8 @@ def _assessed(found: _Equations, prior: float, level: DirectLevel, *, converged:
     alike = 4 * np.pi * max(level.smoothing[0], 0.28) * max(level.smoothing[1], 0.28)
     return Fit(
         converged=converged,
-        covariance=found.noise * undone,
+        # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
+        covariance=np.asarray(found.noise * (undone + undone.T) / 2, dtype=np.float64),
         by_height=undone @ (found.both @ (held / (found.height + held))),
         correlation=found.correlation,
         independent=found.cells / alike,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -129,7 +130,10 @@ class ImageNetwork(Trained):
         elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
         if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
             return found  # a motion nearby has been looked for
-        return _judged(self._from(frames, images, ground, elsewhere.motion), prior, "phase", attitude)
+        second = self._from(frames, images, ground, elsewhere.motion)
+        if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
+            second = self._from(frames, images, ground, second.motion)
+        return _judged(second, prior, "phase", attitude)
 
     def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
         """Estimate the motion from a start of the network's iterations; None: no motion."""
@@ -160,7 +164,10 @@ class ImageNetwork(Trained):
         inputs = self._arrangement(frames)({view: torch.from_numpy(np.stack(images)[None])}, torch.arange(2)[None], 0)
         if not ground:
             return answer_of(self._network, inputs)
-        return answer_of(self._network, (inputs, ground) if start is None else (inputs, ground, torch.tensor([start])))
+        image = cast(Tensor, inputs)  # networks that are given the ground read one image
+        if start is None:
+            return answer_of(self._network, (image, ground))
+        return answer_of(self._network, (image, ground, torch.tensor([start], dtype=torch.float32)))
 
     def _arrangement(self, frames: SonarFrames) -> Arrangement:
         """From the frames to the network's input."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mitsonar.errors import MitsonarError
+from mitsonar.estimation.external.cfar_gicp import CfarGicp
 from mitsonar.estimation.external.ground_pair import ground_pair
 from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator, estimator_from
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
@@ -83,7 +84,7 @@ def test_a_prior_begins_the_registration_of_points(ground: NDArray[np.float64]) 
     """A motion of 0.8 m lies beyond the neighbours of a point; from a prior nearby it is found."""
     pytest.importorskip("small_gicp")
     far = Motion(0.0, 0.8, 0.0)
-    estimator, frames = create_estimator("cfar-gicp"), pair(ground, far)
+    estimator, frames = CfarGicp(), pair(ground, far)
     prior = MotionPrior(Motion(0.02, 0.78, 0.0), np.eye(3))
     assert abs(estimator.estimate(frames).motion.forward - 0.8) > 0.1
     assert abs(estimator.estimate(frames, prior=prior).motion.forward - 0.8) < 0.02

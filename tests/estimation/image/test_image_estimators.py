@@ -107,12 +107,10 @@ def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, size: fl
     motion = np.zeros(3)
     motion[axis] = size * np.array([0.02, 0.02, np.radians(0.4)])[axis]
     found = create_estimator(method).estimate(pair(Motion(*motion)))
-    if method in TRAINED and abs(size) > 1:  # beyond what it has learnt
-        assert not found.valid
-        return
     error = (np.array(found.motion) - motion) * UNITS
     assert found.valid, found.reason
-    assert (np.abs(error) < ALLOWED[method]).all(), f"mm, mm, deg: {error}"
+    beyond = 3 if method in TRAINED and abs(size) > 1 else 1  # beyond what it has learnt: phase finds where it starts
+    assert (np.abs(error) < beyond * np.array(ALLOWED[method])).all(), f"mm, mm, deg: {error}"
 
 
 @pytest.mark.parametrize("method", METHODS)

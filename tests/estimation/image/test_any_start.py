@@ -1,0 +1,151 @@
+"""Motions far from zero: found by phase or from a prior, over relief, and held against what was expected."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.image.direct import Direct, is_far
+from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
+from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.estimation.prior_gate import prior_rejection
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.composition import Motion, compose
+from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.scene import load_scene
+from mitsonar.worlds.rocky_field import RockyField
+
+pytestmark = pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
+
+START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)
+UNITS = np.array([1e3, 1e3, 180 / np.pi])
+FAR = Motion(0.2, -0.18, np.radians(4.5))
+ALLOWED = np.array([12.0, 8.0, 0.25])
+"""Errors over relief in mm, mm, deg: 4 % of the steps, since dense rocks hide the floor and the first echoes err by 3 %."""
+
+METHODS = ["direct", pytest.param("corrnet", marks=pytest.mark.learn)]
+
+
+@pytest.fixture(scope="module")
+def rocks(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Simulator:
+    """A dense rocky field."""
+    folder = tmp_path_factory.mktemp("far rocks") / "world"
+    scene = load_scene(RockyField(size_m=16, a_side=(32, 32)).build(3).write(folder))
+    return Simulator(scene, Sonar(rays_per_beam=300, rays_across=4))
+
+
+@pytest.fixture(scope="module")
+def far(rocks: Simulator) -> SonarFrames:
+    """Two frames, 270 mm and 4.5 deg apart."""
+    return two(rocks, FAR)
+
+
+def two(simulator: Simulator, motion: Motion) -> SonarFrames:
+    """Two frames, the motion apart."""
+    poses = Trajectory(np.array([START, compose(START, motion)]), np.array([0.0, 0.1]))
+    return simulator.render(poses, noise=NOISE_MODELS["none"], seed=3)
+
+
+def expected(motion: Motion, *, mm: float, deg: float) -> MotionPrior:
+    return MotionPrior(motion, np.diag([mm / 1e3, mm / 1e3, np.radians(deg)]) ** 2)
+
+
+def off(found: Estimate, motion: Motion) -> NDArray[np.float64]:
+    return np.asarray(np.abs(np.array(found.motion) - np.array(motion)) * UNITS, dtype=np.float64)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("method", METHODS)
+def test_far_motions_are_found_without_a_prior(far: SonarFrames, method: str) -> None:
+    """Beyond the search from no motion; the covariance holds."""
+    found = create_estimator(method).estimate(far)
+    assert found.valid, found.reason
+    assert found.about["start"] == "phase"
+    assert (off(found, FAR) < ALLOWED).all(), f"mm, mm, deg: {off(found, FAR)}"
+    assert found.covariance is not None
+    assert (off(found, FAR) < 4 * np.sqrt(np.diag(found.covariance)) * UNITS).all()
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("method", METHODS)
+def test_a_prior_is_where_it_starts(far: SonarFrames, method: str) -> None:
+    """A prior that is 10 mm and 0.3 deg off, and says so."""
+    told = Motion(FAR.sideways + 0.01, FAR.forward - 0.01, FAR.yaw + np.radians(0.3))
+    found = create_estimator(method).estimate(far, expected(told, mm=10, deg=0.3))
+    assert found.valid, found.reason
+    assert found.about["start"] == "prior"
+    assert (off(found, FAR) < ALLOWED).all(), f"mm, mm, deg: {off(found, FAR)}"
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("method", METHODS)
+def test_a_wrong_prior_rejects(far: SonarFrames, method: str) -> None:
+    """One that is sure of no motion: nothing is looked for elsewhere, and nothing is believed."""
+    found = create_estimator(method).estimate(far, expected(Motion(0.0, 0.0, 0.0), mm=2, deg=0.1))
+    assert not found.valid
+    assert found.reason
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_wide_prior_does_not_bar_the_search(far: SonarFrames) -> None:
+    """A prior of half a metre tells nothing: phase finds the start."""
+    found = Direct().estimate(far, expected(Motion(0.0, 0.0, 0.0), mm=500, deg=10))
+    assert found.valid, found.reason
+    assert found.about["start"] == "phase"
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_near_motion_with_a_prior_is_that_without(rocks: Simulator) -> None:
+    """The prior only chooses start and levels: at the finest level both end at one motion."""
+    motion = Motion(0.015, -0.012, np.radians(0.4))
+    frames = two(rocks, motion)
+    alone, told = Direct().estimate(frames), Direct().estimate(frames, expected(motion, mm=1, deg=0.05))
+    assert alone.about["start"] == "zero"
+    assert told.valid, told.reason
+    assert (off(told, alone.motion) < [0.1, 0.1, 0.003]).all()
+
+
+@pytest.mark.usefixtures("variant")
+def test_swapped_far_frames_tell_the_opposite_motion(far: SonarFrames) -> None:
+    """Two ways to one number: relief is drawn in the first frame, and the way back has another first frame."""
+    there, back = (Direct().estimate(frames) for frames in (far, far.select(np.array([1, 0]))))
+    home = compose(compose(Pose(0, 0, 0), there.motion), back.motion)
+    assert (np.abs(home[:2]) < 5e-3).all()
+    assert abs(home.heading) < np.radians(0.15)
+
+
+def test_the_prior_gate_is_chi_square() -> None:
+    """Three numbers, each 2.7 standard deviations off, are 21.9 of chi-square; 2.6 are 20.3."""
+    prior = expected(Motion(0.1, 0.0, 0.0), mm=3, deg=0.3)
+    own = np.diag([0.004, 0.004, np.radians(0.4)]) ** 2
+    for times, rejected in ((2.6, False), (2.7, True)):
+        apart = times * np.array([0.005, 0.005, np.radians(0.5)])
+        motion = Motion(0.1 + apart[0], apart[1], apart[2])
+        assert bool(prior_rejection(motion, own, prior)) == rejected
+    assert "4.7 standard deviations" in prior_rejection(motion, own, prior)
+    assert not prior_rejection(motion, own, None)
+
+
+def test_far_is_by_height_and_turn() -> None:
+    assert not is_far(Motion(0.03, 0.03, 0.02), 2.5)
+    assert is_far(Motion(0.03, 0.03, 0.02), 2.0)
+    assert is_far(Motion(0.0, 0.0, -0.03), 2.5)
+
+
+def test_sums_over_blocks_and_values_on_cells() -> None:
+    """The rest belongs to the last block; a plane comes back as it was between the middles of blocks."""
+    maps = np.random.default_rng(0).normal(size=(2, 11, 7))
+    assert cell_blocks(maps.shape, (4, 3)) == (2, 2)
+    sums = by_block(maps, (4, 3)).reshape(2, 2, 2)
+    assert sums[1, 1, 0] == pytest.approx(maps[1, 4:, :3].sum())
+    middles = np.add.outer(np.arange(3) * 4 + 1.5, 2.0 * (np.arange(4) * 2 + 0.5))
+    cells = on_cells(middles, (12, 8), (4, 2))
+    plane = np.add.outer(np.arange(12.0), 2.0 * np.arange(8))
+    assert np.allclose(cells[2:10, 1:7], plane[2:10, 1:7], atol=1e-4)
