@@ -71,7 +71,7 @@ class Observations(NamedTuple):
 
     def take(self, index: Index | NDArray[np.bool_]) -> Observations:
         """Return some of the observations."""
-        return Observations(*(values[index] for values in self))
+        return Observations(self.view[index], self.landmark[index], self.polar[index], self.covariance[index])
 
 
 class Adjusted(NamedTuple):
@@ -141,7 +141,7 @@ def adjusted(
         blocks = _normal_equations(found, held, place, seen, bearing)
         _add_heights(blocks, place[:, 2], relief_m)
         _add_attitudes(blocks, found[held:], told[held:], attitude_std)
-        inverse = np.linalg.inv(blocks.landmarks)
+        inverse = np.asarray(np.linalg.inv(blocks.landmarks), dtype=np.float64)
         crossed = _crossed(blocks.between, inverse)
         reduced = blocks.poses - crossed @ blocks.between.T
         factor = cho_factor(reduced)

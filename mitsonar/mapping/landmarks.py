@@ -27,6 +27,9 @@ LEAST_ALIKE = 0.75
 FARTHEST = np.array([8.0, 2.5])
 """Least correlation of a patch that was found, and how far from where it was looked for [bins, beams]."""
 
+EDGE = np.array([9.0, 2.4])
+"""Distance from the edge of the frame at which landmarks are looked for [bins, beams]."""
+
 STALE = 0.92
 """Correlation below which a patch is cut anew."""
 
@@ -79,7 +82,7 @@ class Found(NamedTuple):
 
     def take(self, index: Index | NDArray[np.bool_]) -> Found:
         """Return some of them."""
-        return Found(*(values[index] for values in self))
+        return Found(self.landmark[index], self.polar[index], self.covariance[index], self.correlation[index])
 
 
 def _empty(*shape: int) -> Array:
@@ -139,11 +142,12 @@ class Landmarks:
 
     @property
     def _middle(self) -> Array:
-        return (np.array([len(self.axes.range_m), len(self.axes.bearing_rad)]) - 1) / 2
+        size = [len(self.axes.range_m), len(self.axes.bearing_rad)]
+        return np.asarray((np.array(size, dtype=np.float64) - 1) / 2)
 
     @property
     def _half(self) -> Array:
-        return self._middle - np.array([9.0, 2.4])
+        return np.asarray(self._middle - EDGE)
 
     def observe(self, keyframe: int, found: Found) -> None:
         """Keep what a keyframe shows; give up landmarks that it misses again."""

@@ -333,5 +333,6 @@ def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose:
         return replace(estimate, about=about)
     turn = np.eye(3)
     turn[:2, :2] = level_turn(float(pose[5]))
-    covariance = turn @ drift @ turn.T
-    return Estimate(Motion(*motion.tolist()), (covariance + covariance.T) / 2, True, "", {"map": USED})
+    # its parts beside the diagonal are those of a whole window, in which a turn displaces the end: not of one motion
+    covariance = np.diag(np.diagonal(turn @ drift @ turn.T))
+    return Estimate(Motion(*motion.tolist()), covariance, True, "", {"map": USED})

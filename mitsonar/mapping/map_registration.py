@@ -104,7 +104,7 @@ def _residuals(landmarks: Landmarks, found: Found, pose: Array, predicted: Array
     spread = found.covariance + projected.by_point @ covariance @ projected.by_point.transpose(0, 2, 1)
     if predicted is not None:
         spread = spread + by_pose @ predicted @ by_pose.transpose(0, 2, 1)
-    inverse = np.linalg.inv(spread)
+    inverse = np.asarray(np.linalg.inv(spread), dtype=np.float64)
     return _Residuals(error, inverse, np.einsum("ni,nij,nj->n", error, inverse, error), by_pose)
 
 

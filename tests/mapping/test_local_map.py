@@ -74,7 +74,9 @@ def _drawn(cells: NDArray[np.float64], bright: NDArray[np.float32]) -> NDArray[n
 
 def wrong_estimates() -> list[Estimate]:
     """Return motions that are wrong in one way, with covariances that believe them to half of that."""
-    true = motions(run().poses)
+    poses = run().poses
+    assert poses is not None
+    true = motions(poses)
     wrong = true * [1, WRONG[1], 1] + [0, 0, WRONG[2]]
     return [Estimate(Motion(*one.tolist()), np.diag([3e-4, 3e-4, 3e-4]) ** 2) for one in wrong]
 
