@@ -122,7 +122,7 @@ class Cells:
         grid = self.grid
         nodes = np.stack([radius - grid.node_range[:, None], bearing - grid.node_bearing])
         # a cell that meets level ground may not meet ground that lies lower
-        row, column = nearest_known(np.isfinite(nodes).all(axis=0)) if lift_m else self.from_node
+        row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0))) if lift_m else self.from_node
         return self._on_all(nodes[:, row, column].astype(np.float32))
 
     def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
