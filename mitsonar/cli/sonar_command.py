@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -14,6 +14,7 @@ from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
 
 if TYPE_CHECKING:
+    from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["fit", "from_recording", "sonars"]
@@ -52,7 +53,8 @@ def fit(
     from mitsonar.records.sonar_frames import SonarFrames
 
     refuse_to_replace(out, overwrite=overwrite)
-    _fit_and_write(SonarFrames.load(frames), sonar, changes, out, measure_coding=measure_coding)
+    told = _told(sonar, changes)
+    _fit_and_write(SonarFrames.load(frames), told, out, measure_coding=measure_coding)
 
 
 @answered
@@ -89,16 +91,30 @@ def from_recording(
     for path in (out, noise):
         if path is not None:
             refuse_to_replace(path, overwrite=overwrite)
+    told = _told(sonar, changes)
     source = open_frames(file, sequence=part, view=topic, geometry=geometry)
     first = max(0, (len(source) - frames) // 2)
     chosen, notes = as_instrument(source.read(range(first, min(first + frames, len(source)))))
-    _fit_and_write(chosen, sonar, changes, out, noise, notes, measure_coding=measure_coding)
+    _fit_and_write(chosen, told, out, noise, notes, measure_coding=measure_coding)
+
+
+class _Told(NamedTuple):
+    """A sonar that fitting starts from, and fields that are known."""
+
+    sonar: Sonar | None
+    fields: dict[str, Any]  # pairs of a command line, which the sonar checks
+
+
+def _told(sonar: str | None, changes: list[str] | None) -> _Told:
+    """Return what the user tells: faults of it are reported before frames are read."""
+    from mitsonar.instruments.named_sonars import load_sonar
+
+    return _Told(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
 
 
 def _fit_and_write(
     frames: SonarFrames,
-    sonar: str | None,
-    changes: list[str] | None,
+    told: _Told,
     out: Path,
     noise: Path | None = None,
     notes: Sequence[str] = (),
@@ -108,10 +124,8 @@ def _fit_and_write(
     """Fit a sonar to frames, write it to OUT, or its noise to another file, and say what was found."""
     from mitsonar.estimation.recorded_sonar import NOISE_FIELDS
     from mitsonar.estimation.sonar_fit import fit_sonar
-    from mitsonar.instruments.named_sonars import load_sonar
 
-    base = None if sonar is None else load_sonar(sonar)
-    found = fit_sonar(frames, base, measure_coding=measure_coding, **changes_of(changes or [], None))
+    found = fit_sonar(frames, told.sonar, measure_coding=measure_coding, **told.fields)
     if noise is None:
         write_whole(out, found.yaml().encode())
     else:

@@ -861,7 +861,7 @@ def test_a_journal_that_never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     make_odometry(tmp_path)
     (tmp_path / "estimates.jsonl").unlink()
     (tmp_path / "estimates.jsonl").symlink_to("/dev/zero")
-    monkeypatch.setattr("mitsonar.mapping.odometry_run.LARGEST_JOURNAL", 1000)
+    monkeypatch.setattr("mitsonar.mapping.estimate_journal.LARGEST_JOURNAL", 1000)
     assert "larger than 1,000 bytes" in refusal(lambda: read_odometry(tmp_path))
 
 
