@@ -162,6 +162,7 @@ def test_a_name_that_is_near_none_is_not_guessed() -> None:
 # ---------------------------------------------------------------- commands that can be pasted
 
 
+@pytest.mark.thorough
 def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> None:
     """A folder with a space, a quote and a dollar sign."""
     folder = tmp_path / "my world's $5"

@@ -749,6 +749,7 @@ def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> 
     assert objects_of(url) == files_of(made)
 
 
+@pytest.mark.thorough
 def test_object_storage_holds_the_bytes_of_a_folder(made: Path, bucket: str) -> None:
     """Made there; a shard that is cut short is found and remade; read from there."""
     url = f"{bucket}/data/tiny.zarr"

@@ -166,6 +166,7 @@ def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
     np.testing.assert_allclose(found.columns([18])[17, :, 0], following[17], rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_errors_over_covariances_are_one_by_draws() -> None:
     """60 draws of the whole model; the mean of 60 chi-squares of three, a third, scatters by 11 %."""
     normalised = []

@@ -149,6 +149,7 @@ def sheet(attribute: str, centre: float = 0.0) -> mi.Mesh:
     return mesh
 
 
+@pytest.mark.thorough
 def test_attributes_of_a_mesh_from_above_and_below() -> None:
     """By face (in the table) and by vertex (asked); the geometric normal counts, not the smooth one."""
     loaded = scene(by_face=sheet("face_reflectivity", -1), by_vertex=sheet("vertex_reflectivity", 1))  # type: ignore[arg-type]

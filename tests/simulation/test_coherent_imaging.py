@@ -144,6 +144,7 @@ def test_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert 10 * math.log10(made / truth) == pytest.approx(0, abs=0.2)
 
 
+@pytest.mark.thorough
 def test_a_sphere_has_the_energy_of_lambert(variant: str) -> None:
     """Of a body that curves: 0.2 dB of the physical model, whose sphere is exact within 0.03 dB."""
     loaded = scene(ball=sphere((0, 4.4, 0), 0.3, diffuse(0.5)))

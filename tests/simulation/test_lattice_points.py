@@ -76,6 +76,7 @@ def test_each_cell_has_one_point_on_the_surface(name: str) -> None:
         assert np.linalg.norm(made.place, axis=1) == pytest.approx(np.full(len(side), 0.8), abs=1e-5)
 
 
+@pytest.mark.thorough
 def test_points_follow_from_seed_and_shape() -> None:
     one, again = found(sphere((0, 0, 0), 0.3)), found(sphere((0, 0, 0), 0.3))
     assert all(np.array_equal(a, b) for a, b in zip(one, again, strict=True))

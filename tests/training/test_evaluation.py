@@ -567,6 +567,7 @@ def test_the_geometry_goes_into_onnx(geometric: Checkpoint, made: Path) -> None:
             assert np.abs(got - want.numpy()).max() < 1e-4 * np.abs(want.numpy()).max()
 
 
+@pytest.mark.thorough
 def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = trained_like("posenet")
     checkpoint.save(tmp_path / "network.ckpt")

@@ -177,6 +177,7 @@ def test_many_pings(name: str) -> None:
     assert np.abs(error).max() < 2.0, error
 
 
+@pytest.mark.thorough
 def test_covariance_tells_how_far_off() -> None:
     answer = Likelihood(speed=SPEED).estimate(pair(MOTIONS[1], seed=1, noise=1e-4))
     error = (np.array(answer.motion) - MOTIONS[1])[:2]

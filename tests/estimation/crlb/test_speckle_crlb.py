@@ -203,6 +203,7 @@ def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
         cramer_rao_bound(simulator, np.array(POSE), NOISE_MODELS["none"], 1e-3, law="rays")
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_commands_answer_coherent_data_sets(tmp_path: Path, mitsonar: Command) -> None:
     """`crlb` says which laws it used, and `compare` divides by the last of them."""

@@ -420,6 +420,7 @@ def test_a_network_of_views_needs_a_data_set_that_holds_them(
 # ---------------------------------------------------------------- the shipped one
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", essence(["coherent", "physical"], "physical"))
 def test_the_shipped_profilenet_knows_unseen_fields(tmp_path: Path, model: str) -> None:
     """Twelve pairs of a field that training has not seen: far better than no motion in both models."""
