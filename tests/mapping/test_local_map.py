@@ -15,6 +15,7 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.sonar_projection import Views, polar_of
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.mapping import local_map
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.landmarks import ImageAxes
 from mitsonar.mapping.local_map import mapped
@@ -30,8 +31,8 @@ WRONG = np.array([0.0, 0.97, np.radians(0.03)])
 """What is wrong with the motions between two frames: too short by 3 %, and a turn of 0.03 deg each."""
 
 
-@lru_cache(maxsize=1)
-def run() -> SonarFrames:
+@lru_cache(maxsize=2)
+def run(heave_m: float = 0.0) -> SonarFrames:
     """Return frames of a path straight on over bright points: half on the ground, half on a relief of 0.25 m."""
     rng = np.random.default_rng(7)
     points = np.column_stack([rng.uniform(-2, 2, 9000), rng.uniform(1, 8, 9000), rng.exponential(0.25, 9000)])
@@ -42,6 +43,7 @@ def run() -> SonarFrames:
     )
     poses = np.zeros((FRAMES, 6))
     poses[:, 1], poses[:, 2], poses[:, 3] = STEP_M * np.arange(FRAMES), 2.5, np.radians(35)
+    poses[:, 2] += heave_m * np.sin(np.arange(FRAMES) / 4)
     ranges, bearings = sonar.range_m, sonar.bearing_rad
     axes, images = ImageAxes(ranges, bearings, "cone"), []
     for pose in poses:
@@ -100,6 +102,17 @@ def test_the_map_takes_out_what_pairs_of_frames_get_wrong() -> None:
     assert abs(error[0]) < 0.01 * length
     covariance = pose_covariances(series, start)[-1]
     assert 1e-4 < np.sqrt(covariance[0, 0]) < 0.02
+
+
+def test_heave_that_no_sensor_tells_is_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = run(0.012)
+    blind = FrameSource.of(replace(frames, poses=None)).with_geometry(pitch_rad=np.radians(35))
+    errors = []
+    for std in (local_map.ROUGH_STD, local_map.ATTITUDE_STD):
+        monkeypatch.setattr(local_map, "ROUGH_STD", std)
+        found = mapped(blind, np.arange(FRAMES), wrong_estimates())
+        errors.append(abs(sum(one.motion.forward for one in found) - STEP_M * (FRAMES - 1)))
+    assert errors[0] < 0.3 * errors[1], "heave changes the length of the path where it is not estimated"
 
 
 def test_the_answer_is_a_function_of_frames_and_estimates() -> None:
