@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
@@ -118,7 +119,7 @@ def _messages(bag: BagFile, topic: Topic) -> Iterator[Message]:
 
 def _up(frame: object) -> float:
     """Return 1 where the axes of a frame are forward, port, up; -1 where they are forward, starboard, down."""
-    return -1.0 if str(frame).lower().endswith(DOWN) else 1.0
+    return -1.0 if re.split("[_/]", str(frame).lower())[-1] in DOWN else 1.0
 
 
 def _seconds(message: Message) -> float:

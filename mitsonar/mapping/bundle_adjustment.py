@@ -116,6 +116,7 @@ def track_weight(faults: Array) -> Array:
 def adjusted(
     poses: Array,
     held: int,
+    told: Array,
     attitude_std: Array,
     points: Array,
     seen: Observations,
@@ -125,8 +126,9 @@ def adjusted(
     """Adjust poses and landmarks.
 
     Args:
-        poses: ``(k, 6)`` [m, rad]. Their heights, pitches and rolls are what sensors tell.
+        poses: ``(k, 6)`` [m, rad].
         held: so many poses from the first stay as they are.
+        told: heights [m], pitches and rolls [rad] of the others, as sensors tell them ``(k - held, 3)``.
         attitude_std: standard deviations of these heights [m], pitches and rolls [rad] ``(3,)``.
         points: of the landmarks ``(l, 3)``, in metres over the ground.
         seen: observations of them.
@@ -136,11 +138,11 @@ def adjusted(
     Raises:
         LinAlgError: observations that do not suffice.
     """
-    told, found, place = poses, poses.copy(), points.copy()
+    found, place = poses.copy(), points.copy()
     for _ in range(ROUNDS):
         blocks = _normal_equations(found, held, place, seen, bearing)
         _add_heights(blocks, place[:, 2], relief_m)
-        _add_attitudes(blocks, found[held:], told[held:], attitude_std)
+        _add_attitudes(blocks, found[held:, 2:5], told, attitude_std)
         inverse = np.asarray(np.linalg.inv(blocks.landmarks), dtype=np.float64)
         crossed = _crossed(blocks.between, inverse)
         reduced = blocks.poses - crossed @ blocks.between.T
@@ -200,12 +202,12 @@ def _add_heights(blocks: _Blocks, height: Array, relief_m: float) -> None:
     blocks.landmark_pull[:, 2] += mean * (relief_m - height) - law * height
 
 
-def _add_attitudes(blocks: _Blocks, poses: Array, told: Array, std: Array) -> None:
-    """Hold heights, pitches and rolls to what sensors tell."""
-    information = np.zeros(6)
-    information[2:5] = 1 / std**2
-    blocks.poses[np.diag_indices(len(blocks.poses))] += np.tile(information, len(poses))
-    blocks.pull[:] += (information * (told - poses)).ravel()
+def _add_attitudes(blocks: _Blocks, attitudes: Array, told: Array, std: Array) -> None:
+    """Hold heights, pitches and rolls ``(poses, 3)`` to what sensors tell."""
+    information, off = np.zeros(6), np.zeros((len(told), 6))
+    information[2:5], off[:, 2:5] = 1 / std**2, told - attitudes
+    blocks.poses[np.diag_indices(len(blocks.poses))] += np.tile(information, len(told))
+    blocks.pull[:] += (information * off).ravel()
 
 
 def _summed(values: Array, group: Index, groups: int) -> Array:

@@ -29,6 +29,9 @@ Index = NDArray[np.intp]
 DEFAULT_REACH_M = 3.0
 """Horizontal distance to the ground that is seen, where it is not known [m]."""
 
+NOTHING = 1e-9
+"""Correlation of errors that do not depend on each other."""
+
 HALF_TOLD = 0.5
 """A sensor tells a component whose standard deviation is below this part of that of unknown ones."""
 
@@ -147,7 +150,12 @@ def graph_path(
     canvas = None if source is None else canvas_of(source)
     errors, reach = ErrorCorrelation(), DEFAULT_REACH_M if canvas is None else canvas.reach_m
     graph = _graph(measured, bridge, start, start_known, sensors)
-    graph = replace(graph, correlated=errors.of(graph.chain.motions, reach))
+    correlated = errors.of(graph.chain.motions, reach)
+    # motions left to the sensors say nothing of the errors of their neighbours
+    wide = np.diagonal(graph.chain.covariances, axis1=1, axis2=2) >= UNKNOWN_STD**2
+    left = np.asarray(wide.all(axis=1), dtype=bool)
+    onward = np.where(left[1:] | left[:-1], NOTHING, correlated.onward)
+    graph = replace(graph, correlated=correlated._replace(onward=onward))
     before = after = solved(graph)
     search = None
     if loops is not None:

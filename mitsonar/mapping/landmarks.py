@@ -255,15 +255,20 @@ class Landmarks:
             setattr(self, name, getattr(self, name)[keep])
         self.patches = self.patches.take(keep)
 
-    def holding(self, first_view: int, fewest: int) -> tuple[Index, Observations]:
+    def holding(self, first_view: int, fewest: int, born: int) -> tuple[Index, Observations]:
         """Return landmarks that hold the keyframes from ``first_view`` on: their numbers, and all observations of them.
+
+        Args:
+            first_view: of the keyframes.
+            fewest: keyframes that must show a landmark.
+            born: keyframe before which landmarks do not count: the map was begun anew there.
 
         In these observations landmarks are numbered in this order.
         """
         times = np.bincount(self.seen.landmark, minlength=len(self.points))
         shown = np.zeros(len(self.points), dtype=bool)
         shown[self.seen.landmark[self.seen.view >= first_view]] = True
-        number = np.flatnonzero(shown & (times >= fewest))
+        number = np.flatnonzero(shown & (times >= fewest) & (self.born >= born))
         place = np.full(len(self.points), -1)
         place[number] = np.arange(len(number))
         seen = self.seen.take(place[self.seen.landmark] >= 0)

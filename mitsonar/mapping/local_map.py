@@ -29,7 +29,7 @@ from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["USED", "mapped"]
+__all__ = ["USED", "map_attitudes", "mapped"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -90,6 +90,8 @@ class _Map:
         keyframes: their number among the frames.
         poses: of the keyframes ``(6,)`` each.
         relief_m: mean height of what is seen over the ground.
+        told: heights, pitches and rolls of the keyframes, as sensors tell them ``(3,)`` each.
+        begun: first keyframe since the map was begun anew.
         lean: height, pitch and roll of the last keyframe, less what was told ``(3,)``.
         drift: covariance of x, y, heading that each keyframe adds ``(3, 3)`` each.
     """
@@ -98,6 +100,8 @@ class _Map:
     attitude_std: Array
     keyframes: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
+    told: list[Array] = field(default_factory=list)
+    begun: int = 0
     relief_m: float = RELIEF_M
     lean: Array = field(default_factory=lambda: np.zeros(3))
     drift: list[Array] = field(default_factory=list)
@@ -125,16 +129,16 @@ def mapped(
         An estimate a motion; those that the map does not tell are as they were.
 
     Raises:
-        MitsonarError: no height over the ground.
+        MitsonarError: no height over the ground, or no pitch.
     """
-    attitudes, std = _attitudes(source, numbers)
+    attitudes, std = map_attitudes(source, numbers)
     state = _Map(Landmarks(_axes(source.like)), std)
     path, reasons = [attitudes[0]], [""]
     for k, (frames, image) in enumerate(_images(source, numbers)):
         expected = attitudes[0].copy() if k == 0 else _predicted(path[-1], estimates[k - 1], attitudes[k])
         expected[2:5] += state.lean
         answer = registered(state.landmarks, image, expected, _spread(estimates, k))
-        pose = _update(state, k, frames, image, answer)
+        pose = _update(state, k, frames, image, answer, attitudes[k])
         if k:
             path.append(pose)
             reasons.append(answer.reason)
@@ -152,8 +156,12 @@ def _axes(like: SonarFrames) -> ImageAxes:
     return ImageAxes(like.range_m, like.bearing_rad, like.sonar.bearing)
 
 
-def _attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
-    """Return height over the ground, pitch and roll of the frames, as poses ``(n, 6)``, and their standard deviations."""
+def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
+    """Return height over the ground, pitch and roll of the frames, as poses ``(n, 6)``, and their standard deviations.
+
+    Raises:
+        MitsonarError: no height over the ground, or no pitch.
+    """
     table = np.zeros((len(numbers), 6))
     heights = None if source.height_m is None else source.height_m[numbers]
     if heights is None or not np.isfinite(heights).any():
@@ -165,15 +173,22 @@ def _attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
     if source.poses is not None and np.isfinite(source.poses[numbers, 2:5]).all():
         poses = source.poses[numbers]
         # an altimeter over a rock tells less than the height over the ground
-        ground = float(np.percentile(poses[:, 2] - heights, 5))
-        table[:, 2:5] = poses[:, 2:5] - np.array([ground, 0, 0])
+        ground = percentile_filter(poses[:, 2] - heights, 5, size=min(HEIGHT_FRAMES, len(heights)), mode="nearest")
+        table[:, 2:5] = poses[:, 2:5]
+        table[:, 2] -= ground
         table[0, 5] = poses[0, 5]
         return table, ATTITUDE_STD
     table[:, 2] = percentile_filter(heights, 90, size=min(HEIGHT_FRAMES, len(heights)), mode="nearest")
     measured = None if source.attitude_rad is None else source.attitude_rad[numbers, :2]
-    table[:, 3] = source.pitch_rad or 0.0
-    if measured is not None and np.isfinite(measured).all():
+    if source.pitch_rad is not None:
+        table[:, 3] = source.pitch_rad
+    elif measured is not None and np.isfinite(measured).all():
         table[:, 3:5] = measured
+    else:
+        raise MitsonarError(
+            f"{source.name}: the local map needs the pitch of the sonar, and the frames tell none: give it, or "
+            "leave the map out"
+        )
     return table, ROUGH_STD
 
 
@@ -213,6 +228,7 @@ def _update(
     frames: SonarFrames,
     image: PatchImage,
     answer: Registered,
+    told: Array,
 ) -> Array:
     """Make a keyframe where the sonar has moved on, adjust the last ones, and return the pose of the frame."""
     if state.keyframes and not answer.reason and not _moved_on(state, answer):
@@ -220,8 +236,10 @@ def _update(
     number, landmarks = len(state.keyframes), state.landmarks
     if answer.reason:
         landmarks.give_up()
+        state.begun = number
     state.keyframes.append(frame)
     state.poses.append(answer.pose.copy())
+    state.told.append(told[2:5])
     state.drift.append(state.drift[-1] if state.drift else np.diag(PAIR_STD**2))
     good = answer.found.take(answer.squared < WORST)
     if number and not answer.reason:
@@ -249,9 +267,9 @@ def _moved_on(state: _Map, answer: Registered) -> bool:
 def _adjust(state: _Map) -> None:
     """Adjust the last keyframes and the landmarks that they show."""
     last, landmarks = len(state.poses), state.landmarks
-    first = max(1, last - WINDOW)
-    number, seen = landmarks.holding(first, FEWEST_VIEWS)
-    if len(number) < FEWEST:
+    first = max(state.begun + 1, last - WINDOW)
+    number, seen = landmarks.holding(first, FEWEST_VIEWS, state.begun)
+    if first >= last or len(number) < FEWEST:
         return
     oldest = int(seen.view.min())
     poses = np.array(state.poses[oldest:])
@@ -259,6 +277,7 @@ def _adjust(state: _Map) -> None:
         new = adjusted(
             poses,
             first - oldest,
+            np.array(state.told[first:]),
             state.attitude_std,
             landmarks.points[number],
             seen._replace(view=seen.view - oldest),
@@ -268,7 +287,7 @@ def _adjust(state: _Map) -> None:
     except LinAlgError:
         return  # the keyframes stay as they were registered
     landmarks.refine(number, new.points, new.point_covariance, new.faults)
-    state.lean += new.poses[-1, 2:5] - poses[-1, 2:5]
+    state.lean = new.poses[-1, 2:5] - state.told[-1]
     state.poses[first:] = list(new.poses[first - oldest :])
     state.drift[-1] = new.last_covariance / (last - first)
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry
@@ -88,12 +89,11 @@ class Canvas:
         return cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
 
     def draw(self, frame: SonarFrames) -> CoarseView | None:
-        """Draw one frame by its own height and attitude, without its light; None where it shows no ground.
-
-        Raises:
-            MitsonarError: no height or pitch.
-        """
-        own = attitude_of(frame, "a search for loops", None, None)
+        """Draw one frame by its own height and attitude, without its light; None where it is known to show none."""
+        try:
+            own = attitude_of(frame, "a search for loops", None, None)
+        except MitsonarError:
+            return None
         if own.reason:
             return None
         ground = GroundGeometry(

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.error_correlation import ErrorCorrelation
 from mitsonar.mapping.frame_source import FrameSource
@@ -136,7 +137,10 @@ def canvas_of(source: FrameSource) -> Canvas | None:
     """Return the ground before the sonar on which frames are compared; None where no frame is known to show any."""
     for number in np.unique(np.linspace(0, len(source) - 1, 5).astype(np.intp)):
         frame = source.read([number])
-        canvas = None if frame.poses is None else Canvas.of(frame)
+        try:
+            canvas = None if frame.poses is None else Canvas.of(frame)
+        except MitsonarError:  # no height
+            canvas = None
         if canvas is not None:
             return canvas
     return None

@@ -22,7 +22,7 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, graph_path
-from mitsonar.mapping.local_map import USED, mapped
+from mitsonar.mapping.local_map import USED, map_attitudes, mapped
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops
 from mitsonar.mapping.mode_continuity import continued
 from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
@@ -193,6 +193,8 @@ def odometry(
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     numbers = _frames_used(source, smooth, scale, every, closure)
     time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops, local_map)
+    if local_map and shown is not None:
+        map_attitudes(shown, numbers)  # what cannot work is refused before hours of estimating
     estimate = partial(estimate_motions, priors=None if sensors is None else sensors.priors(time_s))
     estimates = estimate(source, estimator, numbers, workers=workers, known=known, keep=keep, progress=progress)
     estimates = continued(estimates)

@@ -46,6 +46,7 @@ ODOMETRY = RunKind(
     notes={
         **{"source": str, "inputs": str, "smooth": str, "scale": str | None, "frame": str, "factors": list, "from": list},
         **{"not_believed": int, "warnings": list, "seconds": float, "pairs_in_these_seconds": int, "workers": int},
+        **{"closure": int, "loops": bool, "local_map": bool},
     },
     packages=("mitsonar", "numpy", "scipy", "opencv-python-headless"),
     deciding=("mitsonar",),
@@ -158,6 +159,8 @@ class OdometryFolder:
         write_whole(self.path / "covariances.npz", _covariances(found))
         if found.graph is not None and found.graph.search is not None:
             write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.kept).encode())
+        else:
+            (self.path / "loops.csv").unlink(missing_ok=True)  # of an earlier search
         rows = found.rows()
         write_whole(self.path / "table.md", ("\n".join(table_lines(rows)) + "\n").encode())
         table = [{"name": name, "value": value if np.isfinite(value) else None, "unit": unit} for name, value, unit in rows]
@@ -225,6 +228,7 @@ def run_odometry(
         **{"source": source.name, "inputs": estimator.inputs, "smooth": smooth, "scale": _named(scale), "frame": frame},
         **{**_found(found), "seconds": time.perf_counter() - begun},
         **{"pairs_in_these_seconds": len(found.estimates) - len(kept), "workers": workers},
+        **{"closure": closure, "loops": loops, "local_map": local_map},
     }
     folder.write(found, f"{Path(source.name).name}, {name}", settings)
     return found

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 UNKNOWN_STD = np.array([10.0, 10.0, np.pi])
 """Standard deviations of what a sensor does not tell of a motion [m, m, rad]."""
 
+LEAST_STD = 1e-12
+"""Least standard deviation of a reading: its inverse square must be a number."""
+
 LONGEST_GAP_S = 1.0
 """Time between two readings beyond which nothing is known in between, unless they are slower throughout."""
 
@@ -62,7 +65,7 @@ class Readings:
             raise MitsonarError(
                 f"times of readings must increase: got {self.time_s[where + 1]:g} s after {self.time_s[where]:g}"
             )
-        if not (self.std > 0).all():
+        if not (self.std >= LEAST_STD).all():
             raise MitsonarError(f"standard deviations of readings must be above 0: got {self.std.min():g}")
 
     @property

@@ -43,7 +43,7 @@ def observed(poses: Array, points: Array, bearing: Bearing, noise: float = 0.0, 
 def solved(poses: Array, points: Array, seen: Observations, bearing: Bearing) -> Adjusted:
     """Adjust until nothing moves."""
     for _ in range(6):
-        found = adjusted(poses, 1, STD, points, seen, bearing, 0.2)
+        found = adjusted(poses, 1, poses[1:, 2:5], STD, points, seen, bearing, 0.2)
         poses, points = found.poses, found.points
     return found
 

@@ -196,7 +196,7 @@ def align(image: PatchImage, patches: Patches, row: Array, column: Array) -> Ali
 def _tiles(table: NDArray[np.generic]) -> NDArray[np.generic]:
     """Return the cells of the grid as rows ``(cells, bins * beams of a cell)``."""
     rows, columns = (length // cell for length, cell in zip(table.shape, CELL, strict=True))
-    return table.reshape(rows, CELL[0], columns, CELL[1]).swapaxes(1, 2).reshape(rows * columns, -1)
+    return table.reshape(rows, CELL[0], columns, CELL[1]).swapaxes(1, 2).reshape(rows * columns, CELL[0] * CELL[1])
 
 
 def _sampled(image: Floats, row: Array, column: Array) -> Floats:
