@@ -73,7 +73,7 @@ ATTITUDE_STD = np.array([2e-4, np.radians(2e-3), np.radians(2e-3)])
 ROUGH_STD = np.array([0.01, np.radians(0.3), np.radians(0.3)])
 """The same where they are given for a whole run: heave and tilt are then estimated."""
 
-HEIGHT_FRAMES = 101
+HEIGHT_FRAMES = 401
 """Frames among which the greatest heights are those over the ground, not over a rock."""
 
 SAFETY = 8.0

@@ -147,17 +147,31 @@ class _ReliefLevel:
             by_bin, by_beam = slopes_of((before + after) * np.float32(0.5), self.level, scale)
             sign = np.float32(-1 if back else 1)
             jacobian = (by_bin * derivatives[:, 0] + by_beam * derivatives[:, 1]) * sign
-            sums.append(self._summed(jacobian, jacobian * weight, residual))
+            shown = self._places(level_shift) if back else None  # heights are those of the first frame's blocks
+            sums.append(self._summed(jacobian, jacobian * weight, residual, shown))
         by_motion, both, height = (np.sum([one[k] for one in map(_split, sums)], axis=0) for k in range(3))
         return _Equations(
             by_motion[:, :3], both, height[0], by_motion[:, 3], height[1], ALIKE * scale**2, correlation, count
         )
 
-    def _summed(self, jacobian: Floats, weighted: Floats, residual: Floats) -> NDArray[np.float64]:
-        """Return sums over blocks ``(18, blocks)``: motion by motion, motion by residual, height by all."""
+    def _summed(
+        self, jacobian: Floats, weighted: Floats, residual: Floats, shown: tuple[Floats, Floats] | None
+    ) -> NDArray[np.float64]:
+        """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all.
+
+        ``shown`` is the row and column of each cell in the frame of the blocks; None: that is this frame.
+        """
         pairs = [weighted[k] * other for k in range(3) for other in (*jacobian[:3], residual)]
         pairs += [weighted[3] * other for other in (*jacobian, residual)]
-        return by_block(np.stack(pairs), self.block)
+        if shown is None:
+            return by_block(np.stack(pairs), self.block)
+        place = [
+            np.clip(where // edge, 0, count - 1).astype(np.intp)
+            for where, edge, count in zip(shown, self.block, self.blocks, strict=True)
+        ]
+        number = (place[0] * self.blocks[1] + place[1]).ravel()
+        count = self.blocks[0] * self.blocks[1]
+        return np.stack([np.bincount(number, one.ravel(), minlength=count) for one in pairs])
 
     def _places(self, shift: Floats) -> tuple[Floats, Floats]:
         """Return rows and columns of displaced cells."""
