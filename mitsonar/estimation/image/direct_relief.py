@@ -154,7 +154,7 @@ class _ReliefLevel:
         )
 
     def _summed(self, jacobian: Floats, weighted: Floats, residual: Floats) -> NDArray[np.float64]:
-        """Return sums over blocks ``(18, blocks)``: motion by motion, motion by residual, height by all."""
+        """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all."""
         pairs = [weighted[k] * other for k in range(3) for other in (*jacobian[:3], residual)]
         pairs += [weighted[3] * other for other in (*jacobian, residual)]
         return by_block(np.stack(pairs), self.block)
