@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from bench_trajectories import machine
+from bench_trajectories import GYRO, machine
 from numpy.typing import NDArray
 from trajectory_jobs import COARSE, FIELD_M, FIELD_SEED, HEIGHT_M, PITCH_DEG, RECIPES
 
@@ -36,7 +36,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import normalised_errors
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import Odometry, odometry
-from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.mapping.simulated_sensors import simulated_sensors
 from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
@@ -45,8 +45,7 @@ from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 Array = NDArray[np.float64]
 
 RATE_HZ = 7.0
-GYRO = SensorNoise(gyro_deg_rth=1.0)
-"""Frames a second, and a gyroscope of 1 deg/h^0.5."""
+"""Frames a second."""
 
 
 @dataclass(frozen=True)

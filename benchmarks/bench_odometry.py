@@ -4,8 +4,7 @@
     python benchmarks/bench_odometry.py --quick           # six frames of one set, four methods, kept nowhere
 
 FOLDER holds the recordings of docs/guides/recordings.md (default: the variable MITSONAR_RECORDINGS; without it only
-simulated sets are run). A stopped benchmark goes on. The tables lie in OUT/simulated and OUT/recorded;
-docs/guides/benchmark.md shows them.
+simulated sets are run). A stopped benchmark goes on. The tables lie in OUT/simulated and OUT/recorded.
 """
 
 from __future__ import annotations

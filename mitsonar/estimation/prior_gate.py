@@ -29,7 +29,10 @@ def prior_rejection(motion: Motion, covariance: NDArray[np.float64] | None, prio
         return ""
     apart = np.array(motion) - np.array(prior.motion)
     together = prior.covariance if covariance is None else prior.covariance + covariance
-    square = float(apart @ np.linalg.lstsq(together, apart, rcond=None)[0])
+    std = np.sqrt(np.diag(together))
+    std[std == 0] = 1
+    scaled = apart / std  # else a component of large variance makes the solver drop the others
+    square = float(scaled @ np.linalg.lstsq(together / np.outer(std, std), scaled, rcond=None)[0])
     if square <= LARGEST_SQUARE:
         return ""
     sideways, forward, yaw = in_units(apart)

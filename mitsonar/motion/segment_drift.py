@@ -1,8 +1,8 @@
 """Drift over segments of a path, as the KITTI odometry benchmark defines it (Geiger et al., 2012), with intervals.
 
-Segments of given lengths begin at every so many frames. The error of a segment is the motion between its ends as estimated,
-seen from the true one: its distance over the length, and its angle over the length. The drift is the mean over all segments
-of all lengths. KITTI takes lengths of 100 to 800 m; a sonar's path is shorter.
+Segments of given lengths begin at every frame (KITTI: at every tenth). The error of a segment is the motion between its ends
+as estimated, seen from the true one: its distance over the length, and its angle over the length. The drift is the mean over
+all segments of all lengths. KITTI takes lengths of 100 to 800 m; a sonar's path is shorter.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ class Mesh:
 class Floor:
     """A square plane around the origin; ``texture`` is the XML of what gives its reflectivity.
 
-    It rises along +y by ``slope_deg``.
+    It rises along +y by ``slope_deg``, turned at height ``z_m`` about the line to starboard through the origin.
     """
 
     half_m: float
@@ -196,12 +196,12 @@ class Floor:
 
     def xml(self) -> str:
         """Return the XML of the shape."""
-        turn = f'<rotate x="1" angle="{self.slope_deg!r}"/>\n            ' if self.slope_deg else ""
+        turn = f'\n            <rotate x="1" angle="{self.slope_deg!r}"/>' if self.slope_deg else ""
         return f"""
     <shape type="rectangle" id="{self.name}">
         <transform name="to_world">
             <scale value="{self.half_m!r}"/>
-            {turn}<translate z="{self.z_m!r}"/>
+            <translate z="{self.z_m!r}"/>{turn}
         </transform>
         <bsdf type="diffuse">
             {self.texture}

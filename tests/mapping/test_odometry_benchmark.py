@@ -6,11 +6,13 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from drawn_frames import over_ground, sway
 from helpers import Command
+from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.named_estimators import create_estimator
@@ -28,7 +30,7 @@ from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.worlds.ship_hull import ShipHull
 from mitsonar.worlds.slope import sloped
-from mitsonar.worlds.world import World
+from mitsonar.worlds.world import Floor, World
 
 Row = dict[str, Any]
 
@@ -97,6 +99,23 @@ def test_a_slope_turns_all_of_a_world() -> None:
     assert tilted.floor is not None
     assert '<rotate x="1" angle="10.0"/>' in tilted.floor.xml()
     assert "rotate" not in level.floor.xml()
+
+
+def test_a_floor_off_the_origin_turns_as_meshes_do() -> None:
+    """Corners of the plane lie at its height above the turned level plane, by the order of the transforms."""
+    transform = ElementTree.fromstring(Floor(5.0, "<texture/>", z_m=0.7, slope_deg=10.0).xml()).find("transform")
+    assert transform is not None
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    for step in transform:
+        match step.tag:
+            case "scale":
+                corners *= float(step.attrib["value"])
+            case "translate":
+                corners[:, 2] += float(step.attrib["z"])
+            case "rotate":
+                corners = Rotation.from_euler("x", float(step.attrib["angle"]), degrees=True).apply(corners)
+    normal = np.array([0.0, -np.sin(np.radians(10)), np.cos(np.radians(10))])
+    np.testing.assert_allclose(corners @ normal, 0.7, atol=1e-12)
 
 
 @pytest.mark.usefixtures("variant")

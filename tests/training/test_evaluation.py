@@ -19,7 +19,7 @@ from helpers import Command, refused, run_python, tiny_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.composition import motions
+from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.motion_errors import in_units
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -184,6 +184,10 @@ def test_answers_beyond_the_box_are_invalid(made: Path, pairs: SonarPairs) -> No
     assert "not finite" in found.reason
     assert "forward -24.5 mm is beyond the motions of training, -20..20 mm" in (
         ImageNetwork(constant(own, [0.0, -0.0245, 0.0])).estimate(pairs.sonar_frames(2)).reason
+    )
+    network = ImageNetwork(constant(own))
+    assert "forward 24.5 mm, counted from the start, is beyond" in (
+        network._rejection_of_size(Motion(0.0, 0.1245, 0.0), Motion(0.0, 0.1, 0.0))
     )
 
 

@@ -6,8 +6,11 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from types import ModuleType
 from typing import Any
 
 from mitsonar.errors import MitsonarError
@@ -37,7 +40,7 @@ class PythonClass:
         path: ``my_module:MyEstimator``. The class is created without arguments.
 
     Raises:
-        MitsonarError: no such module or class, or one without ``estimate``.
+        MitsonarError: no such module or class, one without ``estimate``, or one that cannot be imported or created.
     """
 
     path: str
@@ -47,27 +50,46 @@ class PythonClass:
     digest = ""
 
     def __post_init__(self) -> None:
-        if not callable(self._made.estimate):
-            raise MitsonarError(f"{self.path}: estimate must be a method that takes two frames")
+        _ = self._folder, self._made
+
+    def __getstate__(self) -> dict[str, str]:
+        """Return what a worker needs to import the class again: an instance of it need not be picklable."""
+        return {"path": self.path, "_folder": self._folder}
+
+    @cached_property
+    def _folder(self) -> str:
+        """Return the folder that was current at first, where the module may lie."""
+        return os.getcwd()
 
     @cached_property
     def _made(self) -> AnyObject:
         """Return an instance of the class."""
         module, _, name = self.path.partition(":")
-        sys.path.insert(0, os.getcwd())
+        with _importable(self._folder):
+            found = vars(self._imported(module)).get(name)
+            if found is None:
+                raise MitsonarError(f"{self.path}: {module} has no {name}: give the name of a class in it")
+            try:
+                made = found()
+            except Exception as error:
+                raise MitsonarError(f"{self.path}: {name}() raises {_told(error)}: it must need no arguments") from error
         try:
-            made = vars(importlib.import_module(module))[name]()
-            _ = made.estimate
+            estimate = made.estimate
+        except AttributeError:
+            raise MitsonarError(f"{self.path} has no method estimate(frames), which returns an Estimate") from None
+        if not callable(estimate):
+            raise MitsonarError(f"{self.path}: estimate must be a method that takes two frames")
+        return made
+
+    def _imported(self, module: str) -> ModuleType:
+        """Return the module of that name."""
+        try:
+            return importlib.import_module(module)
         except ModuleNotFoundError as error:
             where = f"needs {error.name}, which is not installed" if error.name != module else "is no module here"
             raise MitsonarError(f"{self.path}: {module} {where}: start in its folder, or install it") from None
-        except KeyError:
-            raise MitsonarError(f"{self.path}: {module} has no {name}: give the name of a class in it") from None
-        except AttributeError:
-            raise MitsonarError(f"{self.path} has no method estimate(frames), which returns an Estimate") from None
-        finally:
-            sys.path.remove(os.getcwd())
-        return made
+        except Exception as error:
+            raise MitsonarError(f"{self.path}: {module} raises {_told(error)} when it is imported") from error
 
     def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion by the class, which is not handed the prior.
@@ -81,3 +103,18 @@ class PythonClass:
             return Estimate(motion, found.covariance, bool(found.valid), str(found.reason), found.about)
         except (AttributeError, TypeError):
             raise MitsonarError(f"{self.path}: estimate must return an Estimate: got {type(found).__name__}") from None
+
+
+@contextmanager
+def _importable(folder: str) -> Iterator[None]:
+    """Let modules of a folder be imported."""
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):  # a module may have changed the search path itself
+            sys.path.remove(folder)
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__} ({error})"

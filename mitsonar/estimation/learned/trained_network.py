@@ -222,7 +222,8 @@ class Trained:
         axis = int(beyond.argmax())
         value, low, high = in_units(np.array([off, coder.low, coder.high]))[:, axis]
         name, unit, _ = AXES[axis]
-        return f"{name} {value:.3g} {unit} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
+        since = "" if start is None else ", counted from the start,"
+        return f"{name} {value:.3g} {unit}{since} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
 
 
 def inputs_of(checkpoint: Checkpoint) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,12 +132,30 @@ class Bare:
 
 class Other:
     pass
+
+class Unpicklable(Fixed):
+    def __init__(self):
+        self.answer = lambda: None
+
+class KeyMissing(Fixed):
+    def __init__(self):
+        {}["weights"]
+
+class AttributeMissing(Fixed):
+    def __init__(self):
+        self.weights
+
+class Needy(Fixed):
+    def __init__(self, weights):
+        pass
 '''
 
 
 @pytest.fixture
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_module.py").write_text(MINE)
+    (tmp_path / "broken_module.py").write_text("nothing_of_this_name")
+    (tmp_path / "moving_module.py").write_text(f"import os\nos.chdir('..')\n{MINE}")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "my_module", raising=False)
 
@@ -156,8 +176,30 @@ def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -
         ("my_module:Missing", "my_module has no Missing"),
         ("my_module:Other", r"has no method estimate\(frames\)"),
         ("no_module_of_this_name:Fixed", "is no module here: start in its folder, or install it"),
+        ("my_module:KeyMissing", r"KeyMissing\(\) raises KeyError \('weights'\)"),
+        ("my_module:AttributeMissing", r"AttributeMissing\(\) raises AttributeError \(.* no attribute 'weights'"),
+        ("my_module:Needy", r"Needy\(\) raises TypeError \(.*\): it must need no arguments"),
+        ("broken_module:Fixed", r"broken_module raises NameError \(.*nothing_of_this_name.*\) when it is imported"),
     ],
 )
 def test_what_is_no_estimator_is_one_sentence(text: str, reason: str) -> None:
     with pytest.raises(MitsonarError, match=reason):
         estimator_from(text)
+
+
+@pytest.mark.usefixtures("mine")
+def test_a_worker_imports_the_class_again(ground: NDArray[np.float64], tmp_path: Path) -> None:
+    """Its search path lacks the folder of the module, as that of the installed command does."""
+    assert not {"", str(tmp_path)} & set(sys.path)
+    estimator = estimator_from("my_module:Unpicklable")
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        found = pool.submit(estimator.estimate, pair(ground, Motion(0.0, 0.0, 0.0))).result()
+    assert found.motion == Motion(0.02, 0.0, 0.0)
+
+
+@pytest.mark.usefixtures("mine")
+def test_a_module_that_changes_the_folder_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "moving_module", raising=False)
+    before = list(sys.path)
+    estimator_from("moving_module:Fixed")
+    assert sys.path == before

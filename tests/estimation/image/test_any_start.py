@@ -133,6 +133,13 @@ def test_the_prior_gate_is_chi_square() -> None:
     assert not prior_rejection(motion, own, None)
 
 
+def test_an_unknown_component_does_not_hide_a_known_one() -> None:
+    """The heading alone is expected, to 1 mrad: 5 standard deviations off are too many, 4 are not."""
+    prior = MotionPrior(Motion(0.0, 0.0, 0.0), np.diag([1e10, 1e10, 1e-6]))
+    assert "5.0 standard deviations" in prior_rejection(Motion(0.3, 2.0, 0.005), None, prior)
+    assert not prior_rejection(Motion(0.3, 2.0, 0.004), None, prior)
+
+
 def test_far_is_by_height_and_turn() -> None:
     assert not is_far(Motion(0.03, 0.03, 0.02), 2.5)
     assert is_far(Motion(0.03, 0.03, 0.02), 2.0)
