@@ -112,7 +112,7 @@ def test_heave_that_no_sensor_tells_is_estimated(monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr(local_map, "ROUGH_STD", std)
         found = mapped(blind, np.arange(FRAMES), wrong_estimates())
         errors.append(abs(sum(one.motion.forward for one in found) - STEP_M * (FRAMES - 1)))
-    assert errors[0] < 0.3 * errors[1], "heave changes the length of the path where it is not estimated"
+    assert errors[0] < 0.5 * errors[1], "heave changes the length of the path where it is not estimated"
 
 
 def test_the_answer_is_a_function_of_frames_and_estimates() -> None:
