@@ -17,21 +17,19 @@ from mitsonar.io.run_directory import RunDirectory
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import Odometry
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder, run_odometry
+from mitsonar.mapping.open_source import LOOP
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import cluster_resamples, in_units, motion_errors
 from mitsonar.motion.segment_drift import segment_drift
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import assess, distance_driven, path_length
 
-__all__ = ["LENGTHS_M", "LOOP", "Case", "measured_row"]
+__all__ = ["LENGTHS_M", "Case", "measured_row"]
 
 Array = NDArray[np.float64]
 
 LENGTHS_M = (1.0, 2.0, 5.0)
 """Lengths of the segments of drift [m]; KITTI has 100 to 800 m."""
-
-LOOP = 8
-"""Motions over which loops are closed where no truth is known."""
 
 TIMED_PAIRS = 15
 """Pairs whose estimates are timed, evenly spaced."""

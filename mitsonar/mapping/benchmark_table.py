@@ -25,7 +25,8 @@ def benchmark_lines(rows: Sequence[PlainTable]) -> list[str]:
 
 def _overview(parts: list[list[PlainTable]]) -> Iterator[str]:
     """Yield a table of drift in percent: a line a method, a column a set; nothing for a single set."""
-    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in parts if "path_m" in part[0]}
+    measured = [part for part in parts if any("path_m" in row for row in part)]
+    drifts = {", ".join(_cell(part[0])): {row["method"]: row for row in part} for part in measured}
     if len(drifts) < 2:
         return
     methods = dict.fromkeys(name for of in drifts.values() for name in of)

@@ -20,11 +20,11 @@ from mitsonar.io.plain_data import parse_json
 from mitsonar.io.provenance import digest, versions
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_bytes, read_json, write_json, write_whole
-from mitsonar.mapping.benchmark_row import LENGTHS_M, LOOP, Case, measured_row
+from mitsonar.mapping.benchmark_row import LENGTHS_M, Case, measured_row
 from mitsonar.mapping.benchmark_sets import NOISES, SEED, SETS, TEXTURES, Begin, RenderedSet
 from mitsonar.mapping.benchmark_table import benchmark_lines
 from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.open_source import Reading, open_source, record_at
+from mitsonar.mapping.open_source import LOOP, Reading, open_source, record_at
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["FRAMES", "METHODS", "Wanted", "benchmark_odometry"]
@@ -267,7 +267,10 @@ def _recorded(case: Case, estimator: AnyEstimator, frames: int | None) -> FrameS
         MitsonarError: fewer than two frames, or frames that the estimator does not take.
     """
     source = cast(FrameSource, open_source(case.name, estimator, Reading(geometry=case.geometry)))
-    return source if frames is None else _first(source, frames)
+    source = source if frames is None else _first(source, frames)
+    if len(source) < 2:
+        raise MitsonarError(f"a row of the benchmark needs two frames or more: got {len(source)} from {case.name}")
+    return source
 
 
 def _first(source: FrameSource, count: int) -> FrameSource:

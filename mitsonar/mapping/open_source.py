@@ -23,6 +23,7 @@ from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
 __all__ = [
+    "LOOP",
     "Reading",
     "Source",
     "frames_for",

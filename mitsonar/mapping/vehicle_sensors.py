@@ -293,7 +293,7 @@ class VehicleSensors:
         return SensorMotions(pair, table[pair], covariances[pair], np.zeros((len(pair), 3)))
 
     def _yaws(self, time_s: Array) -> Array:
-        """Return the yaw between frames by the gyroscope, or else by dead reckoning or the compass; else 0."""
+        """Return the yaw between frames by the gyroscope, or else by dead reckoning; else 0."""
         step = np.diff(time_s)
         if self.yaw_rate is not None:
             return np.where(self.yaw_rate.covers(time_s), self.yaw_rate.means(time_s) * step, 0.0)
