@@ -16,7 +16,6 @@ from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.datasets.ground_nodes import ground_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, rejected, two_frames
-from mitsonar.estimation.image.direct import is_far
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.estimation.prior_gate import prior_rejection
@@ -124,7 +123,7 @@ class ImageNetwork(Trained):
             return self._from(frames, images, {}, None)
         ground = _batch(ground_of(frames, attitude))
         found = self._from(frames, images, ground, None if prior is None else prior.motion)
-        found = _judged(found, prior, "zero" if prior is None else "prior", attitude)
+        found = self._judged(found, prior, "zero" if prior is None else "prior")
         if found.valid or (prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))):
             return found
         elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
@@ -133,7 +132,17 @@ class ImageNetwork(Trained):
         second = self._from(frames, images, ground, elsewhere.motion)
         if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
             second = self._from(frames, images, ground, second.motion)
-        return _judged(second, prior, "phase", attitude)
+        return self._judged(second, prior, "phase")
+
+    def _judged(self, found: Estimate, prior: MotionPrior | None, named: str) -> Estimate:
+        """Return an estimate that names its start, with the covariance of motions beyond training where it is one.
+
+        It is rejected where it contradicts a prior.
+        """
+        beyond = bool(self._rejection_of_size(found.motion))
+        covariance = FAR_MODEL * found.covariance if beyond and found.covariance is not None else found.covariance
+        reason = found.reason or prior_rejection(found.motion, covariance, prior)
+        return replace(found, covariance=covariance, valid=not reason, reason=reason, about={**found.about, "start": named})
 
     def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
         """Estimate the motion from a start of the network's iterations; None: no motion."""
@@ -196,14 +205,6 @@ class ImageNetwork(Trained):
         outward = forward + sideways * math.sin(min(math.pi / 2, np.abs(frames.bearing_rad).max()))
         across = yaw + sideways / frames.range_m[0]
         return 2 + int(outward / bin_m), 2 + int(across / beam_rad)
-
-
-def _judged(found: Estimate, prior: MotionPrior | None, named: str, attitude: Attitude) -> Estimate:
-    """Return an estimate that names its start, with the covariance of far motions, rejected where it contradicts a prior."""
-    far = found.covariance is not None and is_far(found.motion, attitude.height_m)
-    covariance = FAR_MODEL * found.covariance if far and found.covariance is not None else found.covariance
-    reason = found.reason or prior_rejection(found.motion, covariance, prior)
-    return replace(found, covariance=covariance, valid=not reason, reason=reason, about={**found.about, "start": named})
 
 
 def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
