@@ -37,7 +37,7 @@ from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["Direct"]
+__all__ = ["Direct", "is_far"]
 
 Floats = NDArray[np.float32]
 
@@ -137,7 +137,7 @@ class Direct:
         if found.valid or (prior is not None and (3 * prior.std <= FARTHEST).all()):
             return found
         elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
-        if not elsewhere.valid or not _is_far(elsewhere.motion, attitude.height_m):
+        if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
             return found  # a motion nearby has been looked for
         second = self._from(replace(task, prior=None), elsewhere.motion, "phase")
         reason = second.reason or prior_rejection(second.motion, second.covariance, prior)
@@ -148,9 +148,9 @@ class Direct:
         height_m = task.attitude.height_m
         if self.heave_std_m:
             return self._over_level(task, start, named)
-        if not _is_far(start, height_m):
+        if not is_far(start, height_m):
             near = self._over_level(task, start, named)
-            if not near.valid or not _is_far(near.motion, height_m):
+            if not near.valid or not is_far(near.motion, height_m):
                 return near
             far = self._over_relief(task, start, near.motion, named)
             return far if far.valid else near
@@ -213,7 +213,7 @@ class Direct:
         return Estimate(motion, covariance, not reason, reason, about)
 
 
-def _is_far(motion: Motion, height_m: float) -> bool:
+def is_far(motion: Motion, height_m: float) -> bool:
     """Return whether relief decides over a motion, seen from this height [m]."""
     return bool(np.hypot(motion.sideways, motion.forward) > FAR * height_m or abs(motion.yaw) > FAR_RAD)
 
