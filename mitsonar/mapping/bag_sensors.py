@@ -66,7 +66,7 @@ def sensors_in_bag(path: str | Path) -> VehicleSensors:
             f"{path} holds no sensor whose messages tell their covariance ({IMU}, {', '.join(TWISTS)}): write the readings "
             "to a CSV file, with their noise"
         )
-    return VehicleSensors(yaw_rate, sideways, forward, name=Path(path).name)
+    return VehicleSensors(yaw_rate, sideways, forward, name=f"the sensors of {Path(path).name}")
 
 
 def _gyroscope(bag: BagFile, topics: list[Topic]) -> Readings | None:

@@ -82,7 +82,7 @@ def load_sensors(path: str | Path) -> VehicleSensors:
         readings.get("heading_deg"),
         _reckoned(table, time) if set(known) & set(RECKONED) else None,
         bias,
-        Path(path).name,
+        f"the sensors of {Path(path).name}",
     )
 
 
