@@ -17,10 +17,13 @@ from scipy.linalg import cho_factor, cho_solve
 from mitsonar.geometry.sonar_projection import Views, projection_of
 from mitsonar.instruments.imaging_sonar import Bearing
 
-__all__ = ["Adjusted", "Observations", "adjusted", "cauchy", "track_weight"]
+__all__ = ["PLANAR", "Adjusted", "Observations", "adjusted", "cauchy", "track_weight"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+PLANAR = np.array([0, 1, 5])
+"""Place of x, y and heading in a pose."""
 
 ROUNDS = 3
 STILL = 1e-6
@@ -154,8 +157,7 @@ def adjusted(
         if np.abs(step).max() < STILL:
             break
     last = cho_solve(factor, np.eye(len(reduced))[:, -6:])[-6:]
-    planar = np.array([0, 1, 5])
-    return Adjusted(found, place, inverse, blocks.faults, last[np.ix_(planar, planar)])
+    return Adjusted(found, place, inverse, blocks.faults, last[np.ix_(PLANAR, PLANAR)])
 
 
 def _normal_equations(poses: Array, held: int, points: Array, seen: Observations, bearing: Bearing) -> _Blocks:

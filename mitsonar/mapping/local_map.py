@@ -105,7 +105,6 @@ class _Map:
     relief_m: float = RELIEF_M
     lean: Array = field(default_factory=lambda: np.zeros(3))
     drift: list[Array] = field(default_factory=list)
-    shown: int = 0
 
 
 def mapped(
@@ -250,14 +249,13 @@ def _update(
     view = Views.of(state.poses[-1])
     landmarks.choose(image, view, number, _usual_height(state))
     landmarks.forget(number - KEPT)
-    state.shown = int(landmarks.used.sum())
     return state.poses[-1].copy()
 
 
 def _moved_on(state: _Map, answer: Registered) -> bool:
     """Return whether the landmarks of the last keyframe have moved by much, or are lost."""
     number = answer.found.landmark
-    if len(number) < max(FEWEST, LOST * state.shown):
+    if len(number) < max(FEWEST, LOST * int(state.landmarks.used.sum())):
         return bool(np.abs(answer.pose - state.poses[-1]).max() > 1e-6)
     axes, points = state.landmarks.axes, state.landmarks.points[number]
     now, then = (axes.cells(polar_of(points, Views.of(pose), axes.bearing)) for pose in (answer.pose, state.poses[-1]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.estimation.image.patches import PatchImage
 from mitsonar.geometry.sonar_projection import Views, projection_of
-from mitsonar.mapping.bundle_adjustment import cauchy, track_weight
+from mitsonar.mapping.bundle_adjustment import PLANAR, cauchy, track_weight
 from mitsonar.mapping.landmarks import Found, Landmarks
 
 __all__ = ["FEWEST", "PAIR_STD", "Registered", "level_turn", "registered"]
@@ -23,9 +23,6 @@ FEWEST = 12
 LEAST_FOUND = 0.5
 """Least part of the landmarks in view that a frame must show. Without noise it is nine tenths; with noise of pixels that
 hides the ground, a fifth."""
-
-PLANAR = np.array([0, 1, 5])
-"""Place of x, y and heading in a pose."""
 
 ROUNDS, STILL = 8, 1e-6
 """Gauss-Newton iterations of a registration, and the step below which they end [m, rad]."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.sensor_files import ROOT_HOUR
-from mitsonar.mapping.vehicle_sensors import DeadReckoning, Readings, VehicleSensors, poses_at
+from mitsonar.mapping.vehicle_sensors import DeadReckoning, Readings, VehicleSensors, straight_poses
 from mitsonar.motion.composition import motions
 from mitsonar.motion.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
     count = int(np.ceil(span * noise.rate_hz))
     edges = np.linspace(true.time_s[0], true.time_s[-1], count + 1)
     step, time = np.diff(edges), (edges[1:] + edges[:-1]) / 2
-    moved = motions(poses_at(true, edges))
+    moved = motions(straight_poses(true, edges))
     # every draw is made, so that a sensor's errors do not depend on which others there are
     draws = rng.normal(size=(7, count))
     bias = rng.normal()
@@ -71,14 +71,14 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
         sin, cos = np.sin(moved[:, 2] / 2), np.cos(moved[:, 2] / 2)
         sideways = Readings(time, (moved[:, 0] * cos + moved[:, 1] * sin) / step + std * draws[1], std)
         forward = Readings(time, (moved[:, 1] * cos - moved[:, 0] * sin) / step + std * draws[2], std)
-    at = poses_at(true, time)
+    at = straight_poses(true, time)
     if noise.depth_m is not None:
         depth = Readings(time, -at[:, 2] + noise.depth_m * draws[3], np.full(count, noise.depth_m))
     if noise.compass_deg is not None:
         std = np.full(count, np.radians(noise.compass_deg))
         heading = Readings(time, at[:, 5] + std * draws[4], std)
     if noise.walk is not None:
-        dead = _reckoned(poses_at(true, edges), edges, noise.walk, draws[[5, 6, 4]].T)
+        dead = _reckoned(straight_poses(true, edges), edges, noise.walk, draws[[5, 6, 4]].T)
     return VehicleSensors(yaw_rate, sideways, forward, depth, heading, dead, bias_std, "simulated sensors")
 
 

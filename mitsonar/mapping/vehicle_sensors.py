@@ -19,7 +19,7 @@ from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["DeadReckoning", "Readings", "SensorMotions", "VehicleSensors", "poses_at"]
+__all__ = ["DeadReckoning", "Readings", "SensorMotions", "VehicleSensors", "straight_poses"]
 
 Array = NDArray[np.float64]
 
@@ -153,10 +153,10 @@ class DeadReckoning:
 
     def poses_at(self, time_s: Array) -> Array:
         """Return poses at times, interpolated; held before the first and after the last ``(times, 6)``."""
-        return poses_at(self.path, time_s)
+        return straight_poses(self.path, time_s)
 
 
-def poses_at(path: Trajectory, time_s: Array) -> Array:
+def straight_poses(path: Trajectory, time_s: Array) -> Array:
     """Return poses at times along straight lines, headings unwrapped; held beyond the ends ``(times, 6)``."""
     table = path.poses.copy()
     table[:, 5] = np.unwrap(table[:, 5])
