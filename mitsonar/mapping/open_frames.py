@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import is_zipfile
@@ -66,13 +67,15 @@ def open_frames(
 def load_frames(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
 ) -> SonarFrames:
-    """Load all frames at a path or URL into memory; see :func:`open_frames`.
+    """Load all frames at a path or URL into memory, with the whole poses where they are known; see :func:`open_frames`.
 
     Raises:
         MitsonarError: no frames there; a sequence or view that is not there.
     """
     source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
-    return source.read(np.arange(len(source)))
+    frames = source.read(np.arange(len(source)))
+    # what an estimator reads has no position and heading; who loads frames asks for what is there
+    return frames if source.poses is None else replace(frames, poses=source.poses.copy())
 
 
 def is_data_set(where: str | Path) -> bool:
