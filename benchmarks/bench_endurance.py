@@ -3,10 +3,11 @@
     python benchmarks/bench_endurance.py [--frames 10000] [--killed 600] [--out DIR]
     python benchmarks/bench_endurance.py --quick       # 24 frames of few rays, killed and resumed, kept nowhere
 
-450 frames of the run `forward` of `bench_trajectories.py` are rendered once. The sonar goes to and fro along them. All frames
-lie in a `frames.zarr`, as `mitsonar render` writes it. `mitsonar odometry --map --sensors` runs in a process of its own, whose
-progress bar notes the processor time and the memory. A shorter run is killed by SIGKILL while it estimates pairs, while it
-makes the map, and while it writes. All files of the resumed runs must be those of a run that was not stopped.
+450 frames of the run `forward` of `bench_trajectories.py` are rendered once. The sonar goes to and fro along them. All
+frames lie in a `frames.zarr`, as `mitsonar render` writes it. `mitsonar odometry --map --sensors` runs in a process of
+its own, whose progress bar notes the processor time and the memory. A shorter run is killed by SIGKILL while it
+estimates pairs, while it makes the map, and while it writes. All files of the resumed runs must be those of a run that
+was not stopped.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
+from unittest.mock import patch
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -109,7 +111,7 @@ def to_and_fro(way: SonarFrames, frames: int, folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     turn = len(way) - 1
     number = turn - np.abs(turn - np.arange(frames) % (2 * turn))
-    time_s = np.arange(frames) * float(np.median(np.diff(way.time_s)))
+    time_s: Array = float(np.median(np.diff(way.time_s))) * np.arange(frames, dtype=np.float64)
     store = FrameStore.create(folder / "frames.zarr", frames, way.select(slice(1)))
     for first in range(0, frames, PART):
         there = number[first : first + PART]
@@ -143,8 +145,8 @@ def command() -> None:
         yield add
         add(0)
 
-    odometry_command.progress_bar = noted
-    run()
+    with patch.object(odometry_command, "progress_bar", noted):
+        run()
 
 
 def resident_mib() -> float:

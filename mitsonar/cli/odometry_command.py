@@ -74,8 +74,8 @@ def odometry(
     sensors: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with unit and noise; or a "
-            "ROS bag. They join with the frames in a pose graph.",
+            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with unit and noise, also "
+            "beside the poses of a trajectory; or a ROS bag. They join with the frames in a pose graph.",
         ),
     ] = None,
     local_map: Annotated[
