@@ -88,8 +88,8 @@ def attitude_of(
     Raises:
         MitsonarError: no pitch; a height neither given nor measured, or not above 0 or the relief.
     """
-    pose = _mean_pose(frames)
-    pitch = pitch_rad if pitch_rad is not None else (None if pose is None else float(pose[3]))
+    lean = _mean_lean(frames)
+    pitch = pitch_rad if pitch_rad is not None else (None if lean is None else float(lean[0]))
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
         raise MitsonarError(
@@ -98,7 +98,7 @@ def attitude_of(
         )
     if given is not None and not 0 < given < np.inf:
         raise MitsonarError(f"{name} needs a height above 0 m: got {given:g}; give {argument('height_m')}")
-    roll = 0.0 if pose is None else float(pose[4])
+    roll = 0.0 if lean is None else float(lean[1])
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     if given is not None and pitch + half > np.pi / 2:
         reason = "the sonar looks past straight down: a cell shows two points of the ground"
@@ -123,11 +123,12 @@ def attitude_of(
     return Attitude(measured.height_m, STD_MEASURED * measured.height_m, pitch, roll, even=measured.even)
 
 
-def _mean_pose(frames: SonarFrames) -> NDArray[np.float64] | None:
-    """Return the mean of the poses ``(6,)``; None where pitch or roll is unknown."""
-    if frames.poses is None or not np.isfinite(frames.poses[:, 3:5]).all():
+def _mean_lean(frames: SonarFrames) -> NDArray[np.float64] | None:
+    """Return the mean of pitch and roll ``(2,)``, by the poses or by the sonar's own sensors; None where unknown."""
+    table, columns = (frames.attitude_rad, slice(0, 2)) if frames.poses is None else (frames.poses, slice(3, 5))
+    if table is None or not np.isfinite(table[:, columns]).all():
         return None
-    return np.asarray(frames.poses.mean(axis=0))
+    return np.asarray(table.mean(axis=0)[columns])
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:
