@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, argument
+from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
@@ -69,6 +70,11 @@ class Attitude:
     roll_rad: float = 0.0
     reason: str = ""
     even: bool = False
+
+    def ground(self, frames: SonarFrames) -> GroundGeometry:
+        """Return the level ground that the cells of the frames show from this height and attitude."""
+        bearing = frames.sonar.bearing
+        return GroundGeometry(frames.range_m, frames.bearing_rad, bearing, self.height_m, self.pitch_rad, self.roll_rad)
 
 
 def attitude_of(

@@ -11,7 +11,7 @@ import numpy as np
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, PlainTable
 from mitsonar.io.plain_data import parse_json, whole_number
-from mitsonar.io.whole_files import read_bytes
+from mitsonar.io.whole_files import whole_lines
 from mitsonar.motion.composition import Motion
 
 __all__ = ["add_to_journal", "read_journal"]
@@ -47,14 +47,7 @@ def read_journal(path: Path, *names: str) -> Iterator[tuple[PlainTable, Estimate
     Raises:
         MitsonarError: the journal is damaged.
     """
-    if not path.exists():
-        return
-    content = read_bytes(path, "journal", LARGEST_JOURNAL)
-    whole = content[: content.rfind(b"\n") + 1]
-    if len(whole) < len(content):
-        with path.open("r+b") as file:
-            file.truncate(len(whole))
-    for number, line in enumerate(whole.splitlines(), start=1):
+    for number, line in enumerate(whole_lines(path, "journal", LARGEST_JOURNAL), start=1):
         try:
             found = _estimate_in(line, names)
         except Exception:  # a line leads to whatever its bytes do

@@ -209,7 +209,7 @@ def odometry(
     plain = Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str), closing)
     if sensors is None and not loops:
         return plain
-    task = LoopTask(shown, estimator, numbers, known_loops, keep_loop) if loops and shown is not None else None
+    task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
     known_start = start is not None or source.poses is not None
     graph = graph_path(measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown)
     return replace(plain, series=graph.series, path=graph.path, graph=graph)
