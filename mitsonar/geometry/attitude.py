@@ -71,6 +71,11 @@ class Attitude:
     reason: str = ""
     even: bool = False
 
+    @property
+    def by_echoes(self) -> bool:
+        """Whether first echoes tell the height."""
+        return self.height_std_m < STD_GIVEN * self.height_m
+
     def ground(self, frames: SonarFrames) -> GroundGeometry:
         """Return the level ground that the cells of the frames show from this height and attitude."""
         bearing = frames.sonar.bearing
