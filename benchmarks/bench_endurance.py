@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -135,15 +136,18 @@ def command() -> None:
     def noted(what: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
         done = 0
 
+        def note(held_mib: float) -> None:
+            with log.open("a") as file:
+                file.write(f"{time.process_time()} {done} {held_mib}\n")
+
         def add(more: int) -> None:
             nonlocal done
             done += more
-            with log.open("a") as file:
-                file.write(f"{time.process_time()} {done} {resident_mib()}\n")
+            note(resident_mib())
 
         add(0)
         yield add
-        add(0)
+        note(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10)
 
     with patch.object(odometry_command, "progress_bar", noted):
         run()
@@ -188,7 +192,7 @@ def table(log: Array, scale: Scale) -> Iterator[str]:
             held = log[(log[:, 1] > begin) & (log[:, 1] <= stop), 2].max()
             cells += [f"{1e3 * (over - start) / (stop - begin):.1f}", f"{held:.0f}"]
         yield f"| {first:,} to {first + step:,} | {' | '.join(cells)} |"
-    yield f"\nPose graph and files: {after[-1, 0] - log[-1, 0]:.1f} s, {after[-1, 2]:.0f} MiB"
+    yield f"\nPose graph and files: {after[-1, 0] - log[-1, 0]:.1f} s, at most {after[-1, 2]:.0f} MiB"
 
 
 # ---------------------------------------------------------------- killed
