@@ -17,7 +17,6 @@ from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.pose_graph import CorrelatedErrors, PoseEdges, PoseGraph, relative_motions, wrapped
-from mitsonar.mapping.selected_inverse import inverse_entries
 
 __all__ = ["OUTLIER", "GraphSolution", "motion_derivatives", "solved"]
 
@@ -33,6 +32,9 @@ CAUCHY = float(chi2.ppf(0.95, 3))
 
 OUTLIER = float(chi2.ppf(0.999, 3))
 """Squared residual over the covariance beyond which a loop is an outlier: of 1,000 true loops one is."""
+
+COLUMNS, ENTRIES = 384, 2**23
+"""Columns of the inverse that are computed at a time, and the numbers in them, at most."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +68,15 @@ class GraphSolution:
 
     def covariances(self) -> tuple[Array, Array]:
         """Return the marginal covariances of poses ``(poses, 3, 3)``, and those with the next pose ``(poses - 1, 3, 3)``."""
-        place = self.states[: 3 * len(self.poses)].reshape(-1, 3)
-        rows = np.repeat(np.concatenate([place, place[:-1]])[:, :, None], 3, axis=2)
-        columns = np.repeat(np.concatenate([place, place[1:]])[:, None], 3, axis=1)
-        unknown = (rows >= 0) & (columns >= 0)
-        found = np.zeros(rows.shape)
-        found[unknown] = inverse_entries(self.factor, rows[unknown], columns[unknown])
-        own, following = np.split(found, [len(place)])
+        count = len(self.poses)
+        own, following = np.zeros((count, 3, 3)), np.zeros((count - 1, 3, 3))
+        step = max(1, min(COLUMNS, ENTRIES // self.factor.shape[0]) // 3)
+        for begin in range(0, count, step):
+            chosen = np.arange(begin, min(begin + step, count))
+            table = self.columns(chosen)
+            own[chosen] = table[chosen, :, np.arange(len(chosen))]
+            before = chosen[chosen > 0]
+            following[before - 1] = table[before - 1, :, before - begin]
         return (own + own.swapaxes(1, 2)) / 2, following
 
     def motion_covariances(self, own: Array, following: Array) -> Array:

@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, eye_array, random_array
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.error_correlation import ErrorCorrelation
-from mitsonar.mapping.graph_solver import GraphSolution, _factored, solved
+from mitsonar.mapping.graph_solver import GraphSolution, solved
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions
-from mitsonar.mapping.selected_inverse import inverse_entries
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 
@@ -169,28 +167,6 @@ def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("seed", range(3))
-def test_entries_of_the_inverse_are_those_of_the_dense_one(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    loose = random_array((60, 60), density=0.05, rng=rng)
-    matrix = csc_array(loose @ loose.T + 0.5 * eye_array(60))
-    rows, columns = np.triu_indices(60)
-    found = inverse_entries(_factored(matrix), rows[::7], columns[::7])
-    np.testing.assert_allclose(found, np.linalg.inv(matrix.toarray())[rows[::7], columns[::7]], atol=1e-12)
-
-
-def test_entries_count_that_the_normal_equations_lack() -> None:
-    """Along a straight line the normal equations hold no entry for sideways and forward together."""
-    graph = graph_of(np.tile([0.0, 0.2, 0.0], (9, 1)))
-    found = solved(graph)
-    own, following = found.covariances()
-    every = found.columns(np.arange(10))
-    for pose in range(10):
-        np.testing.assert_allclose(own[pose], every[pose, :, pose], atol=1e-15)
-    for pose in range(9):
-        np.testing.assert_allclose(following[pose], every[pose, :, pose + 1], atol=1e-15)
-
-
 def test_errors_over_covariances_are_one_by_draws() -> None:
     """60 draws of the whole model; the mean of 60 chi-squares of three, a third, scatters by 11 %."""
     normalised = []
