@@ -67,15 +67,15 @@ def open_frames(
 def load_frames(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
 ) -> SonarFrames:
-    """Load all frames at a path or URL into memory, with the whole poses where they are known; see :func:`open_frames`.
+    """Load all frames at a path or URL into memory, with true poses where they are known; see :func:`open_frames`.
+
+    Labels are not loaded: :meth:`mitsonar.SonarFrames.load` loads those of a run.
 
     Raises:
         MitsonarError: no frames there; a sequence or view that is not there.
     """
     source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
-    frames = source.read(np.arange(len(source)))
-    # what an estimator reads has no position and heading; who loads frames asks for what is there
-    return frames if source.poses is None else replace(frames, poses=source.poses.copy())
+    return replace(source.read(np.arange(len(source))), poses=source.poses, attitude_rad=source.attitude_rad)
 
 
 def is_data_set(where: str | Path) -> bool:

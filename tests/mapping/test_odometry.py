@@ -498,7 +498,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
 
 RESULTS = {
     *("run.json", "estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
-    *("table.md", "table.json", "path.png"),
+    *("table.md", "table.json", "path.png", "height_profile.csv"),
 }
 
 

@@ -210,6 +210,8 @@ class Direct:
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start)) or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
+        if task.attitude.by_echoes and self.relief_m is None:
+            about["height_std_m"] = task.attitude.height_std_m
         return Estimate(motion, covariance, not reason, reason, about)
 
 

@@ -173,7 +173,9 @@ def _fit(
 ) -> Fit:
     """Assess the motion from the gradients of blocks, and from slopes of one frame times those of the other."""
     true = np.sum([_cross(side, cells, level) for side in at.sides], axis=0)
-    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else at.normal) + np.diag(held))
+    # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
+    sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
+    undone = np.linalg.inv(sound + np.diag(held))
     pulls = np.sum([side.sums(side.weighted * side.residual) for side in at.sides], axis=0)
     side = at.sides[0]
     shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
