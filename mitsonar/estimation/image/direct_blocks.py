@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["block_of", "by_block", "cell_blocks", "on_cells"]
+__all__ = ["by_block", "cell_blocks", "on_cells"]
 
 Floats = NDArray[np.float32]
 
@@ -16,16 +16,20 @@ def cell_blocks(shape: tuple[int, ...], block: tuple[int, int]) -> tuple[int, in
     return max(shape[-2] // block[0], 1), max(shape[-1] // block[1], 1)
 
 
-def block_of(size: int, block: int) -> NDArray[np.intp]:
-    """Return the block of each cell along an axis; cells beyond the last whole block belong to it."""
-    return np.minimum(np.arange(size) // block, max(size // block, 1) - 1)
-
-
 def by_block(maps: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.float64]:
     """Sum maps ``(..., bins, beams)`` over blocks ``(..., blocks)``."""
-    starts = [np.arange(0, count * edge, edge) for count, edge in zip(cell_blocks(maps.shape, block), block, strict=True)]
-    sums = np.add.reduceat(np.add.reduceat(maps, starts[0], axis=-2), starts[1], axis=-1)
-    return np.asarray(sums.reshape(*maps.shape[:-2], -1), dtype=np.float64)
+    rows, columns = cell_blocks(maps.shape, block)
+    over = [-(-size // edge) for size, edge in zip(maps.shape[-2:], block, strict=True)]
+    flat = maps.reshape(-1, *maps.shape[-2:])
+    missing = [(0, count * edge - size) for count, edge, size in zip(over, block, maps.shape[-2:], strict=True)]
+    if any(after for _, after in missing):
+        flat = np.pad(flat, ((0, 0), *missing))
+    # means over whole cells: OpenCV takes a third of the time of np.add.reduceat
+    means = [cv2.resize(one, over[::-1], interpolation=cv2.INTER_AREA) for one in flat]
+    sums = np.multiply(means, block[0] * block[1], dtype=np.float64)
+    sums[:, rows - 1] += sums[:, rows:].sum(axis=1)  # cells beyond the last whole block
+    sums[:, :, columns - 1] += sums[:, :, columns:].sum(axis=2)
+    return np.asarray(sums[:, :rows, :columns].reshape(*maps.shape[:-2], -1), dtype=np.float64)
 
 
 def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[int, int]) -> Floats:
