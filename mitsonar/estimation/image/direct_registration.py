@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import correlation_of, spread_of
-from mitsonar.estimation.image.direct_blocks import by_block
+from mitsonar.estimation.image.direct_blocks import by_block, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
 
@@ -32,6 +32,9 @@ AROUND = (3, 3)
 
 BLOCK_CAUCHY = 4.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
+
+COARSE = 10.0
+"""How many times larger steps end the iteration of a level that another follows."""
 
 REMEMBERED = 4
 LEVER_M = 4.0
@@ -82,6 +85,7 @@ def register(
         The motion, and its fit at the finest level.
     """
     v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
+    still = STILL if last else COARSE * STILL
     at, margins = None, np.zeros((2, 2))
     for _ in range(level.iterations):
         at = _linearised(*pair, cells, v, level, margins, last=last)
@@ -90,7 +94,7 @@ def register(
         held = _held(at.scale, len(v), heave_std_m)
         step = np.asarray(-np.linalg.solve(at.normal + np.diag(held), at.pull + held * v), dtype=np.float64)
         v = np.add(v, accelerate(v, step))
-        converged = bool((np.abs(step[:3]) < STILL).all())
+        converged = bool((np.abs(step[:3]) < still).all())
         if converged:
             break
     if not last or at is None:
@@ -147,7 +151,7 @@ def _linearised(
         drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
         pairs.append((drawn, second, inner) if back else (first, drawn, inner))
     residuals = [after - before for before, after, _ in pairs]
-    counted = residuals[0][pairs[0][2]].ravel()
+    counted = residuals[0][pairs[0][2]]
     if counted.size < FEWEST_CELLS:
         return None
     scale = noise_of(counted)
@@ -158,8 +162,8 @@ def _linearised(
 
 
 def noise_of(residual: Floats) -> float:
-    """Return the standard deviation of most residuals ``(cells,)``, by their median."""
-    return max(1.4826 * median_of(np.abs(residual[::5])), FAINTEST)
+    """Return the standard deviation of most residuals, by the median of every fifth."""
+    return max(1.4826 * median_of(np.abs(residual[::5]).ravel()), FAINTEST)
 
 
 def median_of(values: NDArray[np.floating]) -> float:
@@ -184,11 +188,9 @@ def _side(
     weight[inner] = cauchy(residual[inner], scale)
     if cells.seen is not None:
         weight *= cells.seen
-    terms = np.empty((5, *residual.shape), dtype=np.float32)
-    weighted = weight * along, weight * across
-    for k, (one, other) in enumerate(((0, along), (0, across), (1, across), (0, residual), (1, residual))):
-        np.multiply(weighted[one], other, out=terms[k])
-    sums = by_block(terms, cells.patch)
+    bins, beams = weight * along, weight * across
+    products = (bins, along), (bins, across), (beams, across), (bins, residual), (beams, residual)
+    sums = products_by_block(products, cells.patch)
     patches = _patch_weight(sums.reshape(5, *cells.patches)) if last else np.ones(sums.shape[1])
     sums *= patches
     return _Side(before, after, inner, weight, patches, sums[:3], sums[3:])
@@ -214,12 +216,12 @@ def _by_motion(derivative: Doubles, slopes: Doubles) -> Doubles:
 
 def _flat(values: Doubles) -> Doubles:
     """Return values ``(n, 2 * patches)`` of ``(n, 2, patches)``."""
-    return values.reshape(len(values), -1)
+    return np.reshape(values, (len(values), -1))
 
 
 def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
     """Return derivatives ``(n, 2, patches)`` times sums of slopes by slopes: along bins, of both, along beams."""
-    return derivative * slopes[::2] + derivative[:, ::-1] * slopes[1]
+    return np.asarray(derivative * slopes[::2] + derivative[:, ::-1] * slopes[1])
 
 
 def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
@@ -313,8 +315,10 @@ def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
     """
     curvature = side.weight * (2 * side.weight - 1)
     (along, across), others = (central_differences(blurred(image, *level.slopes)) for image in (side.before, side.after))
-    both = (along * others[1] + across * others[0]) * np.float32(0.5)
-    return side.patches * by_block(np.stack([along * others[0], both, across * others[1]]) * curvature, cells.patch)
+    bins, beams = along * curvature, across * curvature
+    products = (bins, others[0]), (bins, others[1]), (beams, others[0]), (beams, others[1])
+    along_both, one, other, across_both = products_by_block(products, cells.patch)
+    return np.stack([along_both, (one + other) / 2, across_both]) * side.patches
 
 
 def _patch_weight(sums: Doubles) -> Doubles:
