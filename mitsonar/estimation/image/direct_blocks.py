@@ -20,29 +20,35 @@ def cell_blocks(shape: tuple[int, ...], block: tuple[int, int]) -> tuple[int, in
 
 def by_block(maps: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.float64]:
     """Sum maps ``(..., bins, beams)`` over blocks ``(..., blocks)``."""
-    sums = [_summed(one, block) for one in maps.reshape(-1, *maps.shape[-2:])]
-    return np.array(sums).reshape(*maps.shape[:-2], -1)
+    means = [_means(one, block) for one in maps.reshape(-1, *maps.shape[-2:])]
+    return _sums(means, cell_blocks(maps.shape, block), block).reshape(*maps.shape[:-2], -1)
 
 
 def products_by_block(pairs: Sequence[tuple[Floats, Floats]], block: tuple[int, int]) -> NDArray[np.float64]:
     """Sum products of two maps ``(bins, beams)`` over blocks ``(pairs, blocks)``."""
-    product = np.empty_like(pairs[0][0])  # one for all: it stays in the processor's cache
-    return np.array([_summed(np.multiply(*pair, out=product), block) for pair in pairs])
+    shape = pairs[0][0].shape
+    product = np.empty(shape, dtype=np.float32)  # one for all: it stays in the processor's cache
+    return _sums([_means(np.multiply(*pair, out=product), block) for pair in pairs], cell_blocks(shape, block), block)
 
 
-def _summed(values: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.float64]:
-    """Sum a map ``(bins, beams)`` over blocks ``(blocks,)``."""
-    rows, columns = cell_blocks(values.shape, block)
+def _means(values: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.floating]:
+    """Average a map ``(bins, beams)`` over blocks; one that is not whole is filled with zeros ``(rows, columns)``."""
     over = [-(-size // edge) for size, edge in zip(values.shape, block, strict=True)]
     missing = [(0, count * edge - size) for count, edge, size in zip(over, block, values.shape, strict=True)]
     if any(after for _, after in missing):
         values = np.pad(values, missing)
-    # means over whole cells: OpenCV takes a third of the time of np.add.reduceat
-    mean = cv2.resize(values, over[::-1], interpolation=cv2.INTER_AREA)
-    sums = np.multiply(mean, block[0] * block[1], dtype=np.float64)
-    sums[rows - 1] += sums[rows:].sum(axis=0)  # cells beyond the last whole block
-    sums[:, columns - 1] += sums[:, columns:].sum(axis=1)
-    return np.asarray(sums[:rows, :columns].ravel(), dtype=np.float64)
+    # OpenCV takes a third of the time of np.add.reduceat
+    return np.asarray(cv2.resize(values, over[::-1], interpolation=cv2.INTER_AREA), dtype=values.dtype)
+
+
+def _sums(means: list[NDArray[np.floating]], blocks: tuple[int, int], block: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum over blocks from their means ``(maps, blocks)``; cells beyond the last whole block belong to it."""
+    sums = np.multiply(means, block[0] * block[1], dtype=np.float64)
+    rows, columns = blocks
+    if sums.shape[1:] != blocks:
+        sums[:, rows - 1] += sums[:, rows:].sum(axis=1)
+        sums[:, :, columns - 1] += sums[:, :, columns:].sum(axis=2)
+    return np.asarray(sums[:, :rows, :columns].reshape(len(means), -1), dtype=np.float64)
 
 
 def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[int, int]) -> Floats:

@@ -41,12 +41,6 @@ PATCH = (8, 4)
 FEWEST_ROWS = 2
 """Fewest rows of a patch of a coarse level."""
 
-MOSTLY = 0.5
-"""Part of the window that must show lit ground for the outline of the light to be left in."""
-
-LIT = 0.9
-"""Part of the field of view's elevation that is free of its outline."""
-
 
 class Cells:
     """The cells of one level: where they are, and how they move with the sonar, in bins and beams.
@@ -60,28 +54,17 @@ class Cells:
     """
 
     def __init__(self, nodes: GroundNodes, level: DirectLevel) -> None:
-        frames, step = nodes.frames, level.step
-        self.nodes = nodes
-        self.grid = cell_grid(tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist()), step)
-        self.row, self.column = self.grid.row, self.grid.column
-        self.patch = max(FEWEST_ROWS, PATCH[0] // step), PATCH[1]
-        self.patches = cell_blocks((len(self.grid.range_m), len(self.grid.bearing_rad)), self.patch)
+        self.nodes, self.grid = nodes, cell_grid(*nodes.key, level.step)
+        self.row, self.column, self.patch, self.patches = self.grid.row, self.grid.column, self.grid.patch, self.grid.patches
         self.derivative = self._on_patches(nodes.derivative)
         known = nodes.known
         first = float(nodes.axes[0][int(known.any(axis=1).argmax())]) if known.any() else np.inf
         self.usable = slice(int(np.searchsorted(self.grid.range_m, first)), None)
-        reach = tuple(2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing[::-1], (1, step), strict=True))
-        self.seen = self._seen(np.radians(frames.sonar.elevation_fov_deg) / 2, reach)
+        self.seen = self._seen(level)
 
-    def _seen(self, half_elevation: float, reach: tuple[int, ...]) -> Floats | None:
-        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
-
-        The outline of the lit ground moves with the sonar and biases motions to zero. It is masked where the ground is even,
-        and where most of the fan is not lit. Rocks blur it, and those that rise beyond it help.
-        """
-        known, lit = self.nodes.known, self.nodes.lit(LIT * half_elevation)
-        mask_lit = self.nodes.attitude.even or lit.mean() < MOSTLY
-        shown = known & lit if mask_lit else known
+    def _seen(self, level: DirectLevel) -> Floats | None:
+        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do."""
+        shown, masked = self.nodes.shown
         if shown[self.nodes.from_node[0].min() :].all():
             return None
         row, column = (
@@ -89,22 +72,17 @@ class Cells:
             for values, nodes in zip((self.grid.range_m, self.grid.bearing_rad), self.nodes.axes, strict=True)
         )
         on_all = shown[row][:, column].astype(np.uint8)
-        return np.asarray(cv2.erode(on_all, np.ones(reach[::-1], np.uint8)) if mask_lit else on_all, dtype=np.float32)
+        reach = [2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing, (level.step, 1), strict=True)]
+        return np.asarray(cv2.erode(on_all, np.ones(reach, np.uint8)) if masked else on_all, dtype=np.float32)
 
     def _on_all(self, nodes: Doubles) -> Floats:
         """Interpolate from the nodes to all cells ``(2, bins, beams)``, in bins and beams."""
-        full = self.grid.over_bins @ nodes.astype(np.float32) @ self.grid.over_beams
-        return np.asarray(full)
+        return np.asarray(self.grid.over_bins @ nodes.astype(np.float32) @ self.grid.over_beams)
 
     def _on_patches(self, nodes: Doubles) -> Doubles:
         """Interpolate from the nodes to the middles of the patches ``(..., 2, patches)``, in bins and beams."""
-        shape = len(self.grid.range_m), len(self.grid.bearing_rad)
-        row, column = (
-            np.minimum(np.arange(count) * edge + edge // 2, size - 1)
-            for count, edge, size in zip(self.patches, self.patch, shape, strict=True)
-        )
-        middles = self.grid.over_bins[:, row] @ nodes @ self.grid.over_beams[:, :, column]
-        return np.asarray(middles.reshape(*nodes.shape[:-2], -1), dtype=np.float64)
+        middles = self.grid.over_rows @ nodes @ self.grid.over_columns
+        return np.asarray(middles.reshape(*nodes.shape[:-2], -1))
 
     def shift(self, v: Doubles, *, back: bool = False, lift_m: float = 0.0) -> Floats:
         """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
@@ -119,14 +97,21 @@ class Cells:
 
 
 class CellGrid(NamedTuple):
-    """Cells of every so many bins, and splines from the nodes to all of them, in bins ``[0]`` and beams ``[1]``."""
+    """Cells of every so many bins and their patches; splines from the nodes, in bins ``[0]`` and beams ``[1]``.
+
+    ``over_bins`` and ``over_beams`` lead to all cells, ``over_rows`` and ``over_columns`` to the middles of the patches.
+    """
 
     range_m: Doubles
     bearing_rad: Doubles
-    over_bins: Floats
-    over_beams: Floats
     row: Floats
     column: Floats
+    over_bins: Floats
+    over_beams: Floats
+    patch: tuple[int, int]
+    patches: tuple[int, int]
+    over_rows: Doubles
+    over_columns: Doubles
 
 
 @lru_cache(maxsize=16)
@@ -137,8 +122,23 @@ def cell_grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: 
         for node, values in zip(node_axes(np.array(range_m), axes), (ranges, axes), strict=True)
     ]
     bin_m, beam_rad = (np.gradient(values)[:, None] for values in (ranges, axes))
-    over_bins = np.stack([splines[0] / bin_m, splines[0]]).astype(np.float32)
-    over_beams = np.stack([splines[1].T, (splines[1] / beam_rad).T]).astype(np.float32)
-    row = np.arange(len(ranges), dtype=np.float32)[:, None]
-    column = np.arange(len(axes), dtype=np.float32)[None, :]
-    return CellGrid(ranges, axes, over_bins, over_beams, row, column)
+    over_bins = np.stack([splines[0] / bin_m, splines[0]])
+    over_beams = np.stack([splines[1].T, (splines[1] / beam_rad).T])
+    patch = max(FEWEST_ROWS, PATCH[0] // step), PATCH[1]
+    patches = cell_blocks((len(ranges), len(axes)), patch)
+    rows, columns = (
+        np.minimum(np.arange(count) * edge + edge // 2, size - 1)
+        for count, edge, size in zip(patches, patch, (len(ranges), len(axes)), strict=True)
+    )
+    return CellGrid(
+        ranges,
+        axes,
+        row=np.arange(len(ranges), dtype=np.float32)[:, None],
+        column=np.arange(len(axes), dtype=np.float32)[None, :],
+        over_bins=over_bins.astype(np.float32),
+        over_beams=over_beams.astype(np.float32),
+        patch=patch,
+        patches=patches,
+        over_rows=over_bins[:, rows],
+        over_columns=np.ascontiguousarray(over_beams[:, :, columns]),
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,12 @@ Doubles = NDArray[np.float64]
 
 NODES = (33, 17)
 """Nodes along range and bearing."""
+
+MOSTLY = 0.5
+"""Part of the window that must show lit ground for the outline of the light to be left in."""
+
+LIT = 0.9
+"""Part of the field of view's elevation that is free of its outline."""
 
 HEIGHT_STEP = 0.05
 """Step of the height for numerical derivatives, as a part of it."""
@@ -59,10 +67,23 @@ class GroundNodes:
             nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
         return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]])
 
-    def lit(self, half_elevation: float) -> NDArray[np.bool_]:
-        """Return which nodes the sonar lights, within so much of its axis [rad] ``(nodes, nodes)``."""
+    @cached_property
+    def shown(self) -> tuple[NDArray[np.bool_], bool]:
+        """Return which nodes show ground to be matched ``(nodes, nodes)``, and whether the outline of the light is masked.
+
+        The outline of the lit ground moves with the sonar and biases motions to zero. It is masked where the ground is even,
+        and where most of the fan is not lit. Rocks blur it, and those that rise beyond it help.
+        """
+        half_elevation = np.radians(self.frames.sonar.elevation_fov_deg) / 2
         with np.errstate(invalid="ignore"):
-            return np.asarray(np.abs(self.ground.elevation(self.ground.points)) <= half_elevation)
+            lit = np.abs(self.ground.elevation(self.ground.points)) <= LIT * half_elevation
+        mask_lit = self.attitude.even or bool(lit.mean() < MOSTLY)
+        return (self.known & lit if mask_lit else self.known), mask_lit
+
+    @cached_property
+    def key(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return ranges and bearings of the frames' cells, to be looked up by."""
+        return tuple(self.frames.range_m.tolist()), tuple(self.frames.bearing_rad.tolist())
 
     def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
         """Return the displacement of the nodes in range [m] and bearing [rad]; see :meth:`Cells.shift`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -49,6 +50,10 @@ FEWEST_CELLS = 500
 
 FEWEST_ROWS = 24
 """Fewest rows of a level that is not the last."""
+
+
+SAMPLED = (5, 3)
+"""The noise is measured in every so manieth bin and beam."""
 
 
 class Fit(NamedTuple):
@@ -154,7 +159,7 @@ def _linearised(
     counted = residuals[0][pairs[0][2]]
     if counted.size < FEWEST_CELLS:
         return None
-    scale = noise_of(counted)
+    scale = noise_of(counted[:: SAMPLED[0], :: SAMPLED[1]].ravel())
     sides = [_side(*pair, residual, cells, level, scale, last=last) for pair, residual in zip(pairs, residuals, strict=True)]
     normal = np.sum([_by_motion(cells.derivative, side.slopes) for side in sides], axis=0)
     pull = np.sum([_flat(cells.derivative) @ side.pull.ravel() for side in sides], axis=0)
@@ -162,8 +167,8 @@ def _linearised(
 
 
 def noise_of(residual: Floats) -> float:
-    """Return the standard deviation of most residuals, by the median of every fifth."""
-    return max(1.4826 * median_of(np.abs(residual[::5]).ravel()), FAINTEST)
+    """Return the standard deviation of most residuals ``(cells,)``, by their median."""
+    return max(1.4826 * median_of(np.abs(residual)), FAINTEST)
 
 
 def median_of(values: NDArray[np.floating]) -> float:
@@ -253,8 +258,15 @@ def is_resolved(bins: int, level: DirectLevel) -> bool:
 def smoothed(image: Floats, level: DirectLevel) -> Floats:
     """Every so many bins of the smoothed image."""
     bins, beams = level.smoothing
-    rows = np.ascontiguousarray(blurred(image, bins, 0)[level.step // 2 :: level.step])
-    return blurred(rows, 0, beams)
+    if level.step == 1:
+        return blurred(image, bins, beams)
+    return blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
+
+
+@lru_cache(maxsize=16)
+def _smoothed_rows(bins: int, sigma: float, step: int) -> Floats:
+    """Return the weights of bins in every so manieth bin, smoothed ``(rows, bins)``: only those are computed."""
+    return np.ascontiguousarray(blurred(np.eye(bins, dtype=np.float32), sigma, 0)[step // 2 :: step])
 
 
 class _AndersonAcceleration:
@@ -286,7 +298,7 @@ def _inner(there: Floats, usable: slice, least: Doubles) -> tuple[slice, slice] 
     ``least`` are the margins so far ``(2,)``, which grow in place: cells that came and went would keep it from settling.
     """
     _, bins, beams = there.shape
-    reach = np.maximum(there.max(axis=(1, 2)), -there.min(axis=(1, 2)))
+    reach = np.array([max(one.max(), -one.min()) for one in there])
     if not np.isfinite(reach).all():
         return None
     least[:] = np.maximum(least, np.ceil(reach) + 1)

@@ -144,7 +144,7 @@ class _ReliefLevel:
             before, after = (drawn, self.images[1]) if back else (self.images[0], drawn)
             residual = after - before
             if not back:
-                scale = noise_of(residual[inside])
+                scale = noise_of(residual[inside][::5])
                 correlation, count = correlation_of(before[inside], after[inside]), int(inside.sum())
             weight = cauchy(residual, scale) * inside
             by_bin, by_beam = slopes_of((before + after) * np.float32(0.5), self.level, scale)
