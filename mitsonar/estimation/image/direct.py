@@ -137,7 +137,7 @@ class Direct:
         found = self._from(task, start, "zero" if prior is None else "prior")
         if found.valid or (prior is not None and (3 * prior.std <= FARTHEST).all()):
             return found
-        elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
+        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
             return found  # a motion nearby has been looked for
         second = self._from(replace(task, prior=None), elsewhere.motion, "phase")

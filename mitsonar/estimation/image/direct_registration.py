@@ -31,7 +31,7 @@ TOGETHER = (3, 2)
 AROUND = (3, 3)
 """Patches along beams and bins around each that are looked at as a block."""
 
-BLOCK_CAUCHY = 4.0
+BLOCK_CAUCHY = 3.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
 
 COARSE = 10.0

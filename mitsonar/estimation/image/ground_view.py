@@ -17,6 +17,7 @@ from mitsonar.records.sonar_frames import SonarFrames
 __all__ = ["GroundView"]
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 MOST_CELLS = 2**20
 """Of a view: a window of many metres gets larger cells."""
@@ -30,28 +31,36 @@ class GroundView:
         frames: whose cells are projected.
         attitude: height over what is seen, pitch, roll.
         cell_m: edge of a pixel; larger where the view would have more than a million.
+        most_along: pixels along the longer side; they are larger where it would have more.
     """
 
     frames: SonarFrames
     attitude: Attitude
     cell_m: float
+    most_along: int = MOST_CELLS
 
     @cached_property
     def _geometry(self) -> GroundGeometry:
-        f, s = self.frames, self.attitude
-        return GroundGeometry(f.range_m, f.bearing_rad, f.sonar.bearing, s.height_m, s.pitch_rad, s.roll_rad)
+        return self._geometry_of(self.frames.range_m, self.frames.bearing_rad)
+
+    def _geometry_of(self, range_m: Doubles, bearing_rad: Doubles) -> GroundGeometry:
+        """Return the geometry of some of the cells."""
+        s = self.attitude
+        return GroundGeometry(range_m, bearing_rad, self.frames.sonar.bearing, s.height_m, s.pitch_rad, s.roll_rad)
 
     @cached_property
     def edge(self) -> float:
         """Edge of a pixel [m]."""
         left, right, near, far = self.reach
-        return max(self.cell_m, float(np.sqrt((right - left) * (far - near) / MOST_CELLS)))
+        whole = float(np.sqrt((right - left) * (far - near) / MOST_CELLS))
+        return max(self.cell_m, whole, max(right - left, far - near) / self.most_along)
 
     @cached_property
     def reach(self) -> tuple[float, float, float, float]:
         """Ground seen: starboard from, to, forward from, to [m]; all 0 where the fan meets no ground."""
-        points = self._geometry.points[::8, ::4]
-        points = np.concatenate([points.reshape(-1, 2), self._geometry.points[[0, -1]].reshape(-1, 2)])
+        f = self.frames
+        few = self._geometry_of(f.range_m[::8], f.bearing_rad[::4]), self._geometry_of(f.range_m[[0, -1]], f.bearing_rad)
+        points = np.concatenate([geometry.points.reshape(-1, 2) for geometry in few])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return 0.0, 0.0, 0.0, 0.0
