@@ -164,8 +164,8 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
     smooth = cv2.GaussianBlur(image, (3, 13), sigmaX=0.5, sigmaY=2.0, borderType=cv2.BORDER_REPLICATE)
     start, bins = smooth[:15], len(smooth)
-    dark = float(np.percentile(start, 25))
-    spread = (dark - float(np.percentile(start, 5))) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
+    darkest, dark = (float(level) for level in np.percentile(start, [5, 25]))
+    spread = (dark - darkest) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
     bright = float(smooth[bins // 4 : 3 * bins // 4].mean())
     over = smooth > dark + max(5 * spread, 0.15 * (bright - dark), FAINTEST)
     first = over.argmax(axis=0)
@@ -176,8 +176,8 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
     steepest = directions(frames.sonar.bearing, frames.bearing_rad, -half)
     down = -vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).apply(steepest)[:, 2]
     drop = (frames.range_m[first] * down)[received]
-    height = float(drop.mean() - TOPS * (np.percentile(drop, 90) - drop.mean()))
-    low, high = np.percentile(drop, [25, 75])
+    low, high, lowest = np.percentile(drop, [25, 75, 90])
+    height = float(drop.mean() - TOPS * (lowest - drop.mean()))
     if frames.sonar.vertical_pattern != "box" and high - low < EVEN_SKIRT * height:
         return None
     return _FirstEchoes(height, bool(high - low < EVEN * height)) if height > 0 else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -31,11 +31,13 @@ class GroundView:
         frames: whose cells are projected.
         attitude: height over what is seen, pitch, roll.
         cell_m: edge of a pixel; larger where the view would have more than a million.
+        most_along: pixels along the longer side; they are larger where it would have more.
     """
 
     frames: SonarFrames
     attitude: Attitude
     cell_m: float
+    most_along: int = MOST_CELLS
 
     @cached_property
     def _geometry(self) -> GroundGeometry:
@@ -45,13 +47,16 @@ class GroundView:
     def edge(self) -> float:
         """Edge of a pixel [m]."""
         left, right, near, far = self.reach
-        return max(self.cell_m, float(np.sqrt((right - left) * (far - near) / MOST_CELLS)))
+        whole = float(np.sqrt((right - left) * (far - near) / MOST_CELLS))
+        return max(self.cell_m, whole, max(right - left, far - near) / self.most_along)
 
     @cached_property
     def reach(self) -> tuple[float, float, float, float]:
         """Ground seen: starboard from, to, forward from, to [m]; all 0 where the fan meets no ground."""
-        points = self._geometry.points[::8, ::4]
-        points = np.concatenate([points.reshape(-1, 2), self._geometry.points[[0, -1]].reshape(-1, 2)])
+        f = self.frames
+        few = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
+        geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in few]
+        points = np.concatenate([geometry.points.reshape(-1, 2) for geometry in geometries])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return 0.0, 0.0, 0.0, 0.0

@@ -126,7 +126,7 @@ class ImageNetwork(Trained):
         found = self._judged(found, prior, "zero" if prior is None else "prior")
         if found.valid or (prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))):
             return found
-        elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
+        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
             return found  # a motion nearby has been looked for
         second = self._from(frames, images, ground, elsewhere.motion)
