@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array, csr_array
-from scipy.sparse.linalg import SuperLU, splu
 from scipy.stats import chi2
 
-from mitsonar.errors import MitsonarError
+from mitsonar.mapping.graph_marginals import marginals_by_nodes
+from mitsonar.mapping.normal_factor import NormalFactor
 from mitsonar.mapping.pose_graph import CorrelatedErrors, PoseEdges, PoseGraph, relative_motions, wrapped
 
 __all__ = ["OUTLIER", "GraphSolution", "motion_derivatives", "solved"]
@@ -33,8 +33,14 @@ CAUCHY = float(chi2.ppf(0.95, 3))
 OUTLIER = float(chi2.ppf(0.999, 3))
 """Squared residual over the covariance beyond which a loop is an outlier: of 1,000 true loops one is."""
 
-COLUMNS, ENTRIES = 384, 2**23
-"""Columns of the inverse that are computed at a time, and the numbers in them, at most."""
+COLUMNS = 384
+"""Columns of the inverse that are computed at a time."""
+
+LONG = 1000
+"""Poses beyond which covariances are those of nodes and of stretches between them."""
+
+STRETCH, NODES = 25, 1000
+"""Poses from one node to the next, and nodes at most, those at the ends of loops not counted."""
 
 
 @dataclass(frozen=True)
@@ -47,20 +53,24 @@ class GraphSolution:
         squared: squared residual of each loop over its own covariance ``(loops,)``, with all poses as solved.
         factor: of the normal equations.
         states: place of each unknown among those of the factor; -1 where it is known.
+        normal: the normal equations.
+        pose_of: number of the pose to which each unknown of the factor belongs; -1 where it is common to all.
     """
 
     poses: Array
     kept: NDArray[np.bool_]
     squared: Array
-    factor: SuperLU
+    factor: NormalFactor
     states: Index
+    normal: csc_array
+    pose_of: Index
 
     def columns(self, poses: ArrayLike) -> Array:
         """Return the covariances of all poses with some of them ``(poses, 3, chosen, 3)``."""
         chosen = np.atleast_1d(np.asarray(poses, dtype=np.intp))
         wanted = (3 * chosen[:, None] + np.arange(3)).ravel()
         place = self.states[wanted]
-        right = np.zeros((self.factor.shape[0], len(wanted)))
+        right = np.zeros((self.normal.shape[0], len(wanted)))
         right[place[place >= 0], np.flatnonzero(place >= 0)] = 1.0
         solution = np.vstack([self.factor.solve(right), np.zeros((1, len(wanted)))])  # the last row: what is known
         count = 3 * len(self.poses)
@@ -69,10 +79,12 @@ class GraphSolution:
     def covariances(self) -> tuple[Array, Array]:
         """Return the marginal covariances of poses ``(poses, 3, 3)``, and those with the next pose ``(poses - 1, 3, 3)``."""
         count = len(self.poses)
+        if count > LONG:
+            nodes = min(NODES, count // STRETCH + 1)
+            return marginals_by_nodes(self.normal, self.pose_of, self.states[: 3 * count].reshape(-1, 3), nodes)
         own, following = np.zeros((count, 3, 3)), np.zeros((count - 1, 3, 3))
-        step = max(1, min(COLUMNS, ENTRIES // self.factor.shape[0]) // 3)
-        for begin in range(0, count, step):
-            chosen = np.arange(begin, min(begin + step, count))
+        for begin in range(0, count, COLUMNS // 3):
+            chosen = np.arange(begin, min(begin + COLUMNS // 3, count))
             table = self.columns(chosen)
             own[chosen] = table[chosen, :, np.arange(len(chosen))]
             before = chosen[chosen > 0]
@@ -105,8 +117,9 @@ def solved(graph: PoseGraph) -> GraphSolution:
             if out.any():
                 kept &= ~out
                 continue
-        poses, factor, states = _gauss_newton(asked, poses, robust=False)
-        return GraphSolution(poses, kept, _squared(graph.loops, poses), factor, states)
+        poses, normal, factor, states = _gauss_newton(asked, poses, robust=False)
+        pose_of = asked.pose_of[states >= 0]
+        return GraphSolution(poses, kept, _squared(graph.loops, poses), factor, states, normal, pose_of)
 
 
 def _squared(edges: PoseEdges, poses: Array) -> Array:
@@ -136,32 +149,32 @@ def motion_derivatives(poses: Array, first: ArrayLike, second: ArrayLike) -> tup
 # ---------------------------------------------------------------- Gauss-Newton
 
 
-def _gauss_newton(graph: PoseGraph, start: Array, *, robust: bool) -> tuple[Array, SuperLU, Index]:
-    """Return the poses, the factor of the normal equations there, and the place of each unknown."""
+def _gauss_newton(graph: PoseGraph, start: Array, *, robust: bool) -> tuple[Array, csc_array, NormalFactor, Index]:
+    """Return the poses, the normal equations there, their factor, and the place of each unknown."""
     total = 3 * len(start) + graph.unknown_errors
     unknown = np.ones(total, dtype=bool)
     unknown[:3] = np.diag(graph.at_start) > 0
     states = np.where(unknown, np.cumsum(unknown) - 1, -1)
+    common = int((graph.pose_of < 0).sum()) if len(start) > LONG else 0
     poses, errors = start.copy(), np.zeros(graph.unknown_errors)
     for _ in range(ITERATIONS):
-        jacobian, residual = _linearised(graph, poses, errors, robust=robust)
-        jacobian = jacobian[:, unknown]
-        factor = _factored(csc_array(jacobian.T @ jacobian))
+        normal, right = _normal_equations(graph, poses, errors, unknown, robust=robust)
+        factor = NormalFactor.of(normal, common)
         step = np.zeros(total)
-        step[unknown] = factor.solve(-(jacobian.T @ residual))
+        step[unknown] = factor.solve(right)
         poses, errors = poses + step[: poses.size].reshape(-1, 3), errors + step[poses.size :]
         if np.abs(step[: poses.size]).max() < SETTLED:
             break
-    return poses, factor, states
+    return poses, normal, factor, states
 
 
-def _factored(normal: csc_array) -> SuperLU:
-    try:
-        return splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    except RuntimeError:
-        raise MitsonarError(
-            "some poses of the graph are tied by nothing: give motions between all consecutive poses"
-        ) from None
+def _normal_equations(
+    graph: PoseGraph, poses: Array, errors: Array, unknown: NDArray[np.bool_], *, robust: bool
+) -> tuple[csc_array, Array]:
+    """Return the matrix and the right side of the equations of a step of the unknowns."""
+    jacobian, residual = _linearised(graph, poses, errors, robust=robust)
+    jacobian = jacobian[:, unknown]
+    return csc_array(jacobian.T @ jacobian), -(jacobian.T @ residual)
 
 
 class _Rows:

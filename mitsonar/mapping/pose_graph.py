@@ -133,6 +133,14 @@ class PoseGraph:
         """Return the number of unknowns beside the poses: three errors a motion, nine slopes and a bias, where asked for."""
         return (0 if self.correlated is None else 3 * len(self.chain.first) + 9) + (self.bias is not None)
 
+    @property
+    def pose_of(self) -> Index:
+        """Return the pose of each unknown; of a motion's errors its first pose, of common ones -1 ``(unknowns,)``."""
+        errors = np.full(self.unknown_errors, -1, dtype=np.intp)
+        if self.correlated is not None:
+            errors[: 3 * len(self.chain.first)] = np.repeat(self.chain.first, 3)
+        return np.concatenate([np.repeat(np.arange(len(self.start)), 3), errors])
+
 
 def relative_motions(poses: Array, first: ArrayLike, second: ArrayLike) -> Array:
     """Return the motions ``(edges, 3)`` from the first to the second poses, of x, y, heading ``(poses, 3)`` (eq. 3.4)."""

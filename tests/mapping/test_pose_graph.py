@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.mapping import graph_solver
 from mitsonar.mapping.error_correlation import ErrorCorrelation
 from mitsonar.mapping.graph_solver import GraphSolution, solved
 from mitsonar.mapping.motion_series import MotionSeries, path_of
@@ -152,7 +153,7 @@ def tangled(rng: np.random.Generator, share: float = 0.8, slope: float = 0.01) -
 def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
     graph, _ = tangled(np.random.default_rng(2))
     found = solved(graph)
-    size = found.factor.shape[0]
+    size = found.normal.shape[0]
     dense = found.factor.solve(np.eye(size))
     normal = np.linalg.inv(dense)
     np.testing.assert_allclose(normal @ dense, np.eye(size), atol=1e-5)
@@ -164,6 +165,33 @@ def test_marginals_are_the_blocks_of_the_dense_inverse() -> None:
     there = found.states[3 * 17 : 3 * 19]
     np.testing.assert_allclose(following[17], dense[np.ix_(there[:3], there[3:])], rtol=1e-6, atol=1e-15)
     np.testing.assert_allclose(found.columns([18])[17, :, 0], following[17], rtol=1e-9)
+
+
+@pytest.mark.parametrize("looped", [False, True])
+@pytest.mark.parametrize("stretch", [1, 4, 40])
+def test_marginals_of_a_long_path_are_those_of_columns(monkeypatch: pytest.MonkeyPatch, stretch: int, looped: bool) -> None:
+    """A chain with correlated errors and a biased gyroscope: nodes and stretches between them are exact."""
+    moved = np.tile([0.0, 0.02, 0.03], (120, 1))
+    graph = replace(graph_of(moved), correlated=ErrorCorrelation().of(moved, REACH_M))
+    gyro = PoseEdges.chain(moved, np.tile(np.diag([10.0, 10.0, 1e-4]) ** 2, (120, 1, 1)))
+    graph = replace(graph, others=gyro, bias=np.tile([0, 0, 1e-4], (120, 1)), at_start=np.diag([0, 0, 1e-2]))
+    if looped:
+        pairs = [(3, 90), (5, 91), (5, 119)]
+        loops = joined(*(edge(i, j, relative_motions(graph.start, [i], [j])[0]) for i, j in pairs))
+        graph = replace(graph, loops=loops)
+    short = solved(graph)
+    own, following = short.covariances()
+    monkeypatch.setattr(graph_solver, "LONG", 100)
+    monkeypatch.setattr(graph_solver, "STRETCH", stretch)
+    long = solved(graph)
+    np.testing.assert_allclose(long.poses, short.poses, atol=1e-9)
+    found, onward = long.covariances()
+    scale = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    assert (np.abs(found - own) <= 1e-5 * scale[:, :, None] * scale[:, None]).all()
+    assert (np.abs(onward - following) <= 1e-5 * scale[:-1, :, None] * scale[1:, None]).all()
+    assert (np.linalg.eigvalsh(found[1:]) > 0).all()
+    motions_of_both = [short.motion_covariances(own, following), long.motion_covariances(found, onward)]
+    np.testing.assert_allclose(*motions_of_both, rtol=1e-4, atol=1e-10)
 
 
 @pytest.mark.thorough
