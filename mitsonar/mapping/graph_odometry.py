@@ -125,6 +125,7 @@ def graph_path(
     sensors: VehicleSensors | None,
     loops: LoopTask | None,
     source: FrameSource | None,
+    by_map: NDArray[np.bool_] | None = None,
 ) -> GraphPath:
     """Compute the path that agrees best with estimated motions, sensors and loops.
 
@@ -136,6 +137,7 @@ def graph_path(
         sensors: of the vehicle.
         loops: a search for loops; None: none.
         source: of the frames, where they show ground: how far ahead of the sonar.
+        by_map: which motions are those of a map ``(motions,)``: its errors are not those of two frames. None: no map.
 
     Raises:
         MitsonarError: sensors that cover no frame, or motions that tell no covariance and are too few to estimate one.
@@ -147,7 +149,10 @@ def graph_path(
     # motions left to the sensors say nothing of the errors of their neighbours
     wide = np.diagonal(graph.chain.covariances, axis1=1, axis2=2) >= UNKNOWN_STD**2
     left = np.asarray(wide.all(axis=1), dtype=bool)
-    onward = np.where(left[1:] | left[:-1], NOTHING, correlated.onward)
+    apart = left[1:] | left[:-1]
+    if by_map is not None:
+        apart |= by_map[1:] != by_map[:-1]
+    onward = np.where(apart, NOTHING, correlated.onward)
     graph = replace(graph, correlated=correlated._replace(onward=onward))
     before = after = solved(graph)
     search = None

@@ -216,7 +216,10 @@ def odometry(
         return plain
     task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
     known_start = start is not None or source.poses is not None
-    graph = graph_path(measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown)
+    by_map = np.array([one.about.get("map") == USED for one in estimates], dtype=bool)
+    graph = graph_path(
+        measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown, by_map=by_map
+    )
     return replace(plain, series=graph.series, path=graph.path, heights=heights(graph.path), graph=graph)
 
 

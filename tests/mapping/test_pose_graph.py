@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping import graph_solver
 from mitsonar.mapping.error_correlation import ErrorCorrelation
+from mitsonar.mapping.graph_odometry import graph_path
 from mitsonar.mapping.graph_solver import GraphSolution, solved
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions
+from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 
@@ -291,3 +294,25 @@ def test_motions_of_the_graph_are_those_of_paths() -> None:
 def test_a_solution_answers_for_known_poses() -> None:
     found: GraphSolution = solved(graph_of(square()))
     assert not found.columns([0]).any()
+
+
+def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
+    """A gyroscope that mends the yaw of the map's motions must not displace those of two frames, and the other way round."""
+    count, valley = 200, 3.5
+    time = np.arange(count + 1) / 20
+    by_map = (np.arange(count) // 25) % 2 == 0
+    motions = np.tile([0.02, 0.0, 0.0], (count, 1))
+    bias = np.where(by_map, 2e-5, -1e-4)  # yaw; two frames confuse it with sideways motion
+    motions[:, 2] += bias
+    motions[~by_map, 0] -= valley * bias[~by_map]
+    pair = np.array([[1e-8 + (valley * 1e-4) ** 2, 0, -valley * 1e-8], [0, 1e-8, 0], [-valley * 1e-8, 0, 1e-8]])
+    covariances = np.where(by_map[:, None, None], np.diag([1e-8, 1e-8, 1e-10]), pair)
+    measured = MotionSeries(motions, time, covariances)
+    true = path_of(np.tile([0.02, 0.0, 0.0], (count, 1)), Pose(0, 0, 2.5, 0.6, 0, 0), time)
+    gyroscope = simulated_sensors(true, SensorNoise(gyro_deg_rth=0.01), seed=0)
+    graph = partial(graph_path, start_known=True, sensors=gyroscope, loops=None, source=None)
+    start = Pose(*true.poses[0])
+    apart = graph(measured, lambda series: series, start, by_map=by_map)
+    alike = graph(measured, lambda series: series, start)
+    off, before = (abs(one.path.poses[-1, 0] - true.poses[-1, 0]) for one in (apart, alike))
+    assert off < before / 2

@@ -28,7 +28,7 @@ SMOOTHING = (1.0, 0.6)
 CELL = (26, 8)
 """Bins and beams in which one patch is chosen."""
 
-SHADOW = 0.15
+SHADOW = 0.3
 AROUND = (25, 61)
 """Level of a shadow, as part of the mean level around it [beams, bins]."""
 
