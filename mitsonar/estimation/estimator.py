@@ -20,14 +20,15 @@ __all__ = [
     "FEWEST_BLOCKS",
     "INPUTS",
     "LEAST_AT_BEST",
-    "LEAST_CORRELATION",
     "AnyEstimator",
     "Estimate",
     "Estimator",
     "PlainTable",
     "Record",
     "blank",
+    "correlation_excess",
     "correlation_of",
+    "correlation_rejection",
     "matching_rejection",
     "rejected",
     "spread_of",
@@ -45,6 +46,12 @@ LEAST_CORRELATION = 8.0
 
 LEAST_AT_BEST = 0.3
 """Least correlation of registered frames: a maximum among noise reaches 0.1 to 0.2."""
+
+LEAST_EXCESS = 6.0
+"""Least excess, in the same standard deviations, of frames that correlate by less: noise hides what they have in common.
+
+Frames of two places of a hull reach 4.1 in high noise, 120 pairs.
+"""
 
 FEWEST_BLOCKS = 8.0
 """Fewest blocks of a frame that share the matched energy: a single object is too little, its height is not known."""
@@ -159,6 +166,39 @@ def correlation_of(first: Real, second: Real) -> float:
     return float(np.vdot(a, b)) / size if size > 0 else 0.0
 
 
+def correlation_rejection(correlation: float, independent: float, excess: float = 0.0) -> str:
+    """Return why registered frames correlate too little; empty where they correlate enough.
+
+    Args:
+        correlation: of the frames as matched.
+        independent: number of cells with independent noise.
+        excess: of :func:`correlation_excess`, where it was measured.
+    """
+    noise = 1 / np.sqrt(independent)
+    if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION * noise) or excess >= LEAST_EXCESS * noise:
+        return ""
+    return f"the frames as matched correlate by {correlation:.2f} only"
+
+
+def correlation_excess(first: Real, second: Real, inside: NDArray[np.bool_], aside: int) -> float:
+    """Return by how much two registered images correlate more than with one of them displaced across the beams.
+
+    What the lighting alone correlates is alike in all beams, and counts on neither side.
+
+    Args:
+        first: one ``(rows, columns)``.
+        second: the other, registered to it.
+        inside: which pixels count.
+        aside: the least displacement [columns]; once and twice as many are taken, to either side.
+    """
+    others: list[float] = []
+    for shift in (-2 * aside, -aside, aside, 2 * aside):
+        here, there = slice(max(shift, 0), min(shift, 0) or None), slice(max(-shift, 0), min(-shift, 0) or None)
+        both = inside[:, here] & inside[:, there]
+        others.append(correlation_of(first[:, here][both], second[:, there][both]) if both.any() else 1.0)
+    return correlation_of(first[inside], second[inside]) - float(np.mean(others))
+
+
 def spread_of(shares: NDArray[np.floating]) -> float:
     """Return the effective number of blocks, from the energy of each. A few bright ones do not hide many faint."""
     amplitude = np.sqrt(np.maximum(shares, 0))
@@ -166,7 +206,9 @@ def spread_of(shares: NDArray[np.floating]) -> float:
     return float(amplitude.sum()) ** 2 / energy if energy > 0 else 0.0
 
 
-def matching_rejection(first: Real, second: Real, inside: NDArray[np.bool_], *, alike: float, block: int = 32) -> str:
+def matching_rejection(
+    first: Real, second: Real, inside: NDArray[np.bool_], *, alike: float, block: int = 32, aside: int = 0
+) -> str:
     """Return why two registered images ``(rows, columns)`` do not match; empty where they do.
 
     Args:
@@ -175,6 +217,7 @@ def matching_rejection(first: Real, second: Real, inside: NDArray[np.bool_], *, 
         inside: which pixels count.
         alike: number of neighbouring pixels that count as one, since the images are smooth.
         block: edge of the blocks over which the matched energy must be spread [pixels].
+        aside: displacement with which a low correlation is compared, see :func:`correlation_excess`; 0: with none.
     """
     count = int(inside.sum())
     if count < alike:
@@ -182,8 +225,10 @@ def matching_rejection(first: Real, second: Real, inside: NDArray[np.bool_], *, 
     # what is slow belongs to the sonar's lighting, not to the ground
     first, second = (image - cv2.blur(image, (block // 2, block // 2)) for image in (first, second))
     correlation = correlation_of(first[inside], second[inside])
-    if correlation < max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(count / alike)):
-        return f"the frames as matched correlate by {correlation:.2f} only"
+    excess = correlation_excess(first, second, inside, aside) if aside and correlation < LEAST_AT_BEST else 0.0
+    reason = correlation_rejection(correlation, count / alike, excess)
+    if reason:
+        return reason
     product = np.where(inside, (first - first[inside].mean()) * (second - second[inside].mean()), 0).astype(np.float64)
     rows, columns = (np.arange(0, size, block) for size in product.shape)
     if spread_of(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1)) < FEWEST_BLOCKS:

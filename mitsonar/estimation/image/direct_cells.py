@@ -42,6 +42,9 @@ HEIGHT_STEP = 0.05
 MOSTLY = 0.5
 """Part of the window that must show lit ground for the outline of the light to be left in."""
 
+NEARLY_ALL = 0.85
+"""Part of the window beyond which the outline costs little to leave out, as in a grazing look at a hull."""
+
 LIT = 0.9
 """Part of the field of view's elevation that is free of its outline."""
 
@@ -89,7 +92,7 @@ class Cells:
         """
         with np.errstate(invalid="ignore"):
             lit = np.abs(self.ground.elevation(self.ground.points)) <= LIT * half_elevation
-        mask_lit = self.attitude.even or lit.mean() < MOSTLY
+        mask_lit = self.attitude.even or not MOSTLY <= lit.mean() <= NEARLY_ALL
         shown = known & lit if mask_lit else known
         if shown[self.from_node[0].min() :].all():
             return None

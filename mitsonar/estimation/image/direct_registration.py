@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import correlation_of, spread_of
+from mitsonar.estimation.estimator import LEAST_AT_BEST, correlation_excess, correlation_of, spread_of
 from mitsonar.estimation.image.direct_blocks import block_of, by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
@@ -28,6 +28,9 @@ BLOCK = (24, 8)
 BLOCK_CAUCHY = 4.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
 
+NEGLIGIBLE = 0.1
+"""Standard deviations of the estimate below which a step left over is lost in the noise."""
+
 REMEMBERED = 4
 LEVER_M = 4.0
 LONGEST = 4.0
@@ -40,7 +43,10 @@ FEWEST_CELLS = 500
 
 
 class Fit(NamedTuple):
-    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes."""
+    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes.
+
+    ``excess`` is how much a low correlation exceeds that of displaced frames.
+    """
 
     converged: bool
     covariance: NDArray[np.float64]
@@ -48,6 +54,18 @@ class Fit(NamedTuple):
     correlation: float
     independent: float
     blocks: float
+    excess: float = 0.0
+
+
+class Held(NamedTuple):
+    """What is known of the unknowns before: mean and standard deviation of each [m, m, rad, m]; infinite: nothing."""
+
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+
+    def weight(self, scale: float, level: DirectLevel) -> NDArray[np.float64]:
+        """Return the prior weight of each unknown in units of the residuals' noise."""
+        return np.asarray(_alike(level) * scale**2 / self.std**2)
 
 
 def register(
@@ -57,7 +75,7 @@ def register(
     level: DirectLevel,
     *,
     last: bool,
-    heave_std_m: float,
+    held: Held,
 ) -> tuple[NDArray[np.float64], Fit | None] | None:
     """Run Gauss-Newton from a start; None where there is nothing to match.
 
@@ -67,7 +85,7 @@ def register(
         start: sideways, forward [m], yaw [rad], and heave [m] where it is unknown ``(3,)`` or ``(4,)``.
         level: smoothing and iterations.
         last: whether it is the finest level: both ways are drawn, and the fit is assessed.
-        heave_std_m: prior standard deviation of the heave.
+        held: what is known of the unknowns before.
 
     Returns:
         The motion, and its fit at the finest level.
@@ -78,22 +96,23 @@ def register(
         at = _linearised(*pair, cells, v, level, last=last)
         if at is None:
             return None
-        held = _held(at.scale, len(v), heave_std_m)
-        step = np.asarray(-np.linalg.solve(at.normal + np.diag(held), at.pull + held * v), dtype=np.float64)
+        weight = held.weight(at.scale, level)
+        step = np.asarray(
+            -np.linalg.solve(at.normal + np.diag(weight), at.pull + weight * (v - held.mean)), dtype=np.float64
+        )
         v = np.add(v, accelerate(v, step))
         converged = bool((np.abs(step[:3]) < STILL).all())
         if converged:
             break
     if not last or at is None:
         return v, None
-    return v, _fit(at, cells, v, level, _held(at.scale, len(v), heave_std_m), converged)
+    fit = _fit(at, cells, v, level, held.weight(at.scale, level), converged)
+    return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
 
 
-def _held(scale: float, unknowns: int, heave_std_m: float) -> NDArray[np.float64]:
-    """Return the prior weight of each unknown in units of the residuals' noise: only heave has one."""
-    held = np.zeros(unknowns)
-    held[3:] = scale**2 / heave_std_m**2 if heave_std_m else 0.0
-    return held
+def _is_small(step: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+    """Return whether a step is lost in the noise of the estimate ``(3, 3)``, however long it is."""
+    return bool(step @ np.linalg.lstsq(covariance, step, rcond=None)[0] < NEGLIGIBLE**2)
 
 
 class _Side(NamedTuple):
@@ -171,26 +190,42 @@ def _linearised(
 def _fit(
     at: _Linearisation, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
 ) -> Fit:
-    """Assess the motion from the gradients of blocks, and from slopes of one frame times those of the other."""
+    """Assess the motion from the gradients of single cells, and from slopes of one frame times those of the other.
+
+    Sums of gradients over blocks tell less: what interpolation leaves over changes sign within a block and cancels there.
+    """
     true = np.sum([_cross(side, cells, level) for side in at.sides], axis=0)
     undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else at.normal) + np.diag(held))
-    pulls = np.sum([side.sums(side.weighted * side.residual) for side in at.sides], axis=0)
+    pulls = [one.weighted * one.residual for one in at.sides]
+    spread = _alike(level) * sum((one @ one.T).astype(np.float64) for one in pulls)
     side = at.sides[0]
+    correlation = correlation_of(side.before[side.inner], side.after[side.inner])
     shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
     lifted = cells.lifted_shift(v)
     by_height = np.zeros(len(v))
     for one in at.sides:
         by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
-    # smoothed noise is alike in neighbouring cells: as many count once as a smoothing kernel covers
-    alike = 4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28)
     return Fit(
         converged=converged,
-        covariance=undone @ (pulls @ pulls.T) @ undone,
+        covariance=undone @ spread @ undone,
         by_height=undone @ by_height,
-        correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
-        independent=side.residual.size / alike,
+        correlation=correlation,
+        independent=side.residual.size / _alike(level),
         blocks=spread_of(shares[0]),
+        excess=_excess(side, cells) if correlation < LEAST_AT_BEST else 0.0,
     )
+
+
+def _excess(side: _Side, cells: Cells) -> float:
+    """Return by how much the frames correlate more than displaced across the beams."""
+    before, after = side.before[side.inner], side.after[side.inner]
+    inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
+    return correlation_excess(before, after, inside, BLOCK[1])
+
+
+def _alike(level: DirectLevel) -> float:
+    """Return how many cells count once: smoothed noise is alike in as many as a smoothing kernel covers."""
+    return float(4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28))
 
 
 def smoothed(image: Floats, level: DirectLevel) -> Floats:
