@@ -12,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
+from mitsonar.geometry.lit_ground import margin_of_light
 from mitsonar.motion.composition import inverse
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -39,15 +40,6 @@ class DirectLevel(NamedTuple):
 HEIGHT_STEP = 0.05
 """Step of the height for numerical derivatives, as a part of it."""
 
-MOSTLY = 0.5
-"""Part of the window that must show lit ground for the outline of the light to be left in."""
-
-NEARLY_ALL = 0.85
-"""Part of the window beyond which the outline costs little to leave out, as in a grazing look at a hull."""
-
-LIT = 0.9
-"""Part of the field of view's elevation that is free of its outline."""
-
 
 class Cells:
     """The cells of one level: where they are, and how they move with the sonar, in bins and beams."""
@@ -67,7 +59,7 @@ class Cells:
         )
         self.nodes = self._nodes(attitude.height_m)
         self.derivative = self._on_all(self.nodes)
-        self.seen = self._seen(known, np.radians(frames.sonar.elevation_fov_deg) / 2, reach)
+        self.seen = self._seen(known, frames.sonar.elevation_fov_deg, reach)
 
     def _ground(self, height: float) -> GroundGeometry:
         """Return the geometry at the nodes."""
@@ -84,16 +76,13 @@ class Cells:
             nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
         return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]]).astype(np.float32)
 
-    def _seen(self, known: NDArray[np.bool_], half_elevation: float, reach: tuple[int, ...]) -> Floats | None:
+    def _seen(self, known: NDArray[np.bool_], elevation_fov_deg: float, reach: tuple[int, ...]) -> Floats | None:
         """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
 
-        The outline of the lit ground moves with the sonar and biases motions to zero. It is masked where the ground is even,
-        and where most of the fan is not lit. Rocks blur it, and those that rise beyond it help.
+        See :func:`mitsonar.geometry.lit_ground.margin_of_light`.
         """
-        with np.errstate(invalid="ignore"):
-            lit = np.abs(self.ground.elevation(self.ground.points)) <= LIT * half_elevation
-        mask_lit = self.attitude.even or not MOSTLY <= lit.mean() <= NEARLY_ALL
-        shown = known & lit if mask_lit else known
+        margin = margin_of_light(self.ground, self.attitude, elevation_fov_deg)
+        shown = known if margin is None else known & (margin >= 0)
         if shown[self.from_node[0].min() :].all():
             return None
         grid = self.grid
@@ -102,7 +91,9 @@ class Cells:
             for values, nodes in ((grid.range_m, grid.node_range), (grid.bearing_rad, grid.node_bearing))
         )
         on_all = shown[row][:, column].astype(np.uint8)
-        return np.asarray(cv2.erode(on_all, np.ones(reach[::-1], np.uint8)) if mask_lit else on_all, dtype=np.float32)
+        return np.asarray(
+            cv2.erode(on_all, np.ones(reach[::-1], np.uint8)) if margin is not None else on_all, dtype=np.float32
+        )
 
     def _on_all(self, nodes: Floats) -> Floats:
         """Interpolate from the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import LEAST_AT_BEST, correlation_excess, correlation_of, spread_of
+from mitsonar.estimation.estimator import ambiguity, correlation_excess, correlation_of, spread_of
 from mitsonar.estimation.image.direct_blocks import block_of, by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
@@ -45,7 +45,7 @@ FEWEST_CELLS = 500
 class Fit(NamedTuple):
     """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes.
 
-    ``excess`` is how much a low correlation exceeds that of displaced frames.
+    ``excess`` is how much the correlation exceeds that of displaced frames.
     """
 
     converged: bool
@@ -199,7 +199,8 @@ def _fit(
     pulls = [one.weighted * one.residual for one in at.sides]
     spread = _alike(level) * sum((one @ one.T).astype(np.float64) for one in pulls)
     side = at.sides[0]
-    correlation = correlation_of(side.before[side.inner], side.after[side.inner])
+    independent = side.residual.size / _alike(level)
+    excess = _excess(side, cells)
     shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
     lifted = cells.lifted_shift(v)
     by_height = np.zeros(len(v))
@@ -207,12 +208,12 @@ def _fit(
         by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
     return Fit(
         converged=converged,
-        covariance=undone @ spread @ undone,
+        covariance=ambiguity(excess, independent) * undone @ spread @ undone,
         by_height=undone @ by_height,
-        correlation=correlation,
-        independent=side.residual.size / _alike(level),
+        correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
+        independent=independent,
         blocks=spread_of(shares[0]),
-        excess=_excess(side, cells) if correlation < LEAST_AT_BEST else 0.0,
+        excess=excess,
     )
 
 
