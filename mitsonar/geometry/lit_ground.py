@@ -54,4 +54,4 @@ def _margin(ground: GroundGeometry, elevation_fov_deg: float) -> NDArray[np.floa
     """Return the margin of each cell ``(bins, beams)``."""
     with np.errstate(invalid="ignore"):
         elevation = np.abs(ground.elevation(ground.points))
-    return np.nan_to_num(1 - elevation / (LIT * np.radians(elevation_fov_deg) / 2), nan=-1.0)
+    return np.asarray(np.nan_to_num(1 - elevation / (LIT * np.radians(elevation_fov_deg) / 2), nan=-1.0))

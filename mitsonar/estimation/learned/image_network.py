@@ -260,8 +260,8 @@ def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
     reasons = []
     for comparison in COMPARISONS:
         first, second, inside = _brought_together(images, ground, motion, comparison)
-        options = {"alike": comparison.alike, "block": BLOCK, "aside": BLOCK // 2}
-        reasons.append(matching_rejection(first, second, inside, **options))
+        alike, aside = comparison.alike, BLOCK // 2
+        reasons.append(matching_rejection(first, second, inside, alike=alike, block=BLOCK, aside=aside))
         if not reasons[-1]:
             return ""
     return reasons[0]
