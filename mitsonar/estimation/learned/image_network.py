@@ -16,6 +16,7 @@ from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.datasets.ground_nodes import ground_of, light_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import (
+    LEAST_AT_BEST,
     Estimate,
     ambiguity,
     blank,
@@ -257,14 +258,17 @@ def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
 
 def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
     """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
-    reasons = []
-    for comparison in COMPARISONS:
-        first, second, inside = _brought_together(images, ground, motion, comparison)
-        alike, aside = comparison.alike, BLOCK // 2
-        reasons.append(matching_rejection(first, second, inside, alike=alike, block=BLOCK, aside=aside))
-        if not reasons[-1]:
-            return ""
-    return reasons[0]
+    coarse, fine = COMPARISONS
+    reason = _mismatch(images, ground, motion, coarse)
+    if reason and _correlation_of_answer(images, ground, motion) < LEAST_AT_BEST:
+        return reason if _mismatch(images, ground, motion, fine) else ""
+    return reason
+
+
+def _mismatch(images: Pair, ground: Ground, motion: Motion, comparison: Comparison) -> str:
+    """Return why the frames that an answer has brought together do not match; empty where they do."""
+    first, second, inside = _brought_together(images, ground, motion, comparison)
+    return matching_rejection(first, second, inside, alike=comparison.alike, block=BLOCK, aside=BLOCK // 2)
 
 
 def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> float:
