@@ -36,7 +36,7 @@ def hull(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Simulator:
 @pytest.mark.parametrize("noise", ["none", "low"])
 @pytest.mark.parametrize("method", ["direct", pytest.param("corrnet", marks=pytest.mark.learn)])
 def test_the_outline_of_the_light_holds_nothing_back(hull: Simulator, method: str, noise: str) -> None:
-    """It moves with the sonar: matched, it made this motion of corrnet 2.2 mm too short in low noise, at a squared error of 28."""
+    """It moves with the sonar: matched, it took 2.2 mm off this motion of corrnet in low noise (squared error 28)."""
     poses = Trajectory(np.array([START, compose(START, MOTION)]), np.array([0.0, 0.1]))
     found = create_estimator(method).estimate(hull.render(poses, noise=NOISE_MODELS[noise], seed=3))
     error = (np.array(found.motion) - MOTION) * UNITS
