@@ -29,7 +29,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.open_frames import open_frames
-from mitsonar.mapping.open_source import with_assumed_plane
+from mitsonar.mapping.open_source import LOOP, with_assumed_plane
 from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -46,7 +46,7 @@ GEOMETRIES = Path(__file__).resolve().parents[1] / "tests/recordings/geometries"
 
 CHAIN = "marine-debris-aris3000/forward_chain.npz"
 
-SHIFT_PIXELS, SHIFT_DEG, LOOP = 3.0, 0.5, 8
+SHIFT_PIXELS, SHIFT_DEG = 3.0, 0.5
 
 
 def opened(path: Path) -> FrameSource:

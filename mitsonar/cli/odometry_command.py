@@ -74,8 +74,8 @@ def odometry(
     sensors: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with unit and noise; or a "
-            "ROS bag. They join with the frames in a pose graph.",
+            help="CSV file of gyroscope, DVL, depth, compass or dead reckoning, columns by name with unit and noise, also "
+            "beside the poses of a trajectory; or a ROS bag. They join with the frames in a pose graph.",
         ),
     ] = None,
     local_map: Annotated[
@@ -111,8 +111,9 @@ def odometry(
 ) -> None:
     """Estimate the motion between consecutive frames, and integrate the path.
 
-    OUT holds estimated.tum, true.tum if poses are known, motions.csv, covariances.npz, table.md, table.json, path.png,
-    run.json, and estimates.jsonl, from which --resume continues. With --loops also loops.csv.
+    OUT holds estimated.tum, true.tum if poses are known, motions.csv, covariances.npz, height_profile.csv if heights are
+    measured, table.md, table.json, path.png, run.json, and estimates.jsonl, from which --resume continues. With --loops
+    also loops.csv.
     """
     from mitsonar.estimation.named_estimators import estimator_from
     from mitsonar.mapping.bag_sensors import open_sensors

@@ -118,7 +118,11 @@ class DataStore:
                 f"no data set at {storage.url}: {reason}; give what `mitsonar dataset make` or `dataset from-frames` wrote"
             ) from None
         if not ours:
-            raise MitsonarError(f"{storage.url} is a Zarr group but no data set of mitsonar")
+            kind = shortened(attributes.get("kind"))
+            raise MitsonarError(
+                f"{storage.url} is no data set of mitsonar, but a Zarr group of the kind {kind}: give what `mitsonar "
+                "dataset make` or `dataset from-frames` wrote"
+            )
         if known != FORMAT:
             raise MitsonarError(
                 f"{storage.url} has format {shortened(known)}, this mitsonar reads {FORMAT}: use the version that made it"
@@ -135,7 +139,8 @@ class DataStore:
             ) from None
         if not unfinished and not store.finished:
             raise MitsonarError(
-                f"{storage.url} is not finished: run the same `mitsonar dataset make` again, it continues where it stopped"
+                f"{storage.url} is not finished, and only a whole data set is read: run the same `mitsonar dataset make` "
+                "again, it continues where it stopped"
             )
         return store
 

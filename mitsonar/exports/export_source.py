@@ -89,8 +89,9 @@ def open_export(where: str | Path, *, view: str | None = None) -> ExportSource:
         index = np.arange(part.start, part.stop)
         frames = source.read(index)
         labels: dict[str, Any] = {name: np.asarray(array[part]) for name, array in stored.items()}
-        poses = None if source.poses is None else source.poses[part]
-        return replace(frames, poses=poses, **like, **labels)
+        # estimators are not given these, and exports are
+        poses, attitude = (None if values is None else values[part] for values in (source.poses, source.attitude_rad))
+        return replace(frames, poses=poses, attitude_rad=attitude, **like, **labels)
 
     base = replace(source.like, **like)
     sequence, posed = np.zeros(len(source), np.int64), source.poses is not None

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, argument
+from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
@@ -77,6 +78,16 @@ class Attitude:
         """Height over the floor, where the fan begins to light it [m]: as told, but there may be a rock straight below."""
         return self.height_m if self.told_m is None else max(self.told_m, self.height_m)
 
+    @property
+    def by_echoes(self) -> bool:
+        """Whether first echoes tell the height."""
+        return self.height_std_m < STD_GIVEN * self.height_m
+
+    def ground(self, frames: SonarFrames) -> GroundGeometry:
+        """Return the level ground that the cells of the frames show from this height and attitude."""
+        bearing = frames.sonar.bearing
+        return GroundGeometry(frames.range_m, frames.bearing_rad, bearing, self.height_m, self.pitch_rad, self.roll_rad)
+
 
 def attitude_of(
     frames: SonarFrames, name: str, height_m: float | None, pitch_rad: float | None, relief_m: float | None = None
@@ -95,8 +106,8 @@ def attitude_of(
     Raises:
         MitsonarError: no pitch; a height neither given nor measured, or not above 0 or the relief.
     """
-    pose = _mean_pose(frames)
-    pitch = pitch_rad if pitch_rad is not None else (None if pose is None else float(pose[3]))
+    lean = _mean_lean(frames)
+    pitch = pitch_rad if pitch_rad is not None else (None if lean is None else float(lean[0]))
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
         raise MitsonarError(
@@ -105,7 +116,7 @@ def attitude_of(
         )
     if given is not None and not 0 < given < np.inf:
         raise MitsonarError(f"{name} needs a height above 0 m: got {given:g}; give {argument('height_m')}")
-    roll = 0.0 if pose is None else float(pose[4])
+    roll = 0.0 if lean is None else float(lean[1])
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     if given is not None and pitch + half > np.pi / 2:
         reason = "the sonar looks past straight down: a cell shows two points of the ground"
@@ -131,11 +142,12 @@ def attitude_of(
     return Attitude(measured.height_m, std, pitch, roll, even=measured.even, told_m=given)
 
 
-def _mean_pose(frames: SonarFrames) -> NDArray[np.float64] | None:
-    """Return the mean of the poses ``(6,)``; None where pitch or roll is unknown."""
-    if frames.poses is None or not np.isfinite(frames.poses[:, 3:5]).all():
+def _mean_lean(frames: SonarFrames) -> NDArray[np.float64] | None:
+    """Return the mean of pitch and roll ``(2,)``, by the poses or by the sonar's own sensors; None where unknown."""
+    table, columns = (frames.attitude_rad, slice(0, 2)) if frames.poses is None else (frames.poses, slice(3, 5))
+    if table is None or not np.isfinite(table[:, columns]).all():
         return None
-    return np.asarray(frames.poses.mean(axis=0))
+    return np.asarray(table.mean(axis=0)[columns])
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:
@@ -160,8 +172,8 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
     smooth = cv2.GaussianBlur(image, (3, 13), sigmaX=0.5, sigmaY=2.0, borderType=cv2.BORDER_REPLICATE)
     start, bins = smooth[:15], len(smooth)
-    dark = float(np.percentile(start, 25))
-    spread = (dark - float(np.percentile(start, 5))) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
+    darkest, dark = (float(level) for level in np.percentile(start, [5, 25]))
+    spread = (dark - darkest) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
     bright = float(smooth[bins // 4 : 3 * bins // 4].mean())
     over = smooth > dark + max(5 * spread, 0.15 * (bright - dark), FAINTEST)
     first = over.argmax(axis=0)
@@ -172,8 +184,8 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
     steepest = directions(frames.sonar.bearing, frames.bearing_rad, -half)
     down = -vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).apply(steepest)[:, 2]
     drop = (frames.range_m[first] * down)[received]
-    height = float(drop.mean() - TOPS * (np.percentile(drop, 90) - drop.mean()))
-    low, high = np.percentile(drop, [25, 75])
+    low, high, lowest = np.percentile(drop, [25, 75, 90])
+    height = float(drop.mean() - TOPS * (lowest - drop.mean()))
     if frames.sonar.vertical_pattern != "box" and high - low < EVEN_SKIRT * height:
         return None
     return _FirstEchoes(height, bool(high - low < EVEN * height)) if height > 0 else None

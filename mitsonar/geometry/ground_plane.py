@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from array_api_compat import array_namespace, is_array_api_obj
@@ -40,7 +40,7 @@ class GroundGeometry:
     @cached_property
     def turn(self) -> NDArray[np.float64]:
         """Return the sonar's starboard, forward and up in level axes, as columns ``(3, 3)``."""
-        return np.asarray(vehicle_rotation(Pose(0, 0, 0, self.pitch_rad, self.roll_rad, 0)).as_matrix()[0])
+        return _turn(self.pitch_rad, self.roll_rad)
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
@@ -104,6 +104,14 @@ class GroundGeometry:
         below = points.dtype.type(self.height_m)
         starboard, forward, up = (x * turn[0, k] + y * turn[1, k] - below * turn[2, k] for k in range(3))
         return starboard, forward, up
+
+
+@lru_cache(maxsize=16)
+def _turn(pitch: float, roll: float) -> NDArray[np.float64]:
+    """Return the axes of a sonar; kept, since many geometries differ by their height alone."""
+    axes = np.asarray(vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).as_matrix()[0], dtype=np.float64)
+    axes.setflags(write=False)
+    return axes
 
 
 def arc_elevation(

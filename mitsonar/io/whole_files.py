@@ -97,6 +97,27 @@ def read_bytes(path: str | Path, what: str, limit: int) -> bytes:
     return content
 
 
+def whole_lines(path: Path, what: str, limit: int) -> list[bytes]:
+    """Read the lines of a file that lines are added to. Cut off one that a kill left half written.
+
+    Args:
+        path: of the file; where there is none, there are no lines.
+        what: kind of file, for errors.
+        limit: largest size in bytes.
+
+    Raises:
+        MitsonarError: not readable, or larger than the limit.
+    """
+    if not path.exists():
+        return []
+    content = read_bytes(path, what, limit)
+    whole = content[: content.rfind(b"\n") + 1]
+    if len(whole) < len(content):
+        with path.open("r+b") as file:
+            file.truncate(len(whole))
+    return whole.splitlines()
+
+
 def read_json(path: str | Path, *, check: bool = True) -> dict[str, PlainValue]:
     """Read the object in a JSON file.
 

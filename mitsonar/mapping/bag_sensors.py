@@ -26,6 +26,9 @@ TWISTS = ("geometry_msgs/msg/TwistWithCovarianceStamped", "nav_msgs/msg/Odometry
 DOWN = ("ned", "frd")
 """Ends of the names of frames whose axes are forward, starboard, down; the others are forward, port, up (REP 103)."""
 
+TRAJECTORY = "trajectory.csv"
+"""The file of a folder whose columns may hold readings."""
+
 LARGEST = 1e6
 """Largest time step, velocity, rate and variance that counts."""
 
@@ -33,10 +36,17 @@ LARGEST = 1e6
 def open_sensors(path: str | Path) -> VehicleSensors:
     """Open the sensors of a CSV file (:func:`mitsonar.mapping.sensor_files.load_sensors`) or of a ROS bag.
 
+    Args:
+        path: of either, or a folder that holds ``trajectory.csv``, with columns of sensors.
+
     Raises:
         MitsonarError: unreadable, or without readings.
     """
     where = Path(path)
+    if where.is_dir() and not is_ros_bag(where, b""):
+        if not (where / TRAJECTORY).is_file():
+            raise MitsonarError(f"{path} holds no {TRAJECTORY}: give a CSV file of sensors, a folder with one, or a ROS bag")
+        return load_sensors(where / TRAJECTORY)
     try:
         first = b""
         if where.is_file():

@@ -70,7 +70,6 @@ class SimulatedSet:
     """A world and a sonar over it.
 
     Attributes:
-        about: in words.
         family: of the world.
         preset: of the sonar.
         window: changes of the preset.
@@ -80,7 +79,6 @@ class SimulatedSet:
         slope_deg: angle at which the ground rises forward [deg].
     """
 
-    about: str
     family: Family
     preset: str
     window: dict[str, Any]
@@ -113,11 +111,10 @@ class SimulatedSet:
 
 
 SETS: dict[str, SimulatedSet] = {
-    "rocks": SimulatedSet(
-        "DIDSON over rocks", RockyField(size_m=30), "didson300", {"range_min": 3.2, "range_max": 5.6}, 2.5, 35, 16
-    ),
+    # DIDSON over rocks
+    "rocks": SimulatedSet(RockyField(size_m=30), "didson300", {"range_min": 3.2, "range_max": 5.6}, 2.5, 35, 16),
+    # Oculus of 130 deg over rocks that rise forward
     "slope": SimulatedSet(
-        "Oculus of 130 deg over rocks that rise forward by 10 deg",
         RockyField(size_m=30),
         "oculus-m750d-750khz",
         {"range_min": 5.0, "range_max": 9.0, "range_bins": 400, "beams": 256},
@@ -126,10 +123,9 @@ SETS: dict[str, SimulatedSet] = {
         35,
         slope_deg=10,
     ),
-    "hull": SimulatedSet(
-        "DIDSON along a hull", ShipHull(), "didson300", {"range_min": 1.5, "range_max": 5.0}, 0.32, 4, 22
-    ),
-}  # fmt: skip
+    # DIDSON along a hull
+    "hull": SimulatedSet(ShipHull(), "didson300", {"range_min": 1.5, "range_max": 5.0}, 0.32, 4, 22),
+}
 """The sets by name."""
 
 

@@ -10,14 +10,17 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, PlainTable
-from mitsonar.io.plain_data import parse_json, whole_number
-from mitsonar.io.whole_files import read_bytes
+from mitsonar.io.plain_data import finite_number, parse_json, whole_number
+from mitsonar.io.whole_files import whole_lines
 from mitsonar.motion.composition import Motion
 
 __all__ = ["add_to_journal", "read_journal"]
 
 LARGEST_JOURNAL = 2**30
 """Bytes: some three million pairs."""
+
+HEIGHTS = ("height_m", "height_std_m")
+"""What an estimator may tell of the height over the ground [m]."""
 
 
 def add_to_journal(path: Path, of: PlainTable, estimate: Estimate) -> None:
@@ -31,8 +34,8 @@ def add_to_journal(path: Path, of: PlainTable, estimate: Estimate) -> None:
     covariance = None if estimate.covariance is None else np.asarray(estimate.covariance, dtype=float).tolist()
     motion = [float(value) for value in estimate.motion]
     line = of | {"motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
-    alike = {name: estimate.about[name] for name in ("modes", "spreads") if name in estimate.about}
-    text = json.dumps(line | {"reason": estimate.reason} | ({"about": alike} if alike else {})) + "\n"
+    about = {name: estimate.about[name] for name in ("modes", "spreads", *HEIGHTS) if name in estimate.about}
+    text = json.dumps(line | {"reason": estimate.reason} | ({"about": about} if about else {})) + "\n"
     with path.open("a", encoding="utf-8") as file:
         file.write(text)
 
@@ -47,14 +50,7 @@ def read_journal(path: Path, *names: str) -> Iterator[tuple[PlainTable, Estimate
     Raises:
         MitsonarError: the journal is damaged.
     """
-    if not path.exists():
-        return
-    content = read_bytes(path, "journal", LARGEST_JOURNAL)
-    whole = content[: content.rfind(b"\n") + 1]
-    if len(whole) < len(content):
-        with path.open("r+b") as file:
-            file.truncate(len(whole))
-    for number, line in enumerate(whole.splitlines(), start=1):
+    for number, line in enumerate(whole_lines(path, "journal", LARGEST_JOURNAL), start=1):
         try:
             found = _estimate_in(line, names)
         except Exception:  # a line leads to whatever its bytes do
@@ -76,6 +72,8 @@ def _estimate_in(line: bytes, names: tuple[str, ...]) -> tuple[PlainTable, Estim
     about = table.get("about", {})
     if not isinstance(about, dict):
         raise ValueError("about is no table")
+    for name in set(HEIGHTS) & set(about):
+        finite_number(about[name], name, above=0)
     of: PlainTable = {name: whole_number(table[name], name, 0, 2**40) for name in names}
     if "first" in names:
         of["guess"] = Motion(*(float(value) for value in np.array(table["guess"], dtype=float).reshape(3)))

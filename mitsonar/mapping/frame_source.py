@@ -51,6 +51,7 @@ class FrameSource:
         height_m: over the ground ``(frames,)``, where known; nan where nothing is below.
         pitch_rad: of the sonar, where its poses are not known.
         told_height_m: the height that the user gave for frames without one.
+        assumed_height: whether ``height_m`` is assumed, since nobody tells it.
         noise: added to the frames that are read.
         seed: of the noise.
         first_number: number of the first frame, of which the noise is a function.
@@ -69,6 +70,7 @@ class FrameSource:
     height_m: Array | None = None
     pitch_rad: float | None = None
     told_height_m: float | None = None
+    assumed_height: bool = False
     noise: NoiseModel | None = None
     seed: int = 0
     first_number: int = 0
@@ -234,7 +236,7 @@ class FrameSource:
             self.like,
             image=image,
             time_s=self.time_s[chosen],
-            poses=self._attitudes(chosen),
+            poses=self.attitudes(chosen),
             attitude_rad=None,
             height_m=None if self.height_m is None else self.height_m[chosen],
         )
@@ -247,8 +249,8 @@ class FrameSource:
         level = level if self.pattern_db is None else level - self.pattern_db
         return replace(frames, image=contrast.apply(level), level="contrast")
 
-    def _attitudes(self, chosen: Index) -> Array | None:
-        """Return poses without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
+    def attitudes(self, chosen: Index) -> Array | None:
+        """Return poses of frames without position and heading ``(n, 6)``; None where neither poses nor pitch are known."""
         if self.poses is not None:
             return self.poses[chosen] * [0, 0, 1, 1, 1, 0]
         if self.pitch_rad is not None:
@@ -282,7 +284,7 @@ class FrameSource:
                 f"{self.time_s[-1]:g} s, and no pose is within {tolerance_s:g} s of a frame: give the path of this run"
             ) from None
         poses = path.poses[there].copy()
-        attitudes = self._attitudes(index)
+        attitudes = self.attitudes(index)
         if attitudes is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
             poses[:, 3:5] = attitudes[:, 3:5]
         return index, poses

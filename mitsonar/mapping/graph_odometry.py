@@ -41,14 +41,12 @@ class LoopTask:
     """What a search for loops needs.
 
     Attributes:
-        source: of the frames.
-        estimator: registers two of them.
+        estimator: registers two frames.
         numbers: of the frames used ``(frames,)``.
         known: registrations of an earlier run.
         keep: called with each new one.
     """
 
-    source: FrameSource
     estimator: AnyEstimator
     numbers: Index
     known: KnownLoops | None = None
@@ -83,11 +81,6 @@ class GraphPath:
     def end_told_m(self) -> float:
         """Return the standard deviation of the position of the end [m]."""
         return float(np.sqrt(np.trace(self.covariances[-1, :2, :2])))
-
-    @property
-    def loops(self) -> PoseEdges:
-        """Return the loops that were kept."""
-        return PoseEdges.none() if self.search is None else self.search.loops.at(self.kept)
 
     def rows(self, true: Trajectory | None) -> list[tuple[str, float, str]]:
         """Return name, value and unit of what the graph adds to the results; ``true`` is the true path at the frames."""
@@ -159,10 +152,10 @@ def graph_path(
     before = after = solved(graph)
     search = None
     if loops is not None:
-        if canvas is None:
+        if source is None or canvas is None:
             raise MitsonarError("a search for loops needs frames that show level ground: give the height and the pitch")
         search = search_loops(
-            loops.source, loops.estimator, loops.numbers, before, errors, canvas, known=loops.known, keep=loops.keep
+            source, loops.estimator, loops.numbers, before, errors, canvas, known=loops.known, keep=loops.keep
         )
         after = _closed(replace(graph, start=before.poses), search, before)
     return _path_of(after, before, measured.time_s, start, sensors, search)

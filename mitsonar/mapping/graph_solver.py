@@ -33,8 +33,8 @@ CAUCHY = float(chi2.ppf(0.95, 3))
 OUTLIER = float(chi2.ppf(0.999, 3))
 """Squared residual over the covariance beyond which a loop is an outlier: of 1,000 true loops one is."""
 
-COLUMNS = 384
-"""Columns of the inverse that are computed at a time."""
+COLUMNS, ENTRIES = 384, 2**23
+"""Columns of the inverse that are computed at a time, and the numbers in them, at most."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,9 @@ class GraphSolution:
         """Return the marginal covariances of poses ``(poses, 3, 3)``, and those with the next pose ``(poses - 1, 3, 3)``."""
         count = len(self.poses)
         own, following = np.zeros((count, 3, 3)), np.zeros((count - 1, 3, 3))
-        for begin in range(0, count, COLUMNS // 3):
-            chosen = np.arange(begin, min(begin + COLUMNS // 3, count))
+        step = max(1, min(COLUMNS, ENTRIES // self.factor.shape[0]) // 3)
+        for begin in range(0, count, step):
+            chosen = np.arange(begin, min(begin + step, count))
             table = self.columns(chosen)
             own[chosen] = table[chosen, :, np.arange(len(chosen))]
             before = chosen[chosen > 0]

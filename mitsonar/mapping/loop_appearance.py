@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.image.ground_view import GroundView
+from mitsonar.estimation.image.ground_view import GroundView, fan_places
 from mitsonar.geometry.attitude import attitude_of
-from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -61,7 +60,7 @@ class Canvas:
         if attitude.reason or not middle > 0:
             return None
         canvas = cls(GroundView(frame, attitude, middle / CELLS_A_REACH))
-        return canvas if min(canvas.points.shape[:2]) >= FEWEST_CELLS else None
+        return canvas if min(canvas.view.points.shape[:2]) >= FEWEST_CELLS else None
 
     @property
     def reach_m(self) -> float:
@@ -75,17 +74,9 @@ class Canvas:
         return min(right - left, far - near)
 
     @cached_property
-    def points(self) -> Array:
-        """Return the ground of each cell: starboard, forward [m]; row 0 farthest forward ``(rows, columns, 2)``."""
-        left, right, near, far = self.view.reach
-        edge = self.view.edge
-        x, y = np.arange(left, right, edge) + edge / 2, np.arange(far, near, -edge) - edge / 2
-        return np.stack(np.meshgrid(x, y), axis=-1)
-
-    @cached_property
     def shape(self) -> tuple[int, int]:
         """Return the size of transforms in which a shifted view does not wrap around."""
-        rows, columns, _ = self.points.shape
+        rows, columns, _ = self.view.points.shape
         return cv2.getOptimalDFTSize(2 * rows), cv2.getOptimalDFTSize(2 * columns)
 
     def draw(self, frame: SonarFrames) -> CoarseView | None:
@@ -96,21 +87,13 @@ class Canvas:
             return None
         if own.reason:
             return None
-        ground = GroundGeometry(
-            frame.range_m, frame.bearing_rad, frame.sonar.bearing, own.height_m, own.pitch_rad, own.roll_rad
-        )
-        radius, bearing = ground.to_polar(self.points)
-        row = np.interp(radius, frame.range_m, np.arange(len(frame.range_m)), left=-1, right=-1)
-        column = np.interp(bearing, frame.bearing_rad, np.arange(len(frame.bearing_rad)), left=-1, right=-1)
-        lit = np.abs(ground.elevation(self.points)) <= np.radians(frame.sonar.elevation_fov_deg) / 2
-        inside = ((row >= 0) & (column >= 0) & lit).astype(np.float32)
+        row, column, shown = fan_places(own.ground(frame), frame.sonar, self.view.points)
+        inside = shown.astype(np.float32)
         if inside.sum() < FEWEST_CELLS**2:
             return None
         bins = self.view.edge / float(np.median(np.diff(frame.range_m)))
         smooth = cv2.GaussianBlur(frame.matching_values()[0], (0, 0), sigmaX=0.5, sigmaY=max(0.4 * bins, 0.3))
-        image = cv2.remap(
-            np.asarray(smooth, dtype=np.float32), column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR
-        )
+        image = cv2.remap(np.asarray(smooth, dtype=np.float32), column, row, cv2.INTER_LINEAR)
         weight = cv2.GaussianBlur(inside, (0, 0), LOCAL) + 1e-6
         image = np.asarray((image - cv2.GaussianBlur(image * inside, (0, 0), LOCAL) / weight) * inside, dtype=np.float32)
         spread = float(np.sqrt((image**2).sum() / inside.sum()))

@@ -109,13 +109,17 @@ class _Candidate(NamedTuple):
 class _Searched:
     """A path, its covariances, and the views of its keyframes."""
 
-    poses: Array
     own: Array
     solution: GraphSolution
     keys: Index
     views: dict[int, CoarseView]
     travelled: Array
     canvas: Canvas
+
+    @property
+    def poses(self) -> Array:
+        """Return x, y [m] and heading [rad] along the path ``(frames, 3)``."""
+        return self.solution.poses
 
     @property
     def reach(self) -> float:
@@ -204,7 +208,7 @@ def _searched(source: FrameSource, numbers: Index, solution: GraphSolution, canv
     drawn = {int(key): canvas.draw(source.read([numbers[key]])) for key in keys}
     views = {key: view for key, view in drawn.items() if view is not None}
     own, _ = solution.covariances()
-    return _Searched(poses, own, solution, keys, views, travelled, canvas)
+    return _Searched(own, solution, keys, views, travelled, canvas)
 
 
 # ---------------------------------------------------------------- appearance

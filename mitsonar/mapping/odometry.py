@@ -22,6 +22,7 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, graph_path
+from mitsonar.mapping.height_profile import HeightProfile, height_profile
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops
 from mitsonar.mapping.mode_continuity import continued
@@ -64,6 +65,7 @@ class Odometry:
         smooth: how the motions were smoothed.
         factors: by which the estimates were multiplied, for sideways, forward, yaw ``(3,)``.
         fitted: whether these factors come from the true path.
+        heights: over the ground along the path.
         closure: what loops of motions leave over, where it was asked for.
         graph: the pose graph's path, where sensors or loops were asked for.
     """
@@ -76,6 +78,7 @@ class Odometry:
     smooth: Smoothing
     factors: Array
     fitted: bool
+    heights: HeightProfile
     closure: Closure | None = None
     graph: GraphPath | None = None
 
@@ -200,19 +203,21 @@ def odometry(
     estimates = continued(estimates)
     closing = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
     estimates = estimates if closing is None else closing.honest(estimates)
+    heights = partial(height_profile, source, numbers, estimates, sensors)
     estimates = mapped(shown, numbers, estimates, progress) if local_map and shown is not None else estimates
     measured = series_of(estimates, time_s)
     factors = _scale_factors(measured, source.true, numbers, scale)
     measured, first = scaled(measured, factors), start or _start(source, int(numbers[0]))
     series = _SMOOTHED[smooth](measured)
     path = path_of(series.motions, first, series.time_s)
-    plain = Odometry(numbers, estimates, series, path, source.true, smooth, factors, isinstance(scale, str), closing)
+    fitted = isinstance(scale, str)
+    plain = Odometry(numbers, estimates, series, path, source.true, smooth, factors, fitted, heights(path), closing)
     if sensors is None and not loops:
         return plain
-    task = LoopTask(shown, estimator, numbers, known_loops, keep_loop) if loops and shown is not None else None
+    task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
     known_start = start is not None or source.poses is not None
     graph = graph_path(measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown)
-    return replace(plain, series=graph.series, path=graph.path, graph=graph)
+    return replace(plain, series=graph.series, path=graph.path, heights=heights(graph.path), graph=graph)
 
 
 def _ground_shown(

@@ -19,7 +19,7 @@ from mitsonar.estimation.named_estimators import EXTERNAL, estimator_from
 from mitsonar.io.plain_data import parse_json
 from mitsonar.io.provenance import digest, versions
 from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import read_bytes, read_json, write_json, write_whole
+from mitsonar.io.whole_files import read_json, whole_lines, write_json, write_whole
 from mitsonar.mapping.benchmark_row import LENGTHS_M, Case, measured_row
 from mitsonar.mapping.benchmark_sets import NOISES, SEED, SETS, TEXTURES, Begin, RenderedSet
 from mitsonar.mapping.benchmark_table import benchmark_lines
@@ -199,14 +199,8 @@ class _Bench:
         Raises:
             MitsonarError: the journal is damaged.
         """
-        if not self.journal.exists():
-            return {}
-        content = read_bytes(self.journal, "journal", LARGEST_JOURNAL)
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) < len(content):
-            write_whole(self.journal, whole)
         rows = {}
-        for number, line in enumerate(whole.splitlines(), start=1):
+        for number, line in enumerate(whole_lines(self.journal, "journal", LARGEST_JOURNAL), start=1):
             try:
                 row = parse_json(line, "the line")
                 rows[row["set"], row["texture"], row["noise"], row["method"]] = row

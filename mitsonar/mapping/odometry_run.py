@@ -41,7 +41,7 @@ ODOMETRY = RunKind(
     "odometry",
     outputs=(
         *("estimates.jsonl", "loops.jsonl", "loops.csv", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
-        *("table.md", "table.json", "path.png"),
+        *("table.md", "table.json", "path.png", "height_profile.csv"),
     ),
     notes={
         **{"source": str, "inputs": str, "smooth": str, "scale": str | None, "frame": str, "factors": list, "from": list},
@@ -157,6 +157,10 @@ class OdometryFolder:
             _save_tum(self.path / "true.tum", found.true, frame)
         write_whole(self.path / "motions.csv", _motions_csv(found).encode())
         write_whole(self.path / "covariances.npz", _covariances(found))
+        if np.isfinite(found.heights.height_m).any():
+            write_whole(self.path / "height_profile.csv", found.heights.csv().encode())
+        else:
+            (self.path / "height_profile.csv").unlink(missing_ok=True)  # of frames that told heights
         if found.graph is not None and found.graph.search is not None:
             write_whole(self.path / "loops.csv", _loops_csv(found, found.graph.search.loops, found.graph.kept).encode())
         else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from zipfile import is_zipfile
@@ -66,13 +67,15 @@ def open_frames(
 def load_frames(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
 ) -> SonarFrames:
-    """Load all frames at a path or URL into memory; see :func:`open_frames`.
+    """Load all frames at a path or URL into memory, with true poses where they are known; see :func:`open_frames`.
+
+    Labels are not loaded: :meth:`mitsonar.SonarFrames.load` loads those of a run.
 
     Raises:
         MitsonarError: no frames there; a sequence or view that is not there.
     """
     source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
-    return source.read(np.arange(len(source)))
+    return replace(source.read(np.arange(len(source))), poses=source.poses, attitude_rad=source.attitude_rad)
 
 
 def is_data_set(where: str | Path) -> bool:

@@ -200,7 +200,7 @@ def with_assumed_plane(source: FrameSource) -> FrameSource:
         stacklevel=3,
     )
     known = source.pitch_rad if source.pitch_rad is not None else pitch
-    return replace(source, height_m=np.full(len(source), height), pitch_rad=known)
+    return replace(source, height_m=np.full(len(source), height), assumed_height=True, pitch_rad=known)
 
 
 def _with_heights(source: Framed, reading: Reading) -> Framed:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
 from mitsonar.io.whole_files import write_whole
 from mitsonar.mapping.vehicle_sensors import DeadReckoning, Readings, VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.motion.trajectory_files import ALIASES
 from mitsonar.recordings.csv_table import CsvTable
 
 __all__ = ["COLUMNS", "ROOT_HOUR", "load_sensors", "save_sensors"]
@@ -29,12 +31,16 @@ COLUMNS = {
     "forward_m_s": ("forward_std_m_s", 1.0, 1.0),
     "depth_m": ("depth_std_m", 1.0, 1.0),
     "heading_deg": ("heading_std_deg", DEG, DEG),
+    "compass_deg": ("compass_std_deg", DEG, DEG),
 }
 """Columns of readings; the column of their noise; the factors of both to m, rad and s."""
 
 RECKONED = ("reckoned_x_m", "reckoned_y_m", "reckoned_heading_deg")
 WALKS = ("reckoned_walk_m_rts", "reckoned_walk_deg_rts")
 """Columns of poses by dead reckoning, and of their random walk per root second."""
+
+OF_POSES = {name for axis in "xy" for name in ALIASES[axis]}
+"""Columns of positions. Beside them ``heading_deg`` is the heading of a pose, which may be the true one."""
 
 BIAS = "yaw_rate_bias_deg_h"
 TIMES = ("time_s", "time", "timestamp")
@@ -47,7 +53,8 @@ def load_sensors(path: str | Path) -> VehicleSensors:
     """Load the readings of sensors from a CSV file.
 
     Its first line names the columns: ``time_s`` (or ``time``, ``timestamp``), and those of the sensors there are. A sensor's
-    noise is a column of its own; its first number counts where later ones are missing. Other columns are not read.
+    noise is a column of its own; its first number counts where later ones are missing. Other columns are not read: the file
+    may be a trajectory (:meth:`mitsonar.Trajectory.load`), whose poses may be the true ones.
 
     | sensor | columns | columns of its noise |
     |---|---|---|
@@ -56,6 +63,7 @@ def load_sensors(path: str | Path) -> VehicleSensors:
     | DVL | ``sideways_m_s`` to starboard, ``forward_m_s`` | ``sideways_std_m_s``, ``forward_std_m_s``, of a reading |
     | depth | ``depth_m`` | ``depth_std_m`` |
     | compass | ``heading_deg``, clockwise from north | ``heading_std_deg`` |
+    | | or ``compass_deg``; beside columns of poses only this | ``compass_std_deg`` |
     | dead reckoning | ``reckoned_x_m``, ``reckoned_y_m`` | ``reckoned_walk_m_rts``, after a second |
     | | ``reckoned_heading_deg`` | ``reckoned_walk_deg_rts`` |
 
@@ -65,13 +73,15 @@ def load_sensors(path: str | Path) -> VehicleSensors:
     """
     table = CsvTable(Path(path))
     time = _column(table, _time_name(table), whole=True)
-    known = [name for name in (*COLUMNS, *RECKONED) if name in table.names]
+    known = _sensor_columns(table)
     if not known:
         wanted = ", ".join((*COLUMNS, *RECKONED))
         raise MitsonarError(f"{path} has no column of a sensor ({', '.join(table.names)[:80]}): known are {wanted}")
     doubled = sorted({name for name in table.names if table.names.count(name) > 1})
     if doubled:
         raise MitsonarError(f"{path} has the column {doubled[0]} more than once: leave one out")
+    if {"heading_deg", "compass_deg"} <= set(known):
+        raise MitsonarError(f"{path} has headings of a compass twice, heading_deg and compass_deg: leave one out")
     readings = {name: _readings(table, time, name) for name in known if name in COLUMNS}
     bias = _first(table, BIAS) * DEG / 3600 if BIAS in table.names else 0.0
     return VehicleSensors(
@@ -79,7 +89,7 @@ def load_sensors(path: str | Path) -> VehicleSensors:
         readings.get("sideways_m_s"),
         readings.get("forward_m_s"),
         readings.get("depth_m"),
-        readings.get("heading_deg"),
+        readings.get("compass_deg", readings.get("heading_deg")),
         _reckoned(table, time) if set(known) & set(RECKONED) else None,
         bias,
         f"the sensors of {Path(path).name}",
@@ -112,8 +122,26 @@ def save_sensors(path: str | Path, sensors: VehicleSensors) -> None:
 
 def _named(sensors: VehicleSensors) -> Mapping[str, Readings]:
     """Return the readings by the name of their column."""
-    every = (sensors.yaw_rate, sensors.sideways, sensors.forward, sensors.depth, sensors.heading)
-    return {name: one for name, one in zip(COLUMNS, every, strict=True) if one is not None}
+    every = {
+        "yaw_rate_deg_s": sensors.yaw_rate,
+        "sideways_m_s": sensors.sideways,
+        "forward_m_s": sensors.forward,
+        "depth_m": sensors.depth,
+        "heading_deg": sensors.heading,
+    }
+    return {name: one for name, one in every.items() if one is not None}
+
+
+def _sensor_columns(table: CsvTable) -> list[str]:
+    """Return the columns of readings that a table has; beside poses ``heading_deg`` is none."""
+    found = [name for name in (*COLUMNS, *RECKONED) if name in table.names]
+    if not OF_POSES & set(table.names) or "heading_deg" not in found:
+        return found
+    if COLUMNS["heading_deg"][0] in table.names:
+        message = f"{table.path}: heading_deg is that of the poses beside it, and is not read"
+        warnings.warn(f"{message}: name the column of a compass compass_deg, and its noise", MitsonarWarning, stacklevel=3)
+    found.remove("heading_deg")
+    return found
 
 
 def _time_name(table: CsvTable) -> str:

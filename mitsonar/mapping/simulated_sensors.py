@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.sensor_files import ROOT_HOUR
 from mitsonar.mapping.vehicle_sensors import DeadReckoning, Readings, VehicleSensors, straight_poses
 from mitsonar.motion.composition import motions
+from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["SensorNoise", "simulated_sensors"]
@@ -56,7 +58,8 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
     count = int(np.ceil(span * noise.rate_hz))
     edges = np.linspace(true.time_s[0], true.time_s[-1], count + 1)
     step, time = np.diff(edges), (edges[1:] + edges[:-1]) / 2
-    moved = motions(straight_poses(true, edges))
+    on_edges = straight_poses(true, edges)
+    moved = motions(on_edges)
     # every draw is made, so that a sensor's errors do not depend on which others there are
     draws = rng.normal(size=(7, count))
     bias = rng.normal()
@@ -78,19 +81,14 @@ def simulated_sensors(true: Trajectory, noise: SensorNoise, seed: int = 0) -> Ve
         std = np.full(count, np.radians(noise.compass_deg))
         heading = Readings(time, at[:, 5] + std * draws[4], std)
     if noise.walk is not None:
-        dead = _reckoned(straight_poses(true, edges), edges, noise.walk, draws[[5, 6, 4]].T)
+        dead = _reckoned(on_edges, edges, noise.walk, draws[[5, 6, 4]].T)
     return VehicleSensors(yaw_rate, sideways, forward, depth, heading, dead, bias_std, "simulated sensors")
 
 
 def _reckoned(poses: Array, time_s: Array, walk: tuple[float, float], draws: Array) -> DeadReckoning:
     """Return poses whose position and heading wander from the true ones."""
     off = np.cumsum(np.sqrt(np.diff(time_s))[:, None] * [walk[0], walk[0], np.radians(walk[1])] * draws, axis=0)
-    wandered = poses.copy()
     # the walk turns with the vehicle: what it adds is of the motion, in axes of the path
     moved = motions(poses) + np.diff(off, axis=0, prepend=0)
-    heading = poses[0, 5] + np.cumsum(moved[:, 2])
-    sin, cos = np.sin(heading), np.cos(heading)
-    wandered[1:, 0] = poses[0, 0] + np.cumsum(moved[:, 1] * sin + moved[:, 0] * cos)
-    wandered[1:, 1] = poses[0, 1] + np.cumsum(moved[:, 1] * cos - moved[:, 0] * sin)
-    wandered[1:, 5] = heading
-    return DeadReckoning(Trajectory(wandered, time_s), walk[0], float(np.radians(walk[1])))
+    wandered = path_of(moved, Pose(*poses[0]), time_s)
+    return DeadReckoning(wandered, walk[0], float(np.radians(walk[1])))

@@ -339,11 +339,15 @@ class VehicleSensors:
 
     def rises(self, time_s: Array) -> Array | None:
         """Return how far each frame is above the first, by the depth ``(frames,)`` [m]; None where it is not known."""
+        depth = self.depths(time_s)
+        return None if depth is None else np.asarray(depth[0] - depth)
+
+    def depths(self, time_s: Array) -> Array | None:
+        """Return the depth of each frame below the surface ``(frames,)`` [m]; None where it is not known."""
         if self.depth is None:
             return None
-        depth = np.interp(time_s, self.depth.time_s, self.depth.values)
         covered = time_s[0] >= self.depth.edges_s[0] - 1e-6 and time_s[-1] <= self.depth.edges_s[-1] + 1e-6
-        return depth[0] - depth if covered else None
+        return np.interp(time_s, self.depth.time_s, self.depth.values) if covered else None
 
 
 def _inverse(matrices: Array) -> Array:

@@ -74,7 +74,7 @@ FARTHEST = 1e12
 
 
 def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Table | None]:
-    """Read the numbers of a CSV file.
+    """Read the numbers of a CSV file. Other columns are not read, nor lines that hold a time and other columns only.
 
     Returns:
         Times [s] and positions [m] ``(poses, 4)``; then quaternions ``(poses, 4)`` and None, or twice the angles pitch, roll
@@ -91,7 +91,7 @@ def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Ta
     attitude, units = _attitude(path, names, convention)
     rows: list[list[float]] = []
     for number, words in enumerate(lines[1:], start=2):
-        if any(word.strip() for word in words):
+        if any(word.strip() for word in words) and not _readings_only(words, [*columns, *attitude]):
             rows.append(_csv_row(path, number, words, [*columns, *attitude]))
             _refuse_disorder(path, number, rows)
     if not rows:
@@ -205,6 +205,12 @@ def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention
     raise MitsonarError(
         f"trajectory {path} has no column {wanted[0]} ({', '.join(names)[:80]}): {near}; columns are {COLUMNS}"
     )
+
+
+def _readings_only(words: list[str], columns: list[int]) -> bool:
+    """Return whether a line has a time and no pose, but something else: readings of sensors at a time of their own."""
+    held = {number for number, word in enumerate(words) if word.strip()}
+    return not held & set(columns[1:]) and columns[0] in held and len(held) > 1
 
 
 def _csv_row(path: str | Path, number: int, words: list[str], columns: list[int]) -> list[float]:

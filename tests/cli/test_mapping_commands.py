@@ -200,7 +200,16 @@ def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_p
 
 # ---------------------------------------------------------------- kills and workers
 
-SAME = ("estimated.tum", "true.tum", "motions.csv", "covariances.npz", "table.md", "table.json", "estimates.jsonl")
+SAME = (
+    "estimated.tum",
+    "true.tum",
+    "motions.csv",
+    "covariances.npz",
+    "table.md",
+    "table.json",
+    "estimates.jsonl",
+    "height_profile.csv",
+)
 
 
 @pytest.mark.thorough

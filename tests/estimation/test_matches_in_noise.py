@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.estimation.estimator import ambiguity, correlation_excess, correlation_of, correlation_rejection
+from mitsonar.estimation.estimator import Excess, ambiguity, correlation_excess, correlation_of, correlation_rejection
 from mitsonar.estimation.image.direct_cells import DirectLevel
 from mitsonar.estimation.image.direct_registration import Held
 
@@ -25,10 +25,11 @@ def images(share: float, lighting: float = 0.0) -> tuple[np.ndarray, np.ndarray,
 def test_excess_is_the_share_in_common_whatever_the_lighting(share: float) -> None:
     """One standard deviation is 1 / sqrt(cells)."""
     std = 1 / np.sqrt(np.prod(SIZE))
-    assert abs(correlation_excess(*images(share), aside=8) - share) < 4 * std
+    assert abs(correlation_excess(*images(share), aside=8).mean - share) < 4 * std
     lit = images(share, lighting=3.0)
     assert correlation_of(lit[0], lit[1]) > 0.7, "lighting alone correlates"
-    assert correlation_excess(*lit, aside=8) == pytest.approx(share / (1 + 3.0), abs=4 * std)  # variance of the light: 3
+    shown = share / (1 + 3.0)  # variance of the light: 3
+    assert correlation_excess(*lit, aside=8).mean == pytest.approx(shown, abs=4 * std)
 
 
 def test_a_low_correlation_counts_where_it_stands_out() -> None:
@@ -41,6 +42,12 @@ def test_a_low_correlation_counts_where_it_stands_out() -> None:
         assert bool(correlation_rejection(correlation, cells, excess)) is said
         assert correlation_rejection(correlation, cells), "without the comparison it is too low"
     assert not correlation_rejection(0.5, cells)
+
+
+def test_a_match_among_few_rocks_must_stand_out_over_what_displaced_ones_scatter() -> None:
+    """Two places of a rocky field correlated by 0.14 of 7 standard deviations of noise, and displaced as much either way."""
+    assert not correlation_rejection(0.14, 2500, Excess(0.14, 0.01))
+    assert correlation_rejection(0.14, 2500, Excess(0.14, 0.04))
 
 
 def test_doubt_grows_as_a_match_stands_out_less() -> None:

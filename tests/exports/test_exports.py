@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -276,6 +277,15 @@ def test_a_long_run_on_disk_gives_the_same_files(frames: SonarFrames, run: Path,
         told = json.loads(table.pop("annotations.json"))
         table["annotations"] = json.dumps([told["images"], told["annotations"], told["categories"]]).encode()
     assert ours == theirs
+
+
+def test_frames_of_a_long_run_keep_poses_and_attitudes(frames: SonarFrames, tmp_path: Path) -> None:
+    assert frames.poses is not None
+    tilted = replace(frames, attitude_rad=frames.poses[:, 3:] + 0.01)
+    FrameStore.create(tmp_path / "frames.zarr", FRAMES, tilted).write(0, tilted)
+    some = open_export(tmp_path / "frames.zarr").read(slice(1, 3))
+    for name in ("poses", "attitude_rad", "shape_id"):
+        assert np.array_equal(getattr(some, name), getattr(tilted, name)[1:3]), name
 
 
 @pytest.mark.e2e

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
+from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.geometry.scan_conversion import cartesian_map, to_cartesian
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.records.sonar_frames import SonarFrames
 
 
 def pixel_centres(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -129,3 +131,15 @@ def test_derivative_by_differences(bearing: str, tilt: tuple[float, float]) -> N
         (r1, b1), (r2, b2) = (ground.to_polar(moved(ground.points, sign * step)) for sign in (-1, 1))
         difference = np.stack([r2 - r1, b2 - b1], axis=-1) / 2e-5
         np.testing.assert_allclose(ground.derivative[..., axis], difference, atol=1e-8)
+
+
+# ---------------------------------------------------------------- attitude
+
+
+def test_the_sonar_s_own_sensors_tell_pitch_and_roll_where_poses_do_not() -> None:
+    sonar = Sonar(beams=24, range_bins=64)
+    lean = np.radians([[30, 2, 90], [32, 4, np.nan]])
+    image, time, height = np.ones((2, 64, 24), np.float32), np.arange(2.0), np.full(2, 2.5)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, time, sonar, attitude_rad=lean, height_m=height)
+    told = attitude_of(frames, "a test", None, None)
+    assert np.degrees([told.pitch_rad, told.roll_rad]) == pytest.approx([31, 3])

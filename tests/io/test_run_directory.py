@@ -18,6 +18,7 @@ import pytest
 from mitsonar.errors import MitsonarError
 from mitsonar.io.provenance import differences, digest, file_digest, json_digest, other_versions, refuse_other, versions
 from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind, refuse_to_replace
+from mitsonar.io.whole_files import whole_lines
 
 KIND = RunKind(
     "experiment",
@@ -281,3 +282,13 @@ def test_files_are_replaced_only_where_that_was_asked_for(tmp_path: Path) -> Non
         refuse_to_replace(free, there, overwrite=False, option="--onnx")
     with pytest.raises(MitsonarError, match="exists and is kept"):
         refuse_to_replace(tmp_path, overwrite=True)
+
+
+def test_a_line_that_a_kill_left_half_written_is_cut_off(tmp_path: Path) -> None:
+    journal = tmp_path / "journal.jsonl"
+    assert whole_lines(journal, "journal", 100) == []
+    journal.write_bytes(b"one\ntwo\nthr")
+    assert whole_lines(journal, "journal", 100) == [b"one", b"two"]
+    assert journal.read_bytes() == b"one\ntwo\n"
+    with pytest.raises(MitsonarError, match="larger than 5 bytes"):
+        whole_lines(journal, "journal", 5)

@@ -28,7 +28,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import bridged, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
-from mitsonar.mapping.open_frames import open_frames
+from mitsonar.mapping.open_frames import load_frames, open_frames
 from mitsonar.mapping.open_source import usual_loop
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, motions
@@ -359,6 +359,7 @@ def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
             assert read.elevation_rad is None
         assert source.like.sonar == SONAR
         np.testing.assert_array_equal(source.poses, frames.poses)
+        np.testing.assert_array_equal(load_frames(tmp_path / where).poses, frames.poses)  # not only what estimators may see
         digests.append(source.digest())
     assert len(set(digests)) == 1
     frames.image[5] += 0.001  # of the first, the middle and the last frame
@@ -497,7 +498,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
 
 RESULTS = {
     *("run.json", "estimates.jsonl", "estimated.tum", "true.tum", "motions.csv", "covariances.npz"),
-    *("table.md", "table.json", "path.png"),
+    *("table.md", "table.json", "path.png", "height_profile.csv"),
 }
 
 

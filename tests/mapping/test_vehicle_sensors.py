@@ -10,11 +10,13 @@ import pytest
 from drawn_frames import sway
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.mapping.bag_sensors import open_sensors
 from mitsonar.mapping.sensor_files import ROOT_HOUR, load_sensors, save_sensors
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.vehicle_sensors import Readings, VehicleSensors
 from mitsonar.motion.composition import motions
+from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -202,3 +204,65 @@ def test_readings_that_are_none_are_refused() -> None:
         VehicleSensors()
     with pytest.raises(MitsonarError, match="too short"):
         simulated_sensors(sway(3), SensorNoise(gyro_deg_rth=1.0, rate_hz=1.0))
+
+
+# ---------------------------------------------------------------- columns of a trajectory
+
+
+FLOWN = "time_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg,yaw_rate_deg_s,yaw_rate_noise_deg_rth,compass_deg,compass_std_deg"
+
+
+def flown(folder: Path) -> Path:
+    """Write a trajectory whose rows hold readings too; the last row holds readings only."""
+    rows = ["0,5,6,2.5,0,35,90,2,1,10,3", "0.5,5,7,2.5,0,35,90,4,,,", "1,5,8,2.5,0,35,90,,,12,", "1.5,,,,,,,6,,,"]
+    (folder / "trajectory.csv").write_text("\n".join([FLOWN, *rows]) + "\n")
+    return folder / "trajectory.csv"
+
+
+def test_sensors_are_columns_of_a_trajectory(tmp_path: Path) -> None:
+    """The heading beside poses is theirs: only ``compass_deg`` is a compass."""
+    read = load_sensors(flown(tmp_path))
+    assert read.names == ["gyroscope", "compass"]
+    assert read.yaw_rate is not None
+    assert read.heading is not None
+    np.testing.assert_allclose(np.degrees(read.yaw_rate.values), [2, 4, 6])
+    np.testing.assert_allclose(np.degrees(read.heading.values), [10, 12])
+    np.testing.assert_allclose(np.degrees(read.heading.std), [3, 3])
+
+
+def test_a_trajectory_with_sensors_is_read_without_them(tmp_path: Path) -> None:
+    path = Trajectory.load(flown(tmp_path))
+    np.testing.assert_allclose(path.time_s, [0, 0.5, 1])
+    np.testing.assert_allclose(path.poses[:, 1], [6, 7, 8])
+    np.testing.assert_allclose(np.degrees(path.poses[:, 5]), 90)
+
+
+def test_true_poses_beside_readings_are_never_read(tmp_path: Path) -> None:
+    read = load_sensors(flown(tmp_path))
+    other = tmp_path / "other.csv"
+    other.write_text(flown(tmp_path).read_text().replace(",5,", ",-55,").replace(",90,", ",17,"))
+    assert load_sensors(other).digest() == read.digest()
+
+
+def test_a_heading_with_a_deviation_beside_poses_is_no_compass(tmp_path: Path) -> None:
+    file = flown(tmp_path)
+    file.write_text(file.read_text().replace("compass_deg", "yaw_of_compass").replace("compass_std_deg", "heading_std_deg"))
+    with pytest.warns(MitsonarWarning, match="compass_deg"):
+        assert load_sensors(file).names == ["gyroscope"]
+    file.write_text("time_s,x,y,z,roll_deg,pitch_deg,heading_deg\n0,0,0,2,0,35,0\n1,0,1,2,0,35,0\n")
+    with pytest.raises(MitsonarError, match=r"no column of a sensor.*compass_deg"):
+        load_sensors(file)
+
+
+def test_a_compass_has_one_column(tmp_path: Path) -> None:
+    (tmp_path / "s.csv").write_text("time_s,heading_deg,heading_std_deg,compass_deg,compass_std_deg\n0,1,1,1,1\n1,1,1,1,1\n")
+    with pytest.raises(MitsonarError, match="leave one out"):
+        load_sensors(tmp_path / "s.csv")
+
+
+def test_the_folder_of_a_trajectory_may_be_given(tmp_path: Path) -> None:
+    flown(tmp_path)
+    assert open_sensors(tmp_path).digest() == load_sensors(tmp_path / "trajectory.csv").digest()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MitsonarError, match=r"no trajectory\.csv"):
+        open_sensors(tmp_path / "empty")

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from mitsonar.estimation.estimator import INPUTS, Estimate, rejected, two_frames
 from mitsonar.estimation.external.ground_pair import package
 from mitsonar.geometry.attitude import Attitude, attitude_of
-from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
@@ -83,15 +82,7 @@ class CfarGicp:
         sums = [count * cv2.blur(image, (1, count)) for count in (wide, narrow)]
         around = (sums[0] - sums[1]) / (wide - narrow)
         summit = level >= cv2.dilate(level, np.ones((3, 3), np.uint8))
-        geometry = GroundGeometry(
-            frames.range_m,
-            frames.bearing_rad,
-            frames.sonar.bearing,
-            attitude.height_m,
-            attitude.pitch_rad,
-            attitude.roll_rad,
-        )
-        points = geometry.points[summit & (level > self.threshold * around)]
+        points = attitude.ground(frames).points[summit & (level > self.threshold * around)]
         points = points[np.isfinite(points).all(axis=1)]
         return np.column_stack([points, np.zeros(len(points))])
 

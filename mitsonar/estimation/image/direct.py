@@ -27,7 +27,8 @@ from mitsonar.estimation.estimator import (
     two_frames,
 )
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
-from mitsonar.estimation.image.direct_registration import Fit, Held, register, smoothed
+from mitsonar.estimation.image.direct_nodes import GroundNodes
+from mitsonar.estimation.image.direct_registration import Fit, Held, is_resolved, register, smoothed
 from mitsonar.estimation.image.direct_relief import registered_over_relief
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.prior_gate import prior_rejection
@@ -150,7 +151,7 @@ class Direct:
         found = self._from(task, start, "zero" if prior is None else "prior")
         if found.valid or (prior is not None and (3 * prior.std <= FARTHEST).all()):
             return found
-        elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
+        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
             return found  # a motion nearby has been looked for
         second = self._from(replace(task, prior=None), elsewhere.motion, "phase")
@@ -179,13 +180,13 @@ class Direct:
         std = HELD if task.prior is None else np.maximum(HELD, task.prior.std)
         held = Held(v.copy(), np.append(std, self.heave_std_m)[: len(v)])
         fit = None
-        levels = self._levels(task)
+        levels, nodes = self._levels(task), GroundNodes(task.frames, task.attitude, heave=bool(self.heave_std_m))
         for number, level in enumerate(levels):
             last = number + 1 == len(levels)
-            if len(task.images[0]) < 24 * level.step and not last:
-                continue  # too few bins for so coarse a step
+            if not last and not is_resolved(len(task.images[0]), level):
+                continue
             pair = smoothed(task.images[0], level), smoothed(task.images[1], level)
-            cells = Cells(task.frames, task.attitude, level, heave=bool(self.heave_std_m))
+            cells = Cells(nodes, level)
             found = register(pair, cells, v, level, last=last, held=held)
             if found is None:
                 return replace(rejected("nothing in the frames to match"), about={"start": named})
@@ -225,6 +226,8 @@ class Direct:
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start)) or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
+        if task.attitude.by_echoes and self.relief_m is None:
+            about["height_std_m"] = task.attitude.height_std_m
         return Estimate(motion, covariance, not reason, reason, about)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["block_of", "by_block", "cell_blocks", "on_cells"]
+__all__ = ["by_block", "cell_blocks", "on_cells", "products_by_block"]
 
 Floats = NDArray[np.float32]
 
@@ -16,16 +18,37 @@ def cell_blocks(shape: tuple[int, ...], block: tuple[int, int]) -> tuple[int, in
     return max(shape[-2] // block[0], 1), max(shape[-1] // block[1], 1)
 
 
-def block_of(size: int, block: int) -> NDArray[np.intp]:
-    """Return the block of each cell along an axis; cells beyond the last whole block belong to it."""
-    return np.minimum(np.arange(size) // block, max(size // block, 1) - 1)
-
-
 def by_block(maps: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.float64]:
     """Sum maps ``(..., bins, beams)`` over blocks ``(..., blocks)``."""
-    starts = [np.arange(0, count * edge, edge) for count, edge in zip(cell_blocks(maps.shape, block), block, strict=True)]
-    sums = np.add.reduceat(np.add.reduceat(maps, starts[0], axis=-2), starts[1], axis=-1)
-    return np.asarray(sums.reshape(*maps.shape[:-2], -1), dtype=np.float64)
+    means = [_means(one, block) for one in maps.reshape(-1, *maps.shape[-2:])]
+    return _sums(means, cell_blocks(maps.shape, block), block).reshape(*maps.shape[:-2], -1)
+
+
+def products_by_block(pairs: Sequence[tuple[Floats, Floats]], block: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum products of two maps ``(bins, beams)`` over blocks ``(pairs, blocks)``."""
+    shape = pairs[0][0].shape
+    product = np.empty(shape, dtype=np.float32)  # one for all: it stays in the processor's cache
+    return _sums([_means(np.multiply(*pair, out=product), block) for pair in pairs], cell_blocks(shape, block), block)
+
+
+def _means(values: NDArray[np.floating], block: tuple[int, int]) -> NDArray[np.floating]:
+    """Average a map ``(bins, beams)`` over blocks; one that is not whole is filled with zeros ``(rows, columns)``."""
+    over = [-(-size // edge) for size, edge in zip(values.shape, block, strict=True)]
+    missing = [(0, count * edge - size) for count, edge, size in zip(over, block, values.shape, strict=True)]
+    if any(after for _, after in missing):
+        values = np.pad(values, missing)
+    # OpenCV takes a third of the time of np.add.reduceat
+    return np.asarray(cv2.resize(values, over[::-1], interpolation=cv2.INTER_AREA), dtype=values.dtype)
+
+
+def _sums(means: list[NDArray[np.floating]], blocks: tuple[int, int], block: tuple[int, int]) -> NDArray[np.float64]:
+    """Sum over blocks from their means ``(maps, blocks)``; cells beyond the last whole block belong to it."""
+    sums = np.multiply(means, block[0] * block[1], dtype=np.float64)
+    rows, columns = blocks
+    if sums.shape[1:] != blocks:
+        sums[:, rows - 1] += sums[:, rows:].sum(axis=1)
+        sums[:, :, columns - 1] += sums[:, :, columns:].sum(axis=2)
+    return np.asarray(sums[:, :rows, :columns].reshape(len(means), -1), dtype=np.float64)
 
 
 def on_cells(table: NDArray[np.float64], shape: tuple[int, ...], block: tuple[int, int]) -> Floats:

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
-from mitsonar.geometry.attitude import Attitude
-from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
-from mitsonar.geometry.lit_ground import margin_of_light
-from mitsonar.motion.composition import inverse
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.estimation.image.direct_blocks import cell_blocks
+from mitsonar.estimation.image.direct_nodes import GroundNodes, node_axes
 
 __all__ = ["Cells", "DirectLevel"]
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 
 class DirectLevel(NamedTuple):
@@ -37,130 +35,110 @@ class DirectLevel(NamedTuple):
     iterations: int
 
 
-HEIGHT_STEP = 0.05
-"""Step of the height for numerical derivatives, as a part of it."""
+PATCH = (8, 4)
+"""Bins and beams that are summed first: the geometry is constant there."""
+
+FEWEST_ROWS = 2
+"""Fewest rows of a patch of a coarse level."""
 
 
 class Cells:
-    """The cells of one level: where they are, and how they move with the sonar, in bins and beams."""
+    """The cells of one level: where they are, and how they move with the sonar, in bins and beams.
 
-    def __init__(self, frames: SonarFrames, attitude: Attitude, level: DirectLevel, *, heave: bool) -> None:
-        step = level.step
-        reach = tuple(2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing[::-1], (1, step), strict=True))
-        self.bearing, self.attitude, self.heave = frames.sonar.bearing, attitude, heave
-        self.grid = cell_grid(tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist()), step)
-        self.row, self.column = self.grid.row, self.grid.column
-        self.ground = self._ground(attitude.height_m)
-        known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
-        self.from_node = nearest_known(known)
-        first = int(known.any(axis=1).argmax()) if known.any() else len(known)
-        self.usable = slice(
-            int(np.searchsorted(self.grid.range_m, self.grid.node_range[first])) if known.any() else 10**9, None
-        )
-        self.nodes = self._nodes(attitude.height_m)
-        self.derivative = self._on_all(self.nodes)
-        self.seen = self._seen(known, frames.sonar.elevation_fov_deg, reach)
+    Attributes:
+        patch: rows and columns of the patches over which cells are summed.
+        patches: number of them along rows and columns.
+        derivative: of the displacement of the patches' middles by motion (and heave) ``(3 or 4, 2, patches)``.
+        usable: rows that meet the ground.
+        seen: 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
+    """
 
-    def _ground(self, height: float) -> GroundGeometry:
-        """Return the geometry at the nodes."""
-        grid, attitude = self.grid, self.attitude
-        return GroundGeometry(
-            grid.node_range, grid.node_bearing, self.bearing, height, attitude.pitch_rad, attitude.roll_rad
-        )
+    def __init__(self, nodes: GroundNodes, level: DirectLevel) -> None:
+        self.nodes, self.grid = nodes, cell_grid(*nodes.key, level.step)
+        self.row, self.column, self.patch, self.patches = self.grid.row, self.grid.column, self.grid.patch, self.grid.patches
+        self.derivative = self._on_patches(nodes.derivative)
+        known = nodes.known
+        first = float(nodes.axes[0][int(known.any(axis=1).argmax())]) if known.any() else np.inf
+        self.usable = slice(int(np.searchsorted(self.grid.range_m, first)), None)
+        self.seen = self._seen(level)
 
-    def _nodes(self, height: float) -> Floats:
-        """Return the derivative at the nodes by motion (and heave) ``(3 or 4, 2, nodes, nodes)``."""
-        ground = self._ground(height)
-        nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
-        if self.heave:
-            nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
-        return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]]).astype(np.float32)
-
-    def _seen(self, known: NDArray[np.bool_], elevation_fov_deg: float, reach: tuple[int, ...]) -> Floats | None:
-        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do.
-
-        See :func:`mitsonar.geometry.lit_ground.margin_of_light`.
-        """
-        margin = margin_of_light(self.ground, self.attitude, elevation_fov_deg)
-        shown = known if margin is None else known & (margin >= 0)
-        if shown[self.from_node[0].min() :].all():
+    def _seen(self, level: DirectLevel) -> Floats | None:
+        """Return 1 where a cell shows ground to be matched, else 0 ``(bins, beams)``; None where all cells do."""
+        shown, masked = self.nodes.shown
+        if shown[self.nodes.from_node[0].min() :].all():
             return None
-        grid = self.grid
         row, column = (
             np.abs(values[:, None] - nodes).argmin(axis=1)
-            for values, nodes in ((grid.range_m, grid.node_range), (grid.bearing_rad, grid.node_bearing))
+            for values, nodes in zip((self.grid.range_m, self.grid.bearing_rad), self.nodes.axes, strict=True)
         )
         on_all = shown[row][:, column].astype(np.uint8)
-        return np.asarray(
-            cv2.erode(on_all, np.ones(reach[::-1], np.uint8)) if margin is not None else on_all, dtype=np.float32
-        )
+        reach = [2 * int(np.ceil(2 * s / k)) + 1 for s, k in zip(level.smoothing, (level.step, 1), strict=True)]
+        return np.asarray(cv2.erode(on_all, np.ones(reach, np.uint8)) if masked else on_all, dtype=np.float32)
 
-    def _on_all(self, nodes: Floats) -> Floats:
-        """Interpolate from the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
-        full = self.grid.over_bins @ nodes @ self.grid.over_beams.T
-        full[..., 0, :, :] /= self.grid.bin_m[:, None]
-        full[..., 1, :, :] /= self.grid.beam_rad
-        return np.asarray(full)
+    def _on_all(self, nodes: Doubles) -> Floats:
+        """Interpolate from the nodes to all cells ``(2, bins, beams)``, in bins and beams."""
+        return np.asarray(self.grid.over_bins @ nodes.astype(np.float32) @ self.grid.over_beams)
 
-    def shift(self, v: NDArray[np.float64], *, back: bool = False, lift_m: float = 0.0) -> Floats:
+    def _on_patches(self, nodes: Doubles) -> Doubles:
+        """Interpolate from the nodes to the middles of the patches ``(..., 2, patches)``, in bins and beams."""
+        middles = self.grid.over_rows @ nodes @ self.grid.over_columns
+        return np.asarray(middles.reshape(*nodes.shape[:-2], -1))
+
+    def shift(self, v: Doubles, *, back: bool = False, lift_m: float = 0.0) -> Floats:
         """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
 
         It is in bins and beams; ``back``: from the second frame to the first; ``lift_m``: of ground so much higher.
         """
-        ground = other = self._ground(self.attitude.height_m - lift_m) if lift_m else self.ground
-        if self.heave:
-            half = float(v[3]) / (2 if back else -2)
-            ground, other = (self._ground(self.attitude.height_m + change) for change in (half, -half))
-        motion = inverse(v[:3]) if back else v[:3]
-        radius, bearing = other.to_polar(moved(ground.points, motion))
-        grid = self.grid
-        nodes = np.stack([radius - grid.node_range[:, None], bearing - grid.node_bearing])
-        # a cell that meets level ground may not meet ground that lies lower
-        row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else self.from_node
-        return self._on_all(nodes[:, row, column].astype(np.float32))
+        return self._on_all(self.nodes.shift(v, back=back, lift_m=lift_m))
 
-    def lifted_shift(self, v: NDArray[np.float64]) -> Floats:
-        """Return the derivative of :meth:`shift` by the height [1/m], to first order in the motion."""
-        change = HEIGHT_STEP * self.attitude.height_m
-        other = self._nodes(self.attitude.height_m + change)
-        return self._on_all(np.tensordot(v.astype(np.float32) / np.float32(change), other - self.nodes, axes=1))
-
-    def along(self, slopes: tuple[Floats, Floats], inner: tuple[slice, slice]) -> Floats:
-        """Return the derivative of the image by each component of the motion ``(3 or 4, cells)``."""
-        by_bin, by_beam = slopes[0][inner], slopes[1][inner]
-        jacobian = np.empty((len(self.derivative), *by_bin.shape), dtype=np.float32)
-        for out, (bins, beams) in zip(jacobian, self.derivative, strict=True):
-            np.multiply(by_bin, bins[inner], out=out)
-            out += by_beam * beams[inner]
-            if self.seen is not None:
-                out *= self.seen[inner]
-        return jacobian.reshape(len(jacobian), -1)
+    def lifted_shift(self, v: Doubles) -> Doubles:
+        """Return the derivative of :meth:`shift` by the height at the middles of the patches ``(2, patches)`` [1/m]."""
+        return self._on_patches(self.nodes.lifted_shift(v))
 
 
 class CellGrid(NamedTuple):
-    """Cells of every so many bins, and splines from few nodes to all of them: the geometry is smooth."""
+    """Cells of every so many bins and their patches; splines from the nodes, in bins ``[0]`` and beams ``[1]``.
 
-    range_m: NDArray[np.float64]
-    bearing_rad: NDArray[np.float64]
-    node_range: NDArray[np.float64]
-    node_bearing: NDArray[np.float64]
-    over_bins: Floats
-    over_beams: Floats
-    bin_m: Floats
-    beam_rad: Floats
+    ``over_bins`` and ``over_beams`` lead to all cells, ``over_rows`` and ``over_columns`` to the middles of the patches.
+    """
+
+    range_m: Doubles
+    bearing_rad: Doubles
     row: Floats
     column: Floats
+    over_bins: Floats
+    over_beams: Floats
+    patch: tuple[int, int]
+    patches: tuple[int, int]
+    over_rows: Doubles
+    over_columns: Doubles
 
 
 @lru_cache(maxsize=16)
 def cell_grid(range_m: tuple[float, ...], bearing_rad: tuple[float, ...], step: int) -> CellGrid:
     ranges, axes = np.array(range_m)[step // 2 :: step], np.array(bearing_rad)
-    nodes = [np.linspace(values[0], values[-1], count) for values, count in ((ranges, 33), (axes, 17))]
     splines = [
-        np.asarray(make_interp_spline(node, np.eye(len(node)), 3)(values), dtype=np.float32)
-        for node, values in zip(nodes, (ranges, axes), strict=True)
+        np.asarray(make_interp_spline(node, np.eye(len(node)), 3)(values))
+        for node, values in zip(node_axes(np.array(range_m), axes), (ranges, axes), strict=True)
     ]
-    row = np.arange(len(ranges), dtype=np.float32)[:, None]
-    column = np.arange(len(axes), dtype=np.float32)[None, :]
-    spacing = [np.gradient(values).astype(np.float32) for values in (ranges, axes)]
-    return CellGrid(ranges, axes, nodes[0], nodes[1], splines[0], splines[1], spacing[0], spacing[1], row, column)
+    bin_m, beam_rad = (np.gradient(values)[:, None] for values in (ranges, axes))
+    over_bins = np.stack([splines[0] / bin_m, splines[0]])
+    over_beams = np.stack([splines[1].T, (splines[1] / beam_rad).T])
+    patch = max(FEWEST_ROWS, PATCH[0] // step), PATCH[1]
+    patches = cell_blocks((len(ranges), len(axes)), patch)
+    rows, columns = (
+        np.minimum(np.arange(count) * edge + edge // 2, size - 1)
+        for count, edge, size in zip(patches, patch, (len(ranges), len(axes)), strict=True)
+    )
+    return CellGrid(
+        ranges,
+        axes,
+        row=np.arange(len(ranges), dtype=np.float32)[:, None],
+        column=np.arange(len(axes), dtype=np.float32)[None, :],
+        over_bins=over_bins.astype(np.float32),
+        over_beams=over_beams.astype(np.float32),
+        patch=patch,
+        patches=patches,
+        over_rows=over_bins[:, rows],
+        over_columns=np.ascontiguousarray(over_beams[:, :, columns]),
+    )

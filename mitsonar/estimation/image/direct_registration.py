@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import ambiguity, correlation_excess, correlation_of, spread_of
-from mitsonar.estimation.image.direct_blocks import block_of, by_block
+from mitsonar.estimation.estimator import Excess, ambiguity, correlation_excess, correlation_of, spread_of
+from mitsonar.estimation.image.direct_blocks import by_block, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
 
-__all__ = ["Fit", "register", "smoothed"]
+__all__ = ["FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"]
 
 Floats = NDArray[np.float32]
+Doubles = NDArray[np.float64]
 
 STILL = np.array([3e-5, 3e-5, 6e-6])
 """Steps below which an iteration ends [m, m, rad]."""
@@ -22,14 +25,23 @@ STILL = np.array([3e-5, 3e-5, 6e-6])
 CAUCHY = 3.0
 """Residuals of so many standard deviations have half the weight."""
 
-BLOCK = (24, 8)
-"""Bins and beams within which residuals belong together: rocks and their shadows."""
+TOGETHER = (3, 2)
+"""Patches within which residuals belong together: rocks and their shadows."""
+
+AROUND = (3, 3)
+"""Patches along beams and bins around each that are looked at as a block."""
 
 BLOCK_CAUCHY = 4.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
 
 NEGLIGIBLE = 0.1
 """Standard deviations of the estimate below which a step left over is lost in the noise."""
+
+ASIDE = 8
+"""Beams by which one frame is displaced to see how much the match stands out."""
+
+COARSE = 10.0
+"""How many times larger steps end the iteration of a level that another follows."""
 
 REMEMBERED = 4
 LEVER_M = 4.0
@@ -41,6 +53,12 @@ must be before."""
 FEWEST_CELLS = 500
 """Fewest cells that are registered."""
 
+FEWEST_ROWS = 24
+"""Fewest rows of a level that is not the last."""
+
+SAMPLED = (5, 3)
+"""The noise is measured in every so manieth bin and beam."""
+
 
 class Fit(NamedTuple):
     """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes.
@@ -49,34 +67,34 @@ class Fit(NamedTuple):
     """
 
     converged: bool
-    covariance: NDArray[np.float64]
-    by_height: NDArray[np.float64]
+    covariance: Doubles
+    by_height: Doubles
     correlation: float
     independent: float
     blocks: float
-    excess: float = 0.0
+    excess: Excess = Excess()
 
 
 class Held(NamedTuple):
     """What is known of the unknowns before: mean and standard deviation of each [m, m, rad, m]; infinite: nothing."""
 
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
+    mean: Doubles
+    std: Doubles
 
-    def weight(self, scale: float, level: DirectLevel) -> NDArray[np.float64]:
+    def weight(self, scale: float, level: DirectLevel) -> Doubles:
         """Return the prior weight of each unknown in units of the residuals' noise."""
-        return np.asarray(_alike(level) * scale**2 / self.std**2)
+        return np.asarray(alike_cells(level) * scale**2 / self.std**2)
 
 
 def register(
     pair: tuple[Floats, Floats],
     cells: Cells,
-    start: NDArray[np.float64],
+    start: Doubles,
     level: DirectLevel,
     *,
     last: bool,
     held: Held,
-) -> tuple[NDArray[np.float64], Fit | None] | None:
+) -> tuple[Doubles, Fit | None] | None:
     """Run Gauss-Newton from a start; None where there is nothing to match.
 
     Args:
@@ -91,17 +109,17 @@ def register(
         The motion, and its fit at the finest level.
     """
     v, accelerate, converged = start.copy(), _AndersonAcceleration(), False
-    at = None
+    still = STILL if last else COARSE * STILL
+    at, margins = None, np.zeros((2, 2))
     for _ in range(level.iterations):
-        at = _linearised(*pair, cells, v, level, last=last)
+        at = _linearised(*pair, cells, v, level, margins, last=last)
         if at is None:
             return None
         weight = held.weight(at.scale, level)
-        step = np.asarray(
-            -np.linalg.solve(at.normal + np.diag(weight), at.pull + weight * (v - held.mean)), dtype=np.float64
-        )
+        pull = at.pull + weight * (v - held.mean)
+        step = np.asarray(-np.linalg.solve(at.normal + np.diag(weight), pull), dtype=np.float64)
         v = np.add(v, accelerate(v, step))
-        converged = bool((np.abs(step[:3]) < STILL).all())
+        converged = bool((np.abs(step[:3]) < still).all())
         if converged:
             break
     if not last or at is None:
@@ -110,43 +128,29 @@ def register(
     return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
 
 
-def _is_small(step: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+def _is_small(step: Doubles, covariance: Doubles) -> bool:
     """Return whether a step is lost in the noise of the estimate ``(3, 3)``, however long it is."""
     return bool(step @ np.linalg.lstsq(covariance, step, rcond=None)[0] < NEGLIGIBLE**2)
 
 
 class _Side(NamedTuple):
-    """One frame drawn at the cells of the other: residuals, and their derivatives by a further motion.
+    """One frame drawn at the cells of the other: residual, weights, and sums over patches.
 
-    ``weight`` is that of single cells, ``blocks`` that of the block of each; None: all 1.
+    ``weight`` is that of single cells, 0 where they do not count ``(bins, beams)``; ``along`` and ``across`` are it times
+    the slopes along bins and beams; ``patches`` is that of each patch ``(patches,)``; ``slopes`` and ``pull`` are sums of
+    both weights times slope by slope, and times slope by residual: along bins, of both, along beams ``(3, patches)``; along
+    bins, beams ``(2, patches)``.
     """
 
     before: Floats
     after: Floats
     inner: tuple[slice, slice]
-    slopes: tuple[Floats, Floats]
-    residual: Floats
-    jacobian: Floats
     weight: Floats
-    blocks: Floats | None
-    weighted: Floats
-
-    def curvature(self) -> Floats:
-        """Return the derivative of weight times residual by the residual ``(cells,)``.
-
-        Outliers, whose weight falls as they grow, have a negative one: a motion that the weights hold is known less well
-        than the sum of the weights says.
-        """
-        alone = self.weight * (2 * self.weight - 1)
-        return alone if self.blocks is None else alone * self.blocks
-
-    def sums(self, values: Floats) -> NDArray[np.float64]:
-        """Sum maps ``(maps, cells)`` over blocks of the whole frame ``(maps, blocks)``."""
-        rows, columns = self.before.shape
-        whole = np.zeros((len(values), rows, columns), dtype=np.float32)
-        inside = whole[:, self.inner[0], self.inner[1]]
-        inside[...] = values.reshape(inside.shape)
-        return by_block(whole, BLOCK)
+    along: Floats
+    across: Floats
+    patches: Doubles
+    slopes: Doubles
+    pull: Doubles
 
 
 class _Linearisation(NamedTuple):
@@ -154,95 +158,170 @@ class _Linearisation(NamedTuple):
 
     sides: list[_Side]
     scale: float
-    normal: NDArray[np.float64]
-    pull: NDArray[np.float64]
+    normal: Doubles
+    pull: Doubles
 
 
 def _linearised(
-    first: Floats, second: Floats, cells: Cells, v: NDArray[np.float64], level: DirectLevel, *, last: bool
+    first: Floats, second: Floats, cells: Cells, v: Doubles, level: DirectLevel, margins: Doubles, *, last: bool
 ) -> _Linearisation | None:
-    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains."""
+    """Draw the second frame at the cells of the first, at the last level also the reverse; None where too little remains.
+
+    ``margins`` of both ways ``(2, 2)`` grow in place.
+    """
     pairs = []
     for back in (False, True) if last else (False,):
         there = cells.shift(v, back=back)
-        inner = _inner(there, cells.usable)
+        inner = _inner(there, cells.usable, margins[int(back)])
         if inner is None:
             return None
         drawn = sampled(first if back else second, cells.row + there[0], cells.column + there[1])
         pairs.append((drawn, second, inner) if back else (first, drawn, inner))
-    residuals = [(after - before)[inner].ravel() for before, after, inner in pairs]
-    if residuals[0].size < FEWEST_CELLS:
+    residuals = [after - before for before, after, _ in pairs]
+    counted = residuals[0][pairs[0][2]]
+    if counted.size < FEWEST_CELLS:
         return None
-    scale = max(1.4826 * float(np.median(np.abs(residuals[0][::5]))), FAINTEST)
-    sides = []
-    for (before, after, inner), residual in zip(pairs, residuals, strict=True):
-        slopes = slopes_of((before + after) * np.float32(0.5), level, scale)
-        weight = np.asarray(1 / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
-        blocks = _block_weight(slopes, residual, weight, inner) if last else None
-        jacobian = cells.along(slopes, inner)
-        weighted = jacobian * (weight if blocks is None else weight * blocks)
-        sides.append(_Side(before, after, inner, slopes, residual, jacobian, weight, blocks, weighted))
-    normal = np.asarray(sum(side.weighted @ side.jacobian.T for side in sides), dtype=np.float64)
-    pull = np.asarray(sum(side.weighted @ side.residual for side in sides), dtype=np.float64)
+    scale = noise_of(counted[:: SAMPLED[0], :: SAMPLED[1]].ravel())
+    sides = [_side(*pair, residual, cells, level, scale, last=last) for pair, residual in zip(pairs, residuals, strict=True)]
+    normal = np.sum([_by_motion(cells.derivative, side.slopes) for side in sides], axis=0)
+    pull = np.sum([_flat(cells.derivative) @ side.pull.ravel() for side in sides], axis=0)
     return None if _singular(normal) else _Linearisation(sides, scale, normal, pull)
 
 
-def _fit(
-    at: _Linearisation, cells: Cells, v: NDArray[np.float64], level: DirectLevel, held: NDArray[np.float64], converged: bool
-) -> Fit:
+def noise_of(residual: Floats) -> float:
+    """Return the standard deviation of most residuals ``(cells,)``, by their median."""
+    return max(1.4826 * median_of(np.abs(residual)), FAINTEST)
+
+
+def median_of(values: NDArray[np.floating]) -> float:
+    """Return the median ``(n,)``, of an even number the upper one: without the checks of ``np.median``."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+def _side(
+    before: Floats,
+    after: Floats,
+    inner: tuple[slice, slice],
+    residual: Floats,
+    cells: Cells,
+    level: DirectLevel,
+    scale: float,
+    *,
+    last: bool,
+) -> _Side:
+    """Weigh cells, and at the last level blocks; sum over patches."""
+    along, across = slopes_of((before + after) * np.float32(0.5), level, scale)
+    weight = np.zeros_like(residual)
+    weight[inner] = cauchy(residual[inner], scale)
+    if cells.seen is not None:
+        weight *= cells.seen
+    bins, beams = weight * along, weight * across
+    products = (bins, along), (bins, across), (beams, across), (bins, residual), (beams, residual)
+    sums = products_by_block(products, cells.patch)
+    patches = _patch_weight(sums.reshape(5, *cells.patches)) if last else np.ones(sums.shape[1])
+    sums *= patches
+    return _Side(before, after, inner, weight, bins, beams, patches, sums[:3], sums[3:])
+
+
+def cauchy(residual: Floats, scale: float) -> Floats:
+    """Return weights of residuals whose noise has this standard deviation."""
+    ratio = residual * np.float32(1 / (CAUCHY * scale))
+    ratio *= ratio
+    ratio += 1
+    return np.asarray(np.reciprocal(ratio, out=ratio))
+
+
+def alike_cells(level: DirectLevel) -> float:
+    """Return how many cells count once: smoothed noise is alike in neighbours, as far as a smoothing kernel covers."""
+    return float(4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28))
+
+
+def _by_motion(derivative: Doubles, slopes: Doubles) -> Doubles:
+    """Return how the pull changes with the motion ``(unknowns, unknowns)``, from sums of slopes by slopes."""
+    return np.asarray(_flat(_information(derivative, slopes)) @ _flat(derivative).T)
+
+
+def _flat(values: Doubles) -> Doubles:
+    """Return values ``(n, 2 * patches)`` of ``(n, 2, patches)``."""
+    return np.reshape(values, (len(values), -1))
+
+
+def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
+    """Return derivatives ``(n, 2, patches)`` times sums of slopes by slopes: along bins, of both, along beams."""
+    return np.asarray(derivative * slopes[::2] + derivative[:, ::-1] * slopes[1])
+
+
+def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
     """Assess the motion from the gradients of single cells, and from slopes of one frame times those of the other.
 
     Sums of gradients over blocks tell less: what interpolation leaves over changes sign within a block and cancels there.
     """
-    true = np.sum([_cross(side, cells, level) for side in at.sides], axis=0)
-    undone = np.linalg.inv((true if np.linalg.eigvalsh(true)[0] > 0 else at.normal) + np.diag(held))
-    pulls = [one.weighted * one.residual for one in at.sides]
-    spread = _alike(level) * sum((one @ one.T).astype(np.float64) for one in pulls)
+    true = np.sum([_by_motion(cells.derivative, _cross(side, cells, level)) for side in at.sides], axis=0)
+    # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
+    sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
+    undone = np.linalg.inv(sound + np.diag(held))
+    pulls = np.sum([_by_motion(cells.derivative, _squared_pulls(side, cells)) for side in at.sides], axis=0)
+    # what is known before errs, too: where the frames tell nothing it is all that is known
+    spread = alike_cells(level) * ((pulls + pulls.T) / 2 + at.scale**2 * np.diag(held))
     side = at.sides[0]
-    independent = side.residual.size / _alike(level)
-    excess = _excess(side, cells)
-    shares = side.sums((side.weighted * (undone.astype(np.float32) @ side.jacobian)).sum(axis=0)[None])
+    informed = [_information(cells.derivative, one.slopes) for one in at.sides]
+    shares = _together((np.tensordot(undone, informed[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
     lifted = cells.lifted_shift(v)
-    by_height = np.zeros(len(v))
-    for one in at.sides:
-        by_height += one.weighted @ (one.slopes[0] * lifted[0] + one.slopes[1] * lifted[1])[one.inner].ravel()
+    by_height = np.sum([_flat(one) @ lifted.ravel() for one in informed], axis=0)
+    before, after = side.before[side.inner], side.after[side.inner]
+    independent, excess = before.size / alike_cells(level), _excess(side, cells)
     return Fit(
         converged=converged,
-        covariance=ambiguity(excess, independent) * undone @ spread @ undone,
+        covariance=ambiguity(excess.mean, independent) * undone @ spread @ undone,
         by_height=undone @ by_height,
-        correlation=correlation_of(side.before[side.inner], side.after[side.inner]),
+        correlation=correlation_of(before, after),
         independent=independent,
-        blocks=spread_of(shares[0]),
+        blocks=spread_of(shares),
         excess=excess,
     )
 
 
-def _excess(side: _Side, cells: Cells) -> float:
+def _squared_pulls(side: _Side, cells: Cells) -> Doubles:
+    """Return sums of the squared pulls of single cells over patches: along bins, of both, along beams ``(3, patches)``."""
+    residual = side.after - side.before
+    along, across = side.along * residual, side.across * residual
+    return products_by_block(((along, along), (along, across), (across, across)), cells.patch) * side.patches**2
+
+
+def _excess(side: _Side, cells: Cells) -> Excess:
     """Return by how much the frames correlate more than displaced across the beams."""
     before, after = side.before[side.inner], side.after[side.inner]
     inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
-    return correlation_excess(before, after, inside, BLOCK[1])
+    return correlation_excess(before, after, inside, ASIDE)
 
 
-def _alike(level: DirectLevel) -> float:
-    """Return how many cells count once: smoothed noise is alike in as many as a smoothing kernel covers."""
-    return float(4 * np.pi * max(level.smoothing[0] / level.step, 0.28) * max(level.smoothing[1], 0.28))
+def is_resolved(bins: int, level: DirectLevel) -> bool:
+    """Return whether frames of so many bins leave a level enough rows."""
+    return bins >= FEWEST_ROWS * level.step
 
 
 def smoothed(image: Floats, level: DirectLevel) -> Floats:
     """Every so many bins of the smoothed image."""
-    smooth = blurred(image, *level.smoothing)
-    return np.ascontiguousarray(smooth[level.step // 2 :: level.step])
+    bins, beams = level.smoothing
+    if level.step == 1:
+        return blurred(image, bins, beams)
+    return blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
+
+
+@lru_cache(maxsize=16)
+def _smoothed_rows(bins: int, sigma: float, step: int) -> Floats:
+    """Return the weights of bins in every so manieth bin, smoothed ``(rows, bins)``: only those are computed."""
+    return np.ascontiguousarray(blurred(np.eye(bins, dtype=np.float32), sigma, 0)[step // 2 :: step])
 
 
 class _AndersonAcceleration:
     """Anderson acceleration (1965): noise in the slopes shortens steps; the last steps show by how much."""
 
     def __init__(self) -> None:
-        self.places: list[NDArray[np.float64]] = []
-        self.steps: list[NDArray[np.float64]] = []
+        self.places: list[Doubles] = []
+        self.steps: list[Doubles] = []
 
-    def __call__(self, place: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, place: Doubles, step: Doubles) -> Doubles:
         """Return an accelerated step; the given one where the last steps do not suffice."""
         lever = np.array([1, 1, LEVER_M, 1])[: len(step), None]
         if np.linalg.norm(lever[:, 0] * step) > NEAR_M:  # too far for the last steps to tell much
@@ -258,20 +337,24 @@ class _AndersonAcceleration:
         return accelerated if lengths[0] < LONGEST * lengths[1] else step
 
 
-def _inner(half: Floats, usable: slice) -> tuple[slice, slice] | None:
-    """Return the cells that meet the ground and stay within both images; None where none does."""
-    _, bins, beams = half.shape
-    reach = np.abs(half).max(axis=(1, 2))
+def _inner(there: Floats, usable: slice, least: Doubles) -> tuple[slice, slice] | None:
+    """Return the cells that meet the ground and stay within both images; None where none does.
+
+    ``least`` are the margins so far ``(2,)``, which grow in place: cells that came and went would keep it from settling.
+    """
+    _, bins, beams = there.shape
+    reach = np.array([max(one.max(), -one.min()) for one in there])
     if not np.isfinite(reach).all():
         return None
-    margin = [int(np.ceil(far)) + 1 for far in reach]
+    least[:] = np.maximum(least, np.ceil(reach) + 1)
+    margin = [int(far) for far in least]
     start = max(margin[0], usable.start)
     if not (start + margin[0] < bins and 2 * margin[1] < beams):
         return None
     return slice(start, bins - margin[0]), slice(margin[1], beams - margin[1])
 
 
-def _singular(normal: NDArray[np.float64]) -> bool:
+def _singular(normal: Doubles) -> bool:
     """Return whether some motion changes nothing."""
     size = np.sqrt(np.diag(normal))
     if not (size > 0).all():
@@ -280,31 +363,37 @@ def _singular(normal: NDArray[np.float64]) -> bool:
     return bool(stretch[-1] > 1e8 * stretch[0])
 
 
-def _cross(side: _Side, cells: Cells, level: DirectLevel) -> NDArray[np.float64]:
-    """Return how the gradient changes with the motion, from slopes of one frame times slopes of the other, whose noise is
-    independent."""
-    frames = (side.before, side.after)
-    one, other = (cells.along(central_differences(blurred(image, *level.slopes)), side.inner) for image in frames)
-    product = ((one * side.curvature()) @ other.T).astype(np.float64)
-    return (product + product.T) / 2
+def _cross(side: _Side, cells: Cells, level: DirectLevel) -> Doubles:
+    """Return how the pull changes with the slopes ``(3, patches)``, from slopes of one frame times slopes of the other,
+    whose noise is independent.
 
-
-def _block_weight(slopes: tuple[Floats, Floats], residual: Floats, weight: Floats, inner: tuple[slice, slice]) -> Floats:
-    """Return weights ``(cells,)`` of whole blocks: one that moves on its own shows relief, or a shadow.
-
-    The measure is the decrease of its squared differences by its own best shift (Lucas and Kanade, 1981).
+    Outliers, whose weight falls as they grow, count with the derivative of weight times residual, which is negative: a
+    motion that the weights hold is known less well than the sum of the weights says.
     """
-    along, across = slopes[0][inner], slopes[1][inner]
-    r, w = residual.reshape(along.shape), weight.reshape(along.shape)
-    terms = np.empty((5, *r.shape), dtype=np.float32)
-    products = ((along, along), (along, across), (across, across), (along, r), (across, r))
-    for k, (one, other) in enumerate(products):
-        np.multiply(one, other, out=terms[k])
-    terms *= w
-    aa, ab, bb, pull_a, pull_b = by_block(terms, BLOCK)
-    aa, bb = aa + 1e-3 * aa.mean() + 1e-12, bb + 1e-3 * bb.mean() + 1e-12
+    curvature = side.weight * (2 * side.weight - 1)
+    (along, across), others = (central_differences(blurred(image, *level.slopes)) for image in (side.before, side.after))
+    bins, beams = along * curvature, across * curvature
+    products = (bins, others[0]), (bins, others[1]), (beams, others[0]), (beams, others[1])
+    along_both, one, other, across_both = products_by_block(products, cells.patch)
+    return np.stack([along_both, (one + other) / 2, across_both]) * side.patches
+
+
+def _patch_weight(sums: Doubles) -> Doubles:
+    """Return weights of patches ``(patches,)``: one whose surroundings move on their own shows relief, or a shadow.
+
+    The measure is the decrease of their squared differences by their own best shift (Lucas and Kanade, 1981). ``sums``: of
+    slopes by slopes and by residuals ``(5, rows, columns)``.
+    """
+    around = np.array([cv2.boxFilter(one, -1, AROUND, normalize=False, borderType=cv2.BORDER_CONSTANT) for one in sums])
+    aa, ab, bb, pull_a, pull_b = around.reshape(5, -1)
+    holds = aa + bb > 0
+    if not holds.any():
+        return np.ones(aa.shape)
+    aa, bb = (one + 1e-3 * one[holds].mean() + 1e-12 for one in (aa, bb))
     decrease = (bb * pull_a**2 - 2 * ab * pull_a * pull_b + aa * pull_b**2) / (aa * bb - ab * ab)
-    blocks = 1 / (1 + decrease / (BLOCK_CAUCHY**2 * float(np.median(decrease)) + 1e-12))
-    row, column = (block_of(r.shape[k], BLOCK[k]) for k in (0, 1))
-    table = blocks.reshape(row[-1] + 1, column[-1] + 1).astype(np.float32)
-    return np.asarray(table[row][:, column]).ravel()
+    return np.asarray(1 / (1 + decrease / (BLOCK_CAUCHY**2 * median_of(decrease[holds]) + 1e-12)))
+
+
+def _together(values: Doubles, cells: Cells) -> Doubles:
+    """Sum values of patches ``(..., patches)`` over the blocks whose errors are alike ``(..., blocks)``."""
+    return by_block(values.reshape(*values.shape[:-1], *cells.patches), TOGETHER)

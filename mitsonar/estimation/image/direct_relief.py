@@ -17,8 +17,17 @@ from numpy.typing import NDArray
 from mitsonar.estimation.estimator import correlation_of, spread_of
 from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
-from mitsonar.estimation.image.direct_registration import Fit, smoothed
-from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, sampled, slopes_of
+from mitsonar.estimation.image.direct_nodes import GroundNodes
+from mitsonar.estimation.image.direct_registration import (
+    FEWEST_CELLS,
+    Fit,
+    alike_cells,
+    cauchy,
+    is_resolved,
+    noise_of,
+    smoothed,
+)
+from mitsonar.estimation.image.image_slopes import blurred, sampled, slopes_of
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -43,9 +52,6 @@ RELIEF_STD = 0.048
 ILLUMINATION = (12.0, 4.0)
 """Bins and beams beyond which brightness belongs to the sonar, which moves, and not to the ground."""
 
-CAUCHY = 3.0
-"""Residuals of so many standard deviations have half the weight."""
-
 ALIKE = 20.0
 """Residuals that count as one: those of a block err together where its ground is not as the model has it."""
 
@@ -55,10 +61,8 @@ SETTLED = np.array([3e-4, 3e-4, 6e-5])
 TALLEST_STEP = 0.06
 """Largest change of a height in one iteration, as part of the sonar's."""
 
-SMALL = (2e-3, 2e-3, 5e-4, 0.1)
-"""Steps of numerical derivatives [m, m, rad, m]."""
-
-FEWEST_CELLS = 500
+SMALL = (2e-3, 2e-3, 5e-4, 0.04)
+"""Steps of numerical derivatives [m, m, rad], and of the height as part of the sonar's: 0.1 m at 2.5 m."""
 
 
 class _Equations(NamedTuple):
@@ -88,23 +92,22 @@ class _Equations(NamedTuple):
 class _ReliefLevel:
     """One level: its frames and cells, and derivatives at the motion with which it begins."""
 
-    def __init__(
-        self, images: Pair, frames: SonarFrames, attitude: Attitude, v: NDArray[np.float64], level: DirectLevel
-    ) -> None:
+    def __init__(self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel) -> None:
         self.level = level
-        self.cells = Cells(frames, attitude, level, heave=False)
+        self.nodes, self.cells = nodes, Cells(nodes, level)
         slow = ILLUMINATION[0] / level.step, ILLUMINATION[1]
         self.images = tuple(one - blurred(one, *slow) for one in (smoothed(image, level) for image in images))
         self.shape = self.images[0].shape
         self.block = max(1, RELIEF_BLOCK[0] // level.step), RELIEF_BLOCK[1]
         self.blocks = cell_blocks(self.shape, self.block)
         self.sides = [self._derivatives(v, back=back) for back in (False, True)]
-        self.mean = self._mean(frames, attitude)
+        self.mean = self._mean(nodes.frames, nodes.attitude)
 
     def _derivatives(self, v: NDArray[np.float64], *, back: bool) -> Floats:
         """Return the derivatives of the displacement by motion and height ``(4, 2, bins, beams)``."""
         found = []
-        for k, small in enumerate(SMALL):
+        steps = *SMALL[:3], SMALL[3] * self.nodes.attitude.height_m
+        for k, small in enumerate(steps):
             change = np.zeros(4)
             change[k] = small
             ahead, behind = (
@@ -141,9 +144,9 @@ class _ReliefLevel:
             before, after = (drawn, self.images[1]) if back else (self.images[0], drawn)
             residual = after - before
             if not back:
-                scale = max(1.4826 * float(np.median(np.abs(residual[inside][::5]))), FAINTEST)
+                scale = noise_of(residual[inside][::5])
                 correlation, count = correlation_of(before[inside], after[inside]), int(inside.sum())
-            weight = np.asarray(inside / (1 + (residual * np.float32(1 / (CAUCHY * scale))) ** 2), dtype=np.float32)
+            weight = cauchy(residual, scale) * inside
             by_bin, by_beam = slopes_of((before + after) * np.float32(0.5), self.level, scale)
             sign = np.float32(-1 if back else 1)
             jacobian = (by_bin * derivatives[:, 0] + by_beam * derivatives[:, 1]) * sign
@@ -203,8 +206,11 @@ def registered_over_relief(
     v, heights, shape = np.asarray(start, dtype=np.float64), None, (0, 0)
     prior = 1 / (RELIEF_STD * attitude.height_m) ** 2
     found, converged = None, False
-    for level in RELIEF_LEVELS:
-        at = _ReliefLevel(images, frames, attitude, v, level)
+    nodes = GroundNodes(frames, attitude, heave=False)
+    for number, level in enumerate(RELIEF_LEVELS):
+        if number + 1 < len(RELIEF_LEVELS) and not is_resolved(len(images[0]), level):
+            continue
+        at = _ReliefLevel(images, nodes, v, level)
         if heights is not None:
             table = heights.reshape(shape).astype(np.float32)
             heights = cv2.resize(table, at.blocks[::-1]).ravel().astype(np.float64)
@@ -233,14 +239,13 @@ def _assessed(found: _Equations, prior: float, level: DirectLevel, *, converged:
     normal, _ = found.without_heights(prior, np.zeros(len(found.height)))
     undone = np.linalg.inv(normal)
     held = found.noise * prior
-    alike = 4 * np.pi * max(level.smoothing[0], 0.28) * max(level.smoothing[1], 0.28)
     return Fit(
         converged=converged,
         # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
         covariance=np.asarray(found.noise * (undone + undone.T) / 2, dtype=np.float64),
         by_height=undone @ (found.both @ (held / (found.height + held))),
         correlation=found.correlation,
-        independent=found.cells / alike,
+        independent=found.cells / alike_cells(level),
         blocks=spread_of(found.height),
     )
 

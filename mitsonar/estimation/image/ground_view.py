@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["GroundView"]
+__all__ = ["GroundView", "fan_places"]
 
 Floats = NDArray[np.float32]
 
@@ -30,28 +31,32 @@ class GroundView:
         frames: whose cells are projected.
         attitude: height over what is seen, pitch, roll.
         cell_m: edge of a pixel; larger where the view would have more than a million.
+        most_along: pixels along the longer side; they are larger where it would have more.
     """
 
     frames: SonarFrames
     attitude: Attitude
     cell_m: float
+    most_along: int = MOST_CELLS
 
     @cached_property
     def _geometry(self) -> GroundGeometry:
-        f, s = self.frames, self.attitude
-        return GroundGeometry(f.range_m, f.bearing_rad, f.sonar.bearing, s.height_m, s.pitch_rad, s.roll_rad)
+        return self.attitude.ground(self.frames)
 
     @cached_property
     def edge(self) -> float:
         """Edge of a pixel [m]."""
         left, right, near, far = self.reach
-        return max(self.cell_m, float(np.sqrt((right - left) * (far - near) / MOST_CELLS)))
+        whole = float(np.sqrt((right - left) * (far - near) / MOST_CELLS))
+        return max(self.cell_m, whole, max(right - left, far - near) / self.most_along)
 
     @cached_property
     def reach(self) -> tuple[float, float, float, float]:
         """Ground seen: starboard from, to, forward from, to [m]; all 0 where the fan meets no ground."""
-        points = self._geometry.points[::8, ::4]
-        points = np.concatenate([points.reshape(-1, 2), self._geometry.points[[0, -1]].reshape(-1, 2)])
+        f = self.frames
+        few = (f.range_m[::8], f.bearing_rad[::4]), (f.range_m[[0, -1]], f.bearing_rad)
+        geometries = [replace(self._geometry, range_m=ranges, bearing_rad=bearings) for ranges, bearings in few]
+        points = np.concatenate([geometry.points.reshape(-1, 2) for geometry in geometries])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return 0.0, 0.0, 0.0, 0.0
@@ -59,18 +64,17 @@ class GroundView:
         return float(left), float(right), float(near), float(far)
 
     @cached_property
-    def _pixel_positions(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Row and column in the frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
+    def points(self) -> NDArray[np.float64]:
+        """Ground of each pixel: starboard, forward [m] ``(rows, columns, 2)``."""
         left, right, near, far = self.reach
         x = np.arange(left, right, self.edge) + self.edge / 2
         y = np.arange(far, near, -self.edge) - self.edge / 2
-        points = np.stack(np.meshgrid(x, y), axis=-1)
-        radius, bearing = self._geometry.to_polar(points)
-        f = self.frames
-        row = np.interp(radius, f.range_m, np.arange(len(f.range_m)), left=-1, right=-1)
-        column = np.interp(bearing, f.bearing_rad, np.arange(len(f.bearing_rad)), left=-1, right=-1)
-        lit = np.abs(self._geometry.elevation(points)) <= np.radians(f.sonar.elevation_fov_deg) / 2
-        return row.astype(np.float32), column.astype(np.float32), (row >= 0) & (column >= 0) & lit
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    @cached_property
+    def _pixel_positions(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Row and column in the frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
+        return fan_places(self._geometry, self.frames.sonar, self.points)
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -107,3 +111,23 @@ class GroundView:
         still = self.warp(Motion(0.0, 0.0, yaw)).astype(float)
         step = (warp[:, 2] - still[:, 2]) * self.edge
         return Motion(float(-step[0]), float(step[1]), yaw)
+
+
+def fan_places(
+    ground: GroundGeometry, sonar: Sonar, points: NDArray[np.float64]
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Find the cells of a frame that show points of the ground.
+
+    Args:
+        ground: under the frame, with its ranges and bearings.
+        sonar: that received it: it lights what is within the opening of its beams.
+        points: starboard, forward [m] ``(..., 2)``.
+
+    Returns:
+        Row and column in the frame, -1 beyond its cells; and whether a point is within them and lit; each ``(...)``.
+    """
+    radius, bearing = ground.to_polar(points)
+    row = np.interp(radius, ground.range_m, np.arange(len(ground.range_m)), left=-1, right=-1)
+    column = np.interp(bearing, ground.bearing_rad, np.arange(len(ground.bearing_rad)), left=-1, right=-1)
+    lit = np.abs(ground.elevation(points)) <= np.radians(sonar.elevation_fov_deg) / 2
+    return row.astype(np.float32), column.astype(np.float32), (row >= 0) & (column >= 0) & lit

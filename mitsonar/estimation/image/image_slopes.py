@@ -24,7 +24,10 @@ def blurred(image: Floats, bins: float, beams: float) -> Floats:
     if not bins and not beams:
         return image
     size = tuple(2 * int(np.ceil(3 * sigma)) + 1 for sigma in (beams, bins))
-    return np.asarray(cv2.GaussianBlur(image, size, sigmaX=beams, sigmaY=bins, borderType=cv2.BORDER_REPLICATE))
+    least = 1e-3  # OpenCV takes 0 for the other one
+    return np.asarray(
+        cv2.GaussianBlur(image, size, sigmaX=max(beams, least), sigmaY=max(bins, least), borderType=cv2.BORDER_REPLICATE)
+    )
 
 
 def sampled(image: Floats, row: Floats, column: Floats) -> Floats:

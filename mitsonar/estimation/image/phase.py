@@ -24,16 +24,23 @@ __all__ = ["Phase"]
 Floats = NDArray[np.float32]
 
 CELL_M = 0.012
-"""Edge of a pixel of the ground [m]."""
+"""Edge of a pixel of the ground [m], while the fan fits."""
+
+MOST_CELLS = 512
+"""Pixels along the longer side of the fan; they are larger where it would have more."""
 
 ANGLES = 720
 """Directions into which half a turn of a spectrum is divided."""
 
 BAND = (0.04, 0.25)
-"""Spatial frequencies that tell the rotation, in cycles a pixel: below lies the fan's outline, above mostly noise."""
+"""Spatial frequencies that tell the rotation, in cycles a pixel of :data:`CELL_M`: below lies the fan's outline, above
+mostly noise."""
+
+HIGHEST = 0.45
+"""Highest frequency of any picture, in its own pixels."""
 
 LOW = 0.06
-"""Standard deviation of the frequencies whose phases are compared, in cycles a pixel."""
+"""Standard deviation of the frequencies whose phases are compared, in cycles a pixel of :data:`CELL_M`."""
 
 ROUNDS = 3
 """Rotation and translation, each found again after the frames have been brought together by what is known."""
@@ -46,10 +53,12 @@ class Phase:
     Args:
         height_m: over the ground, where the window shows no first echoes; default: that of the frames.
         pitch_rad: default: that of the frames.
+        relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
     """
 
     height_m: float | None = None
     pitch_rad: float | None = None
+    relief_m: float | None = None
 
     consumes = SonarFrames
     inputs = INPUTS
@@ -62,18 +71,21 @@ class Phase:
             MitsonarError: frames of :func:`mitsonar.estimation.estimator.two_frames`, or no height or pitch.
         """
         images = two_frames(frames)
-        attitude = attitude_of(frames, "phase", self.height_m, self.pitch_rad)
-        view = GroundView(frames, attitude, CELL_M)
+        attitude = attitude_of(frames, "phase", self.height_m, self.pitch_rad, self.relief_m)
+        view = GroundView(frames, attitude, CELL_M, MOST_CELLS)
         first, second = (view.draw(image) for image in images)
         if attitude.reason or blank(first) or blank(second):
             return rejected(attitude.reason or "nothing in the frames to match")
         if min(first.shape) < 32 or not view.inside.any():
             return rejected("the fan meets too little ground")
         window = _window(view.inside)
-        motion = Motion(0.0, 0.0, 0.0)
+        fixed, motion = _windowed(first, window), Motion(0.0, 0.0, 0.0)
+        larger = view.edge / CELL_M
+        turn, shift = _PhaseCorrelation(_spectrum_by_angle(fixed, larger), LOW), _PhaseCorrelation(fixed, LOW * larger)
         for _ in range(ROUNDS):
-            motion = _turned(motion, _rotation(first, _back(second, view, motion), window))
-            motion = _shifted(motion, _translation(first, _back(second, view, motion), window), view)
+            _, rows = turn.offset(_spectrum_by_angle(_windowed(_back(second, view, motion), window), larger))
+            motion = _turned(motion, -rows * np.pi / ANGLES)
+            motion = _shifted(motion, shift.offset(_windowed(_back(second, view, motion), window)), view)
         matched = _back(second, view, motion)
         smooth = [cv2.GaussianBlur(image, (5, 5), 0) for image in (first, matched)]
         reason = matching_rejection(smooth[0], smooth[1], window > 0.3, alike=4 * np.pi * 1.1**2)
@@ -98,39 +110,38 @@ def _windowed(image: Floats, window: Floats) -> Floats:
     return np.asarray((image - np.average(image, weights=window)) * window, dtype=np.float32)
 
 
-def _rotation(first: Floats, second: Floats, window: Floats) -> float:
-    """How far the spectrum of the second is turned against that of the first [rad], clockwise seen from above."""
-    spectra = [_spectrum_by_angle(_windowed(image, window)) for image in (first, second)]
-    return -_offset(*spectra)[1] * np.pi / ANGLES
+def _spectrum_by_angle(image: Floats, larger: float) -> Floats:
+    """Logarithm of the spectrum's magnitude over half a turn ``(angles, frequencies)``, less the mean over angles.
 
-
-def _spectrum_by_angle(image: Floats) -> Floats:
-    """Logarithm of the spectrum's magnitude over half a turn ``(angles, frequencies)``, less the mean over angles."""
+    The frequencies are the same on the ground where pixels are so many times larger.
+    """
+    band = [min(larger * end, HIGHEST) for end in BAND]
     size = 2 * cv2.getOptimalDFTSize(max(image.shape))
     magnitude = np.fft.fftshift(np.abs(np.fft.rfft2(image, (size, size))), axes=0).astype(np.float32)
     angle = (np.arange(ANGLES, dtype=np.float32)[:, None] + 0.5) / ANGLES * np.pi - np.pi / 2
-    frequency = np.arange(int(BAND[0] * size), int(BAND[1] * size), dtype=np.float32)[None, :]
+    frequency = np.arange(int(band[0] * size), int(band[1] * size), dtype=np.float32)[None, :]
     column, row = frequency * np.cos(angle), size // 2 + frequency * np.sin(angle)
     polar = np.log(cv2.remap(magnitude, column, row, cv2.INTER_LINEAR) + 1e-6)
     return np.asarray(polar - polar.mean(axis=0), dtype=np.float32)
 
 
-def _translation(first: Floats, second: Floats, window: Floats) -> tuple[float, float]:
-    """Columns and rows by which the second lies off the first."""
-    return _offset(_windowed(first, window), _windowed(second, window))
+class _PhaseCorrelation:
+    """How far images lie off a first one, from the phases of their low frequencies alone; ``low`` in cycles a pixel."""
 
+    def __init__(self, first: Floats, low: float) -> None:
+        self.shape = [cv2.getOptimalDFTSize(2 * size) for size in first.shape]
+        self.conjugate = np.conj(np.fft.rfft2(first, self.shape))
+        frequency = np.hypot(np.fft.fftfreq(self.shape[0])[:, None], np.fft.rfftfreq(self.shape[1])[None, :])
+        self.low = np.exp(-((frequency / low) ** 2) / 2)
 
-def _offset(first: Floats, second: Floats) -> tuple[float, float]:
-    """Columns and rows by which the second lies off the first, from the phases of their low frequencies alone."""
-    shape = [cv2.getOptimalDFTSize(2 * size) for size in first.shape]
-    cross = np.conj(np.fft.rfft2(first, shape)) * np.fft.rfft2(second, shape)
-    frequency = np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None, :])
-    low = np.exp(-((frequency / LOW) ** 2) / 2)
-    peak = np.fft.fftshift(np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-30) * low, shape))
-    row, column = np.unravel_index(int(peak[1:-1, 1:-1].argmax()), (shape[0] - 2, shape[1] - 2))
-    near = np.log(np.maximum(peak[row : row + 3, column : column + 3], 1e-12 * float(peak.max()) + 1e-300))
-    rows, columns = (_summit(line) for line in (near[:, 1], near[1]))
-    return float(column + 1 + columns - shape[1] // 2), float(row + 1 + rows - shape[0] // 2)
+    def offset(self, second: Floats) -> tuple[float, float]:
+        """Return columns and rows by which the second lies off the first."""
+        cross = self.conjugate * np.fft.rfft2(second, self.shape)
+        peak = np.fft.fftshift(np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-30) * self.low, self.shape))
+        row, column = np.unravel_index(int(peak[1:-1, 1:-1].argmax()), (self.shape[0] - 2, self.shape[1] - 2))
+        near = np.log(np.maximum(peak[row : row + 3, column : column + 3], 1e-12 * float(peak.max()) + 1e-300))
+        rows, columns = (_summit(line) for line in (near[:, 1], near[1]))
+        return float(column + 1 + columns - self.shape[1] // 2), float(row + 1 + rows - self.shape[0] // 2)
 
 
 def _summit(three: NDArray[np.float64]) -> float:

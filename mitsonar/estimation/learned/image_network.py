@@ -155,15 +155,20 @@ class ImageNetwork(Trained):
         if found.covariance is not None and _correlation_of_answer(images, ground, found.motion) < NOISY:
             found = self._again(frames, images, ground, found)
         found = self._judged(found, prior, "zero" if prior is None else "prior")
-        if found.valid or (prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))):
+        doubtful = found.valid and _correlation_of_answer(images, ground, found.motion) < LEAST_AT_BEST
+        is_near = prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))
+        if is_near or (found.valid and not doubtful):
             return found
-        elsewhere = Phase(self.height_m, self.pitch_rad).estimate(frames)
+        elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
             return found  # a motion nearby has been looked for
         second = self._from(frames, images, ground, elsewhere.motion)
         if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
             second = self._from(frames, images, ground, second.motion)
-        return self._judged(second, prior, "phase")
+        second = self._judged(second, prior, "phase")
+        if doubtful and (not second.valid or _correlation_of_answer(images, ground, second.motion) < LEAST_AT_BEST):
+            return found
+        return second
 
     def _judged(self, found: Estimate, prior: MotionPrior | None, named: str) -> Estimate:
         """Return an estimate that names its start, with the covariance of motions beyond training where it is one.
@@ -200,7 +205,7 @@ class ImageNetwork(Trained):
         went = np.array(found.motion) - np.array(first.motion)
         fine = COMPARISONS[-1]
         one, other, inside = _brought_together(images, ground, found.motion, fine)
-        excess = correlation_excess(one, other, inside, BLOCK // 2)
+        excess = correlation_excess(one, other, inside, BLOCK // 2).mean
         unsure = ambiguity(excess, inside.sum() / fine.alike)
         reason = found.reason or self._rejection_of_size(found.motion)
         return replace(found, covariance=unsure * found.covariance + np.outer(went, went), valid=not reason, reason=reason)

@@ -1,0 +1,96 @@
+"""Level ground at a few nodes of a frame, and how it moves with the sonar: what lies between them is smooth."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.geometry.attitude import Attitude
+from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
+from mitsonar.geometry.lit_ground import margin_of_light
+from mitsonar.motion.composition import inverse
+from mitsonar.records.sonar_frames import SonarFrames
+
+__all__ = ["NODES", "GroundNodes", "node_axes"]
+
+Doubles = NDArray[np.float64]
+
+NODES = (33, 17)
+"""Nodes along range and bearing."""
+
+HEIGHT_STEP = 0.05
+"""Step of the height for numerical derivatives, as a part of it."""
+
+
+def node_axes(range_m: Doubles, bearing_rad: Doubles) -> tuple[Doubles, Doubles]:
+    """Return ranges [m] and bearings [rad] of the nodes: from the first to the last cell."""
+    return np.linspace(range_m[0], range_m[-1], NODES[0]), np.linspace(bearing_rad[0], bearing_rad[-1], NODES[1])
+
+
+class GroundNodes:
+    """The nodes of a pair of frames, which all levels share.
+
+    Args:
+        frames: whose axes they span.
+        attitude: of the sonar.
+        heave: whether the derivative has a fourth component, by the sonar's height.
+
+    Attributes:
+        known: whether a node meets the ground ``(nodes, nodes)``.
+        derivative: of range [m] and bearing [rad] by motion (and heave) ``(3 or 4, 2, nodes, nodes)``.
+    """
+
+    def __init__(self, frames: SonarFrames, attitude: Attitude, *, heave: bool) -> None:
+        self.frames, self.attitude, self.heave = frames, attitude, heave
+        self.axes = node_axes(frames.range_m, frames.bearing_rad)
+        self.ground = self._ground(attitude.height_m)
+        self.known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
+        self.from_node = nearest_known(self.known)
+        self.derivative = self._derivative(self.ground)
+
+    def _ground(self, height: float) -> GroundGeometry:
+        """Return the geometry of the nodes from a height."""
+        attitude = self.attitude
+        return GroundGeometry(*self.axes, self.frames.sonar.bearing, height, attitude.pitch_rad, attitude.roll_rad)
+
+    def _derivative(self, ground: GroundGeometry) -> Doubles:
+        """Return the derivative by motion (and heave), that of the nearest node where a node meets no ground."""
+        nodes = np.moveaxis(ground.derivative, (3, 2), (0, 1))
+        if self.heave:
+            nodes = np.concatenate([nodes, np.moveaxis(ground.derivative_by_height, 2, 0)[None]])
+        return np.nan_to_num(nodes[:, :, self.from_node[0], self.from_node[1]])
+
+    @cached_property
+    def shown(self) -> tuple[NDArray[np.bool_], bool]:
+        """Return which nodes show ground to be matched ``(nodes, nodes)``, and whether the outline of the light is masked.
+
+        See :func:`mitsonar.geometry.lit_ground.margin_of_light`.
+        """
+        margin = margin_of_light(self.ground, self.attitude, self.frames.sonar.elevation_fov_deg)
+        return (self.known, False) if margin is None else (self.known & (margin >= 0), True)
+
+    @cached_property
+    def key(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return ranges and bearings of the frames' cells, to be looked up by."""
+        return tuple(self.frames.range_m.tolist()), tuple(self.frames.bearing_rad.tolist())
+
+    def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
+        """Return the displacement of the nodes in range [m] and bearing [rad]; see :meth:`Cells.shift`."""
+        ground = other = self._ground(self.attitude.height_m - lift_m) if lift_m else self.ground
+        if self.heave:
+            half = float(v[3]) / (2 if back else -2)
+            ground, other = (self._ground(self.attitude.height_m + change) for change in (half, -half))
+        motion = inverse(v[:3]) if back else v[:3]
+        radius, bearing = other.to_polar(moved(ground.points, motion))
+        nodes = np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
+        # a cell that meets level ground may not meet ground that lies lower
+        row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else self.from_node
+        return np.asarray(nodes[:, row, column], dtype=np.float64)
+
+    def lifted_shift(self, v: Doubles) -> Doubles:
+        """Return the derivative of :meth:`shift` by the height [m/m, rad/m], to first order in the motion."""
+        change = HEIGHT_STEP * self.attitude.height_m
+        higher = self._derivative(self._ground(self.attitude.height_m + change))
+        return np.asarray(np.tensordot(v / change, higher - self.derivative, axes=1))
