@@ -50,7 +50,7 @@ LEVELS = (
 MODEL = 1.1
 """Squared errors over the covariance of the residuals: interpolation between cells makes noise alike in a few more of them.
 
-With it they are 0.9 and 0.7 times the covariance on rocky fields without and with high noise, 1.8 times with speckle."""
+With it they are 0.9 and 0.7 times the covariance on rocky fields without and with high noise, 1.9 times with speckle."""
 
 FAR_MODEL = 3.0
 """Squared errors over the covariance of the residuals where heights of blocks are estimated, measured on rocky fields."""
