@@ -7,10 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, nearest_known
+from mitsonar.geometry.lit_ground import margin_of_light
 from mitsonar.instruments.imaging_sonar import Bearing
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["NODES", "ground_at", "ground_of"]
+__all__ = ["NODES", "ground_at", "ground_of", "light_of"]
 
 NODES = (17, 9)
 """Nodes along range and bearing. The geometry is smooth: linear interpolation between them errs by less than 1e-3 cells."""
@@ -77,3 +78,19 @@ def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.f
         attitude.pitch_rad,
         attitude.roll_rad,
     )
+
+
+def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
+    """Compute how far inside the light the ground of each node lies, as ``lit (R, C)``; empty where its outline is left in.
+
+    See :func:`mitsonar.geometry.lit_ground.margin_of_light`. It stays in where
+    little of the window is lit, as in training, which does without this table.
+    """
+    range_m, bearing_rad = (
+        np.interp(np.linspace(0, len(axis) - 1, count), np.arange(len(axis)), axis)
+        for axis, count in zip((frames.range_m, frames.bearing_rad), NODES, strict=True)
+    )
+    sonar, pitch_rad, roll_rad = frames.sonar, attitude.pitch_rad, attitude.roll_rad
+    ground = GroundGeometry(range_m, bearing_rad, sonar.bearing, attitude.height_m, pitch_rad, roll_rad)
+    margin = margin_of_light(ground, attitude, sonar.elevation_fov_deg, mostly=0.0)
+    return {} if margin is None else {"lit": margin.astype(np.float32)}

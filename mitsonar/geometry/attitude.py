@@ -62,6 +62,7 @@ class Attitude:
         roll_rad: > 0 puts starboard down.
         reason: why the given geometry is rejected; empty where it is not.
         even: whether first echoes show ground without relief.
+        told_m: height over the ground as it was told [m]; None: it was not.
     """
 
     height_m: float
@@ -70,6 +71,12 @@ class Attitude:
     roll_rad: float = 0.0
     reason: str = ""
     even: bool = False
+    told_m: float | None = None
+
+    @property
+    def floor_m(self) -> float:
+        """Height over the floor, where the fan begins to light it [m]: as told, but there may be a rock straight below."""
+        return self.height_m if self.told_m is None else max(self.told_m, self.height_m)
 
     @property
     def by_echoes(self) -> bool:
@@ -131,7 +138,8 @@ def attitude_of(
     if abs(measured.height_m - given) > AGREEING * given:
         reason = f"first echoes tell a height of {measured.height_m:.2f} m, not {given:.2f} m: height or pitch is wrong"
         return Attitude(given, STD_GIVEN * given, pitch, roll, reason)
-    return Attitude(measured.height_m, STD_MEASURED * measured.height_m, pitch, roll, even=measured.even)
+    std = STD_MEASURED * measured.height_m
+    return Attitude(measured.height_m, std, pitch, roll, even=measured.even, told_m=given)
 
 
 def _mean_lean(frames: SonarFrames) -> NDArray[np.float64] | None:

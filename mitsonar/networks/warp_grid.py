@@ -55,6 +55,7 @@ class WarpGrid:
             derivative = derivative + self.by_relief
         self.derivative = derivative.transpose(1, 2)
         self.crosswise = self.derivative.flip(2)
+        self.lit = self._on_cells(ground["lit"]) > 0 if "lit" in ground else None
 
     def draw(self, second: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
         """Sample the second frame, bilinearly, where a motion moves the cells of the first.
@@ -68,6 +69,8 @@ class WarpGrid:
         """
         place = self.base + self.span * self._shift(motion)
         inside = (place.abs().amax(dim=1) <= 1 + 1e-3).to(second.dtype)  # rounding must not decide at the border
+        if self.lit is not None:
+            inside = inside * self.lit
         grid = torch.stack([place[:, 1], place[:, 0]], dim=-1)
         return functional.grid_sample(second, grid, align_corners=True, padding_mode="border"), inside
 

@@ -138,7 +138,7 @@ def test_derivative_by_differences(bearing: str, tilt: tuple[float, float]) -> N
 
 def test_the_sonar_s_own_sensors_tell_pitch_and_roll_where_poses_do_not() -> None:
     sonar = Sonar(beams=24, range_bins=64)
-    lean = np.radians([[30, 2, 90], [32, 4, np.nan]])
+    lean = np.radians(np.array([[30, 2, 90], [32, 4, np.nan]]))
     image, time, height = np.ones((2, 64, 24), np.float32), np.arange(2.0), np.full(2, 2.5)
     frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, time, sonar, attitude_rad=lean, height_m=height)
     told = attitude_of(frames, "a test", None, None)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
+from mitsonar.geometry.lit_ground import margin_of_light
 from mitsonar.motion.composition import inverse
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -18,12 +19,6 @@ Doubles = NDArray[np.float64]
 
 NODES = (33, 17)
 """Nodes along range and bearing."""
-
-MOSTLY = 0.5
-"""Part of the window that must show lit ground for the outline of the light to be left in."""
-
-LIT = 0.9
-"""Part of the field of view's elevation that is free of its outline."""
 
 HEIGHT_STEP = 0.05
 """Step of the height for numerical derivatives, as a part of it."""
@@ -71,14 +66,10 @@ class GroundNodes:
     def shown(self) -> tuple[NDArray[np.bool_], bool]:
         """Return which nodes show ground to be matched ``(nodes, nodes)``, and whether the outline of the light is masked.
 
-        The outline of the lit ground moves with the sonar and biases motions to zero. It is masked where the ground is even,
-        and where most of the fan is not lit. Rocks blur it, and those that rise beyond it help.
+        See :func:`mitsonar.geometry.lit_ground.margin_of_light`.
         """
-        half_elevation = np.radians(self.frames.sonar.elevation_fov_deg) / 2
-        with np.errstate(invalid="ignore"):
-            lit = np.abs(self.ground.elevation(self.ground.points)) <= LIT * half_elevation
-        mask_lit = self.attitude.even or bool(lit.mean() < MOSTLY)
-        return (self.known & lit if mask_lit else self.known), mask_lit
+        margin = margin_of_light(self.ground, self.attitude, self.frames.sonar.elevation_fov_deg)
+        return (self.known, False) if margin is None else (self.known & (margin >= 0), True)
 
     @cached_property
     def key(self) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import correlation_of, spread_of
+from mitsonar.estimation.estimator import Excess, ambiguity, correlation_excess, correlation_of, spread_of
 from mitsonar.estimation.image.direct_blocks import by_block, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
 
-__all__ = ["FEWEST_CELLS", "Fit", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"]
+__all__ = ["FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"]
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -31,8 +31,14 @@ TOGETHER = (3, 2)
 AROUND = (3, 3)
 """Patches along beams and bins around each that are looked at as a block."""
 
-BLOCK_CAUCHY = 3.0
+BLOCK_CAUCHY = 4.0
 """Blocks whose own best shift explains so many times (squared) what it usually does have half the weight."""
+
+NEGLIGIBLE = 0.1
+"""Standard deviations of the estimate below which a step left over is lost in the noise."""
+
+ASIDE = 8
+"""Beams by which one frame is displaced to see how much the match stands out."""
 
 COARSE = 10.0
 """How many times larger steps end the iteration of a level that another follows."""
@@ -47,17 +53,18 @@ must be before."""
 FEWEST_CELLS = 500
 """Fewest cells that are registered."""
 
-
 FEWEST_ROWS = 24
 """Fewest rows of a level that is not the last."""
-
 
 SAMPLED = (5, 3)
 """The noise is measured in every so manieth bin and beam."""
 
 
 class Fit(NamedTuple):
-    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes."""
+    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes.
+
+    ``excess`` is how much the correlation exceeds that of displaced frames.
+    """
 
     converged: bool
     covariance: Doubles
@@ -65,6 +72,18 @@ class Fit(NamedTuple):
     correlation: float
     independent: float
     blocks: float
+    excess: Excess = Excess()
+
+
+class Held(NamedTuple):
+    """What is known of the unknowns before: mean and standard deviation of each [m, m, rad, m]; infinite: nothing."""
+
+    mean: Doubles
+    std: Doubles
+
+    def weight(self, scale: float, level: DirectLevel) -> Doubles:
+        """Return the prior weight of each unknown in units of the residuals' noise."""
+        return np.asarray(alike_cells(level) * scale**2 / self.std**2)
 
 
 def register(
@@ -74,7 +93,7 @@ def register(
     level: DirectLevel,
     *,
     last: bool,
-    heave_std_m: float,
+    held: Held,
 ) -> tuple[Doubles, Fit | None] | None:
     """Run Gauss-Newton from a start; None where there is nothing to match.
 
@@ -84,7 +103,7 @@ def register(
         start: sideways, forward [m], yaw [rad], and heave [m] where it is unknown ``(3,)`` or ``(4,)``.
         level: smoothing and iterations.
         last: whether it is the finest level: both ways are drawn, and the fit is assessed.
-        heave_std_m: prior standard deviation of the heave.
+        held: what is known of the unknowns before.
 
     Returns:
         The motion, and its fit at the finest level.
@@ -96,36 +115,39 @@ def register(
         at = _linearised(*pair, cells, v, level, margins, last=last)
         if at is None:
             return None
-        held = _held(at.scale, len(v), heave_std_m)
-        step = np.asarray(-np.linalg.solve(at.normal + np.diag(held), at.pull + held * v), dtype=np.float64)
+        weight = held.weight(at.scale, level)
+        pull = at.pull + weight * (v - held.mean)
+        step = np.asarray(-np.linalg.solve(at.normal + np.diag(weight), pull), dtype=np.float64)
         v = np.add(v, accelerate(v, step))
         converged = bool((np.abs(step[:3]) < still).all())
         if converged:
             break
     if not last or at is None:
         return v, None
-    return v, _fit(at, cells, v, level, _held(at.scale, len(v), heave_std_m), converged)
+    fit = _fit(at, cells, v, level, held.weight(at.scale, level), converged)
+    return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
 
 
-def _held(scale: float, unknowns: int, heave_std_m: float) -> Doubles:
-    """Return the prior weight of each unknown in units of the residuals' noise: only heave has one."""
-    held = np.zeros(unknowns)
-    held[3:] = scale**2 / heave_std_m**2 if heave_std_m else 0.0
-    return held
+def _is_small(step: Doubles, covariance: Doubles) -> bool:
+    """Return whether a step is lost in the noise of the estimate ``(3, 3)``, however long it is."""
+    return bool(step @ np.linalg.lstsq(covariance, step, rcond=None)[0] < NEGLIGIBLE**2)
 
 
 class _Side(NamedTuple):
     """One frame drawn at the cells of the other: residual, weights, and sums over patches.
 
-    ``weight`` is that of single cells, 0 where they do not count ``(bins, beams)``; ``patches`` that of each patch
-    ``(patches,)``; ``slopes`` and ``pull`` are sums of both weights times slope by slope, and times slope by residual: along
-    bins, of both, along beams ``(3, patches)``; along bins, beams ``(2, patches)``.
+    ``weight`` is that of single cells, 0 where they do not count ``(bins, beams)``; ``along`` and ``across`` are it times
+    the slopes along bins and beams; ``patches`` is that of each patch ``(patches,)``; ``slopes`` and ``pull`` are sums of
+    both weights times slope by slope, and times slope by residual: along bins, of both, along beams ``(3, patches)``; along
+    bins, beams ``(2, patches)``.
     """
 
     before: Floats
     after: Floats
     inner: tuple[slice, slice]
     weight: Floats
+    along: Floats
+    across: Floats
     patches: Doubles
     slopes: Doubles
     pull: Doubles
@@ -198,7 +220,7 @@ def _side(
     sums = products_by_block(products, cells.patch)
     patches = _patch_weight(sums.reshape(5, *cells.patches)) if last else np.ones(sums.shape[1])
     sums *= patches
-    return _Side(before, after, inner, weight, patches, sums[:3], sums[3:])
+    return _Side(before, after, inner, weight, bins, beams, patches, sums[:3], sums[3:])
 
 
 def cauchy(residual: Floats, scale: float) -> Floats:
@@ -230,26 +252,47 @@ def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
 
 
 def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
-    """Assess the motion from the gradients of blocks, and from slopes of one frame times those of the other."""
+    """Assess the motion from the gradients of single cells, and from slopes of one frame times those of the other.
+
+    Sums of gradients over blocks tell less: what interpolation leaves over changes sign within a block and cancels there.
+    """
     true = np.sum([_by_motion(cells.derivative, _cross(side, cells, level)) for side in at.sides], axis=0)
     # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
     sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
     undone = np.linalg.inv(sound + np.diag(held))
-    pulls = np.sum([_together((cells.derivative * side.pull).sum(axis=1), cells) for side in at.sides], axis=0)
+    pulls = np.sum([_by_motion(cells.derivative, _squared_pulls(side, cells)) for side in at.sides], axis=0)
+    # what is known before errs, too: where the frames tell nothing it is all that is known
+    spread = alike_cells(level) * ((pulls + pulls.T) / 2 + at.scale**2 * np.diag(held))
     side = at.sides[0]
     informed = [_information(cells.derivative, one.slopes) for one in at.sides]
     shares = _together((np.tensordot(undone, informed[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
     lifted = cells.lifted_shift(v)
     by_height = np.sum([_flat(one) @ lifted.ravel() for one in informed], axis=0)
     before, after = side.before[side.inner], side.after[side.inner]
+    independent, excess = before.size / alike_cells(level), _excess(side, cells)
     return Fit(
         converged=converged,
-        covariance=undone @ (pulls @ pulls.T) @ undone,
+        covariance=ambiguity(excess.mean, independent) * undone @ spread @ undone,
         by_height=undone @ by_height,
         correlation=correlation_of(before, after),
-        independent=before.size / alike_cells(level),
+        independent=independent,
         blocks=spread_of(shares),
+        excess=excess,
     )
+
+
+def _squared_pulls(side: _Side, cells: Cells) -> Doubles:
+    """Return sums of the squared pulls of single cells over patches: along bins, of both, along beams ``(3, patches)``."""
+    residual = side.after - side.before
+    along, across = side.along * residual, side.across * residual
+    return products_by_block(((along, along), (along, across), (across, across)), cells.patch) * side.patches**2
+
+
+def _excess(side: _Side, cells: Cells) -> Excess:
+    """Return by how much the frames correlate more than displaced across the beams."""
+    before, after = side.before[side.inner], side.after[side.inner]
+    inside = np.ones(before.shape, dtype=bool) if cells.seen is None else cells.seen[side.inner] > 0
+    return correlation_excess(before, after, inside, ASIDE)
 
 
 def is_resolved(bins: int, level: DirectLevel) -> bool:

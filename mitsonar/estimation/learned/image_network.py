@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -13,9 +13,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mitsonar.datasets.arrangement import Arrangement
-from mitsonar.datasets.ground_nodes import ground_of
+from mitsonar.datasets.ground_nodes import ground_of, light_of
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.estimator import Estimate, blank, matching_rejection, rejected, two_frames
+from mitsonar.estimation.estimator import (
+    LEAST_AT_BEST,
+    Estimate,
+    ambiguity,
+    blank,
+    correlation_excess,
+    correlation_of,
+    matching_rejection,
+    rejected,
+    two_frames,
+    without_slow,
+)
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.estimation.prior_gate import prior_rejection
@@ -34,11 +45,29 @@ Pair = tuple[NDArray[np.float32], NDArray[np.float32]]
 SMOOTH = (2.0, 0.8)
 """Standard deviations of the filter before frames are matched [bins, beams]."""
 
-CELL = 4
-"""Bins of the cells in which frames are compared that an answer has brought together."""
+
+class Comparison(NamedTuple):
+    """How frames are compared that an answer has brought together: bins of a cell, smoothing [bins, beams]."""
+
+    cell: int
+    smoothing: tuple[float, float]
+
+    @property
+    def alike(self) -> float:
+        """Return how many neighbouring cells count as one."""
+        return 4 * math.pi * math.hypot(self.smoothing[0] / self.cell, 12**-0.5) * self.smoothing[1]
+
+
+COMPARISONS = (Comparison(4, SMOOTH), Comparison(1, (0.7, 0.5)))
+"""The second only where the first finds nothing: fine texture shows in noise that hides what is coarse."""
 
 BLOCK = 16
 """Such cells and beams of the blocks over which what is matched must be spread."""
+
+NOISY = 0.75
+"""Correlation of matched frames below which noise shortens the network's steps, so that it goes on from its answer.
+
+Rocky fields have 0.77 and more in high noise, hulls 0.5 and less."""
 
 FAR_MODEL = 4.0
 """Squared errors over the network's covariance for motions far beyond training, measured on rocky fields."""
@@ -121,10 +150,14 @@ class ImageNetwork(Trained):
             return rejected(attitude.reason)
         if attitude is None:
             return self._from(frames, images, {}, None)
-        ground = _batch(ground_of(frames, attitude))
+        ground = _batch({**ground_of(frames, attitude), **light_of(frames, attitude)})
         found = self._from(frames, images, ground, None if prior is None else prior.motion)
+        if found.covariance is not None and _correlation_of_answer(images, ground, found.motion) < NOISY:
+            found = self._again(frames, images, ground, found)
         found = self._judged(found, prior, "zero" if prior is None else "prior")
-        if found.valid or (prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))):
+        doubtful = found.valid and _correlation_of_answer(images, ground, found.motion) < LEAST_AT_BEST
+        is_near = prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))
+        if is_near or (found.valid and not doubtful):
             return found
         elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not self._rejection_of_size(elsewhere.motion):
@@ -132,7 +165,10 @@ class ImageNetwork(Trained):
         second = self._from(frames, images, ground, elsewhere.motion)
         if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
             second = self._from(frames, images, ground, second.motion)
-        return self._judged(second, prior, "phase")
+        second = self._judged(second, prior, "phase")
+        if doubtful and (not second.valid or _correlation_of_answer(images, ground, second.motion) < LEAST_AT_BEST):
+            return found
+        return second
 
     def _judged(self, found: Estimate, prior: MotionPrior | None, named: str) -> Estimate:
         """Return an estimate that names its start, with the covariance of motions beyond training where it is one.
@@ -161,6 +197,19 @@ class ImageNetwork(Trained):
             reason = _rejection_of_answer(images, ground, motion) if ground else self._rejection_of_match(frames, images)
         return Estimate(motion, covariance, not reason, reason)
 
+    def _again(self, frames: SonarFrames, images: Pair, ground: Ground, first: Estimate) -> Estimate:
+        """Estimate once more, from an answer that noise may have held back; how far it goes is not known better."""
+        found = self._from(frames, images, ground, first.motion)
+        if found.covariance is None:
+            return found
+        went = np.array(found.motion) - np.array(first.motion)
+        fine = COMPARISONS[-1]
+        one, other, inside = _brought_together(images, ground, found.motion, fine)
+        excess = correlation_excess(one, other, inside, BLOCK // 2).mean
+        unsure = ambiguity(excess, inside.sum() / fine.alike)
+        reason = found.reason or self._rejection_of_size(found.motion)
+        return replace(found, covariance=unsure * found.covariance + np.outer(went, went), valid=not reason, reason=reason)
+
     def _attitude_of(self, frames: SonarFrames) -> Attitude | None:
         """Height and pitch, for a network that is given them."""
         if not self._checkpoint.arrangement["ground"]:
@@ -187,11 +236,11 @@ class ImageNetwork(Trained):
 
     def _rejection_of_match(self, frames: SonarFrames, images: Pair) -> str:
         """Whether the frames show one place at all: they must be alike once shifted, as far as training's motions go."""
-        first, second = (smooth(image) for image in images)
+        first, second = (smooth(image, Comparison(1, SMOOTH)) for image in images)
         size = first.shape
         rows, columns = (min(reach, length // 3) for reach, length in zip(self._reach(frames), size, strict=True))
         middle = second[rows : size[0] - rows, columns : size[1] - columns]
-        found = cv2.matchTemplate(without_slow(first), without_slow(middle), cv2.TM_CCOEFF_NORMED)
+        found = cv2.matchTemplate(without_slow(first, 32), without_slow(middle, 32), cv2.TM_CCOEFF_NORMED)
         row, column = np.unravel_index(int(found.argmax()), found.shape)
         there = first[row : row + middle.shape[0], column : column + middle.shape[1]]
         inside = np.ones(middle.shape, dtype=bool)
@@ -214,23 +263,41 @@ def _batch(table: dict[str, NDArray[np.float32]]) -> Ground:
 
 def _rejection_of_answer(images: Pair, ground: Ground, motion: Motion) -> str:
     """Whether the frames are alike once the second is drawn where the answer takes what the first shows."""
-    rows, beams = images[0].shape[0] // CELL, images[0].shape[1]
-    means = (image[: rows * CELL].reshape(rows, CELL, beams).mean(axis=1) for image in images)
-    first, second = (smooth(mean, CELL) for mean in means)
-    warp_grid = WarpGrid(ground, torch.ones(1, 3), (CELL, 1), images[0].shape, first.shape, None)
+    coarse, fine = COMPARISONS
+    reason = _mismatch(images, ground, motion, coarse)
+    if reason and _correlation_of_answer(images, ground, motion) < LEAST_AT_BEST:
+        return reason if _mismatch(images, ground, motion, fine) else ""
+    return reason
+
+
+def _mismatch(images: Pair, ground: Ground, motion: Motion, comparison: Comparison) -> str:
+    """Return why the frames that an answer has brought together do not match; empty where they do."""
+    first, second, inside = _brought_together(images, ground, motion, comparison)
+    return matching_rejection(first, second, inside, alike=comparison.alike, block=BLOCK, aside=BLOCK // 2)
+
+
+def _correlation_of_answer(images: Pair, ground: Ground, motion: Motion) -> float:
+    """Return the correlation of the frames that an answer has brought together."""
+    first, second, inside = _brought_together(images, ground, motion, COMPARISONS[0])
+    return correlation_of(without_slow(first, BLOCK)[inside], without_slow(second, BLOCK)[inside])
+
+
+def _brought_together(
+    images: Pair, ground: Ground, motion: Motion, comparison: Comparison
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Return the first frame, the second one drawn at its cells, and which cells both show."""
+    rows, beams = images[0].shape[0] // comparison.cell, images[0].shape[1]
+    means = (image[: rows * comparison.cell].reshape(rows, comparison.cell, beams).mean(axis=1) for image in images)
+    first, second = (smooth(mean, comparison) for mean in means)
+    warp_grid = WarpGrid(ground, torch.ones(1, 3), (comparison.cell, 1), images[0].shape, first.shape, None)
     back, inside = warp_grid.draw(torch.from_numpy(second)[None, None], torch.tensor([motion]))
-    alike = 4 * math.pi * math.hypot(SMOOTH[0] / CELL, 12**-0.5) * SMOOTH[1]
-    return matching_rejection(first, back[0, 0].numpy(), inside[0].numpy() > 0, alike=alike, block=BLOCK)
+    return first, back[0, 0].numpy(), inside[0].numpy() > 0
 
 
-def smooth(image: NDArray[np.float32], step: int = 1) -> NDArray[np.float32]:
-    """With less noise; ``step`` bins are a cell."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=SMOOTH[1], sigmaY=SMOOTH[0] / step), dtype=np.float32)
-
-
-def without_slow(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Remove what varies slowly: it belongs to the illumination, not to the ground."""
-    return np.asarray(image - cv2.blur(image, (16, 16)), dtype=np.float32)
+def smooth(image: NDArray[np.float32], comparison: Comparison) -> NDArray[np.float32]:
+    """With less noise."""
+    bins, beams = comparison.smoothing
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigmaX=beams, sigmaY=bins / comparison.cell), dtype=np.float32)
 
 
 def _is_covariance(matrix: NDArray[np.float64]) -> bool:
