@@ -50,6 +50,7 @@ from trajectory_jobs import (
     RUNS,
     SETTINGS,
     SLOW,
+    SPECKLE,
     TABLE_21,
     TEXTURES,
     Job,
@@ -65,6 +66,7 @@ from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.mapping.benchmark_sets import TEXTURES as SONARS
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.pose_covariance import pose_covariances
@@ -94,7 +96,9 @@ def main() -> None:
     """Run what is missing, draw, print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default=",".join(PARTS), help="which parts, with commas between")
-    parser.add_argument("--models", default=",".join(RECIPES), help="of the trajectories, with commas between")
+    parser.add_argument(
+        "--models", default=",".join(RECIPES), help=f"of the trajectories, with commas between; {SPECKLE} too"
+    )
     parser.add_argument("--frames", type=int, default=0, help="so many frames of each run at most, to try")
     parser.add_argument("--out", type=Path, default=Path("out/trajectories"), help="data sets, results, estimates")
     parser.add_argument("--pictures", type=Path, help="where pictures go (default: OUT)")
@@ -310,7 +314,8 @@ def rendered(job: Job) -> SonarFrames:
     from mitsonar.worlds.pattern import Pattern
     from mitsonar.worlds.rocky_field import RockyField
 
-    sonar = load_recipe(RECIPES[job.model]).instrument.replace(**(COARSE if job.coarse else {}))
+    recipe, speckle = (RECIPES["physical"], SONARS["speckle"]) if job.model == SPECKLE else (RECIPES[job.model], {})
+    sonar = load_recipe(recipe).instrument.replace(**(COARSE if job.coarse else {}), **speckle)
     rocks = {"a_side": (9, 15)} if job.coarse else {}
     family = Pattern(texture="gaussian") if job.run in RUNS else RockyField(size_m=FIELD_M, **rocks)
     with tempfile.TemporaryDirectory(prefix="bench-trajectories-") as folder:

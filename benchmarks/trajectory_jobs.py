@@ -42,6 +42,9 @@ SETTINGS = (
 RECIPES = {"thesis": "rocky-field", "physical": "rocky-field-physical"}
 """Where the sonar of each model is described."""
 
+SPECKLE = "coherent"
+"""Model of runs whose sonar is that of the model ``physical`` with speckle; they are rendered without noise only."""
+
 HEIGHT_M, PITCH_DEG = 2.5, 35.0
 FIELD_M, FIELD_SEED, FRAMES = 50.0, 904, 904
 """The field of the trajectories. The worlds of the recipes have other seeds: hashes of the data set's seed and the scene."""
@@ -94,6 +97,7 @@ def jobs(parts: Iterable[str], frames: int, every: int, table: Table, coarse: bo
     """List all jobs, the most important first."""
     if "trajectories" in parts:
         yield from (trajectory_job(run, model, frames, coarse) for model in RECIPES for run in NOISE_OF)
+        yield from (trajectory_job(run, SPECKLE, frames, coarse) for run, noise in NOISE_OF.items() if noise == "none")
     if "table21" in parts:
         for setting in table.settings:
             own = setting._replace(every=setting.every * every)
