@@ -193,8 +193,8 @@ def test_marginals_of_a_long_path_are_those_of_columns(monkeypatch: pytest.Monke
     assert (np.abs(found - own) <= 1e-5 * scale[:, :, None] * scale[:, None]).all()
     assert (np.abs(onward - following) <= 1e-5 * scale[:-1, :, None] * scale[1:, None]).all()
     assert (np.linalg.eigvalsh(found[1:]) > 0).all()
-    motions_of_both = [short.motion_covariances(own, following), long.motion_covariances(found, onward)]
-    np.testing.assert_allclose(*motions_of_both, rtol=1e-4, atol=1e-10)
+    of_long, of_short = long.motion_covariances(found, onward), short.motion_covariances(own, following)
+    np.testing.assert_allclose(of_long, of_short, rtol=1e-4, atol=1e-10)
 
 
 @pytest.mark.thorough
