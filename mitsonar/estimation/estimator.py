@@ -20,6 +20,7 @@ __all__ = [
     "FEWEST_BLOCKS",
     "INPUTS",
     "LEAST_AT_BEST",
+    "UNMEASURED",
     "AnyEstimator",
     "Estimate",
     "Estimator",
@@ -34,6 +35,7 @@ __all__ = [
     "matching_rejection",
     "rejected",
     "spread_of",
+    "stands_out",
     "two_frames",
     "without_slow",
 ]
@@ -198,6 +200,7 @@ class Excess(NamedTuple):
 
 
 UNMEASURED = Excess()
+"""The excess of frames of which none was measured."""
 
 
 def correlation_rejection(correlation: float, independent: float, excess: Excess = UNMEASURED) -> str:
@@ -208,12 +211,20 @@ def correlation_rejection(correlation: float, independent: float, excess: Excess
         independent: number of cells with independent noise.
         excess: of :func:`correlation_excess`, where it was measured.
     """
-    noise = 1 / np.sqrt(independent)
-    if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION * noise):
-        return ""
-    if excess.mean >= max(LEAST_EXCESS * noise, LEAST_OVER_SCATTER * float(np.hypot(noise, excess.scatter))):
+    if correlation >= max(LEAST_AT_BEST, LEAST_CORRELATION / np.sqrt(independent)) or stands_out(independent, excess):
         return ""
     return f"the frames as matched correlate by {correlation:.2f} only"
+
+
+def stands_out(independent: float, excess: Excess) -> bool:
+    """Return whether registered frames correlate by far more than displaced ones do.
+
+    Args:
+        independent: number of cells with independent noise.
+        excess: of :func:`correlation_excess`.
+    """
+    noise = 1 / np.sqrt(independent)
+    return bool(excess.mean >= max(LEAST_EXCESS * noise, LEAST_OVER_SCATTER * np.hypot(noise, excess.scatter)))
 
 
 def correlation_excess(first: Real, second: Real, inside: NDArray[np.bool_], aside: int) -> Excess:

@@ -21,9 +21,11 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import (
     FEWEST_BLOCKS,
     INPUTS,
+    UNMEASURED,
     Estimate,
     correlation_rejection,
     rejected,
+    stands_out,
     two_frames,
 )
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
@@ -149,7 +151,10 @@ class Direct:
         task = _Task(frames, images, attitude, prior)
         start = Motion(0.0, 0.0, 0.0) if prior is None else prior.motion
         found = self._from(task, start, "zero" if prior is None else "prior")
-        if found.valid or (prior is not None and (3 * prior.std <= FARTHEST).all()):
+        # light over even ground correlates at any motion: a match that hardly stands out may be far from the true one
+        if (found.valid and found.about.get("stands_out", True)) or (
+            prior is not None and (3 * prior.std <= FARTHEST).all()
+        ):
             return found
         elsewhere = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
         if not elsewhere.valid or not is_far(elsewhere.motion, attitude.height_m):
@@ -226,6 +231,8 @@ class Direct:
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start)) or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
+        if fit.excess != UNMEASURED:
+            about["stands_out"] = stands_out(fit.independent, fit.excess)
         if task.attitude.by_echoes and self.relief_m is None:
             about["height_std_m"] = task.attitude.height_std_m
         return Estimate(motion, covariance, not reason, reason, about)

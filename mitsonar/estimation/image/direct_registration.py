@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.estimation.estimator import Excess, ambiguity, correlation_excess, correlation_of, spread_of
+from mitsonar.estimation.estimator import UNMEASURED, Excess, ambiguity, correlation_excess, correlation_of, spread_of
 from mitsonar.estimation.image.direct_blocks import by_block, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
@@ -72,7 +72,7 @@ class Fit(NamedTuple):
     correlation: float
     independent: float
     blocks: float
-    excess: Excess = Excess()
+    excess: Excess = UNMEASURED
 
 
 class Held(NamedTuple):
