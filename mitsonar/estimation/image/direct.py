@@ -6,8 +6,8 @@ than a beam biases the estimate towards whole and half beams. The slopes of the 
 differences into motion. Single differences, and whole blocks that move on their own, have Cauchy weights: shadow edges and
 relief are outliers.
 
-It starts from no motion, or from a prior. Where that fails, ``phase`` finds a start. Over far motions relief decides: there
-the heights of blocks are estimated, too (:mod:`mitsonar.estimation.image.direct_relief`).
+It starts from no motion, or from a prior. Where that fails or hardly stands out, ``phase`` finds a start. Over far motions
+relief decides: there the heights of blocks are estimated, too (:mod:`mitsonar.estimation.image.direct_relief`).
 """
 
 from __future__ import annotations
@@ -136,7 +136,8 @@ class Direct:
         Args:
             frames: two.
             prior: where to start and how far to search; a motion that contradicts it is rejected. Default: it starts from no
-                motion. Where that finds none, and nothing tells that the motion is near, :class:`Phase` finds the start.
+                motion. Where that finds none, or none that stands out, and nothing tells that the motion is near,
+                :class:`Phase` finds the start.
 
         Returns:
             The estimate; ``start`` of ``about`` is ``zero``, ``prior`` or ``phase``.
