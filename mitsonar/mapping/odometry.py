@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Literal, get_args
 
@@ -203,7 +203,7 @@ def odometry(
     estimates = continued(estimates)
     closing = closure_of(source, estimator, numbers, estimates, closure, progress) if closure else None
     estimates = estimates if closing is None else closing.honest(estimates)
-    heights = partial(height_profile, source, numbers, estimates, sensors)
+    pairs = estimates  # their first echoes tell the heights
     estimates = mapped(shown, numbers, estimates, progress) if local_map and shown is not None else estimates
     measured = series_of(estimates, time_s)
     factors = _scale_factors(measured, source.true, numbers, scale)
@@ -211,16 +211,17 @@ def odometry(
     series = _SMOOTHED[smooth](measured)
     path = path_of(series.motions, first, series.time_s)
     fitted = isinstance(scale, str)
-    plain = Odometry(numbers, estimates, series, path, source.true, smooth, factors, fitted, heights(path), closing)
-    if sensors is None and not loops:
-        return plain
-    task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
-    known_start = start is not None or source.poses is not None
-    by_map = np.array([one.about.get("map") == USED for one in estimates], dtype=bool)
-    graph = graph_path(
-        measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown, by_map=by_map
-    )
-    return replace(plain, series=graph.series, path=graph.path, heights=heights(graph.path), graph=graph)
+    graph = None
+    if sensors is not None or loops:
+        task = LoopTask(estimator, numbers, known_loops, keep_loop) if loops else None
+        known_start = start is not None or source.poses is not None
+        by_map = np.array([one.about.get("map") == USED for one in estimates], dtype=bool)
+        graph = graph_path(
+            measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown, by_map=by_map
+        )
+        series, path = graph.series, graph.path
+    heights = height_profile(source, numbers, pairs, sensors, path)
+    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, fitted, heights, closing, graph)
 
 
 def _ground_shown(
