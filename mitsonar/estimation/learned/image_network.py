@@ -31,7 +31,7 @@ from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import Attitude, attitude_of
-from mitsonar.motion.composition import Motion
+from mitsonar.motion.composition import Motion, inverse
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.gaussian_head import GaussianHead
@@ -198,17 +198,35 @@ class ImageNetwork(Trained):
         return Estimate(motion, covariance, not reason, reason)
 
     def _again(self, frames: SonarFrames, images: Pair, ground: Ground, first: Estimate) -> Estimate:
-        """Estimate once more, from an answer that noise may have held back; how far it goes is not known better."""
+        """Estimate once more, from an answer that noise may have held back, and back from the second frame.
+
+        The mean of both ways counts. How far the answers go and how far they lie apart is not known better.
+        """
         found = self._from(frames, images, ground, first.motion)
         if found.covariance is None:
             return found
+        motion, apart = self._both_ways(frames, images, found.motion)
         went = np.array(found.motion) - np.array(first.motion)
         fine = COMPARISONS[-1]
-        one, other, inside = _brought_together(images, ground, found.motion, fine)
+        one, other, inside = _brought_together(images, ground, motion, fine)
         excess = correlation_excess(one, other, inside, BLOCK // 2).mean
         unsure = ambiguity(excess, inside.sum() / fine.alike)
-        reason = found.reason or self._rejection_of_size(found.motion)
-        return replace(found, covariance=unsure * found.covariance + np.outer(went, went), valid=not reason, reason=reason)
+        reason = found.reason or self._rejection_of_size(motion)
+        covariance = unsure * found.covariance + np.outer(went, went) + np.outer(apart, apart) / 2
+        return Estimate(motion, covariance, not reason, reason, found.about)
+
+    def _both_ways(self, frames: SonarFrames, images: Pair, there: Motion) -> tuple[Motion, NDArray[np.float64]]:
+        """Return the mean of a motion and of that from the second frame to the first, and how far they lie apart."""
+        swapped = frames.select(np.array([1, 0]))
+        attitude = self._attitude_of(swapped)
+        if attitude is None or attitude.reason:
+            return there, np.zeros(3)
+        ground = _batch({**ground_of(swapped, attitude), **light_of(swapped, attitude)})
+        back = self._from(swapped, images[::-1], ground, Motion(*inverse(np.array(there)).tolist()))
+        if back.covariance is None:
+            return there, np.zeros(3)
+        apart = inverse(np.array(back.motion)) - np.array(there)
+        return Motion(*(np.array(there) + apart / 2).tolist()), apart
 
     def _attitude_of(self, frames: SonarFrames) -> Attitude | None:
         """Height and pitch, for a network that is given them."""
