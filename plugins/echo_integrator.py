@@ -186,7 +186,7 @@ def _meets(scene: mi.Scene, ray: mi.Ray3f, fan: Fan, hit: Hit, angle: DeviceArra
     way = edge_direction(fan, angle)
     asked = hit.valid & flatter(hit.n, ray.d, way)
     coherent: DeviceArray = True
-    found = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, way), coherent=coherent, active=asked)
+    found = scene.ray_intersect_preliminary(mi.Ray3f(ray.o, way, ray.time), coherent=coherent, active=asked)
     along: DeviceArray = way * found.t - ray.d * hit.t
     level = dr.abs(dr.dot(hit.n, along)) <= LEVEL * dr.norm(along)
     return dr.select(asked & found.is_valid() & level, found.t, otherwise)

@@ -168,7 +168,10 @@ class Surfaces:
     def hit(self, scene: mi.Scene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
         """Trace rays to the nearest surface. The arrays are not evaluated: later operations join the same kernel."""
         coherent: DeviceArray = True
-        found = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+        return self.read(scene.ray_intersect_preliminary(ray, coherent=coherent, active=active), ray, active)
+
+    def read(self, found: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
+        """Return the surface at points that rays were found to meet; both in the axes of the shape's scene."""
         valid = found.is_valid() & active
         index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
         known = valid & (index * 4 < dr.width(self.shapes))

@@ -12,6 +12,7 @@ from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.motion.moving_bodies import MovingBodies
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
 
@@ -58,6 +59,10 @@ def render(
     mirrors: Annotated[
         bool, typer.Option("--mirrors", help="Glints of smooth materials (model coherent); see docs/guides/coherent.md.")
     ] = False,
+    moving: Annotated[
+        list[str] | None,
+        typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; see docs/guides/moving.md."),
+    ] = None,
     rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
@@ -88,9 +93,13 @@ def render(
         raise MitsonarError(
             f"--mirrors needs the model coherent: got {instrument.model}; leave it out, or give --model coherent"
         )
-    simulator = Simulator(loaded, instrument, mirrors="materials" if mirrors else None, rays_per_launch=rays_per_launch)
+    bodies = moving_bodies(moving or [], named)
+    simulator = Simulator(
+        loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
+    )
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     origin |= {"mirrors": True} if mirrors else {}
+    origin |= {"moving": {pair: file_digest(Path(pair.partition("=")[2])) for pair in moving}} if moving else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
@@ -101,6 +110,20 @@ def render(
         say(line)
     if report.pictures:
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
+
+
+def moving_bodies(pairs: list[str], frame: str) -> MovingBodies | None:
+    """Return what --moving says."""
+    from mitsonar.motion.moving_bodies import MovingBodies
+    from mitsonar.motion.trajectory import Trajectory
+
+    found: dict[str, list[Trajectory]] = {}
+    for pair in pairs:
+        name, _, file = pair.partition("=")
+        if not name or not file:
+            raise MitsonarError(f"--moving takes ID=FILE.tum: got {pair!r}")
+        found.setdefault(name, []).append(Trajectory.load(file, frame, looks_ahead=False))
+    return MovingBodies.of(found) if found else None
 
 
 def scene_parameters(pairs: list[str]) -> dict[str, str]:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.aperture import Aperture, Pattern, Shading
+from mitsonar.instruments.ping_groups import GroupOrder, check_groups, scans
 from mitsonar.instruments.pulse import Pulse
 from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
 
@@ -132,6 +133,13 @@ class Sonar(Instrument):
         description="time-varying gain (R / 1 m)^gain_exponent of `physical`; 2 undoes the spreading of one way, 4 of both",
     )
     frame_rate_hz: float = Field(10.0, gt=0, le=1e6, description="pings a second [Hz]")
+    ping_groups: int = Field(1, ge=1, le=65_536, description="groups of beams that ping one after another in a frame")
+    group_order: GroupOrder = Field(
+        "interleaved", description="beam k in group k mod ping_groups, or sequential: neighbours in one group"
+    )
+    group_interval_s: float | None = Field(
+        None, ge=0, le=1e3, description="from the ping of a group to the next [s]; default: 2 range_max / sound_speed"
+    )
     quality: Quality = Field(
         "standard", description="rays of `physical`: draft, standard or fine; `mitsonar presets` prints what each errs by"
     )
@@ -239,6 +247,7 @@ class Sonar(Instrument):
             )
         if self.pulse_m is not None and self.bandwidth_hz is not None:
             raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
+        check_groups(self)
         if self.model == "coherent":
             self._check_coherent()
         if self.beam_pattern != "box":
@@ -253,7 +262,8 @@ class Sonar(Instrument):
             raise ValueError("near_glow_db stands above the noise: give noise_level_db too")
         if self.frequency_hz is None:
             raise ValueError("the model coherent needs the carrier: give frequency_hz, 1.8e6 for example")
-        if self.azimuth_fov_deg > MOST_COHERENT_DEG or self.elevation_fov_deg > MOST_COHERENT_DEG:
+        across = math.degrees(self.beam_width_rad) if scans(self) else self.azimuth_fov_deg
+        if across > MOST_COHERENT_DEG or self.elevation_fov_deg > MOST_COHERENT_DEG:
             raise ValueError(
                 f"the model coherent covers at most {MOST_COHERENT_DEG} x {MOST_COHERENT_DEG} deg: got "
                 f"{self.azimuth_fov_deg:g} x {self.elevation_fov_deg:g}; use the model physical"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
@@ -82,8 +82,41 @@ class Trajectory:
         if len(self) == 1:
             return Trajectory(np.repeat(self.poses, frames, axis=0), np.arange(frames) + self.time_s[0])
         time = np.linspace(self.time_s[0], self.time_s[-1], frames)
+        return Trajectory(self.at(time), time)
+
+    def at(self, time_s: ArrayLike) -> NDArray[np.float64]:
+        """Interpolate the poses ``(n, 6)`` at times ``(n,)`` [s], along straight lines and shortest turns.
+
+        Before the first time and after the last one the first and the last pose hold.
+
+        Raises:
+            MitsonarError: times of the trajectory that do not grow.
+        """
+        time = np.clip(np.atleast_1d(np.asarray(time_s, dtype=float)), self.time_s[0], self.time_s[-1])
+        if len(self) == 1:
+            return np.repeat(self.poses, len(time), axis=0)
+        if not (np.diff(self.time_s) > 0).all():
+            raise MitsonarError("poses between those of a trajectory need times that grow: got one that does not")
         position = np.column_stack([np.interp(time, self.time_s, axis) for axis in self.poses[:, :3].T])
-        return Trajectory(poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time)), time)
+        return poses_from(position, Slerp(self.time_s, vehicle_rotation(self.poses))(time))
+
+    def lengthened(self, seconds: float) -> Trajectory:
+        """Return the trajectory with a pose this long before its first and one after its last, at the speed beside each.
+
+        Turns go on about the axis of the step beside them. A single pose stands still.
+        """
+        if len(self) == 1 or seconds <= 0:
+            return self
+        ends, times = [], []
+        for at, inner, way in ((0, 1, -1.0), (-1, -2, 1.0)):
+            part = seconds / abs(self.time_s[at] - self.time_s[inner])
+            last, before = vehicle_rotation(self.poses[at]), vehicle_rotation(self.poses[inner])
+            onward = Rotation.from_rotvec((last * before.inv()).as_rotvec() * part)
+            place = self.poses[at, :3] + (self.poses[at, :3] - self.poses[inner, :3]) * part
+            ends.append(poses_from(place, onward * last))
+            times.append(self.time_s[at] + way * seconds)
+        poses = np.concatenate([ends[0], self.poses, ends[1]])
+        return Trajectory(poses, np.concatenate([times[:1], self.time_s, times[1:]]))
 
     @classmethod
     def load(cls, path: str | Path, frame: str = "mitsonar", *, looks_ahead: bool = True) -> Self:

@@ -28,7 +28,7 @@ FLOOR_DB = -100.0
 LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
 """Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
 
-PER_FRAME = ("image", "time_s", "poses", "attitude_rad", "height_m", *LABELS)
+PER_FRAME = ("image", "time_s", "poses", "beam_poses", "body_poses", "attitude_rad", "height_m", *LABELS)
 
 IMAGE = ("frames", "bins", "beams")
 
@@ -38,6 +38,8 @@ COLUMNS = {
     "bearing_rad": Column(("beams",), low=-math.pi, high=math.pi, order="strict"),
     "time_s": Column(("frames",), order="same"),
     "poses": Column(("frames", "six"), low=-1e9, high=1e9),
+    "beam_poses": Column(("frames", "beams", "six"), low=-1e9, high=1e9),
+    "body_poses": Column(("frames", "bodies", "six"), low=-1e9, high=1e9),
     "attitude_rad": Column(("frames", "three"), low=-7, high=7, nan=True),
     "height_m": Column(("frames",), low=0, nan=True),
     "elevation_rad": Column(IMAGE, low=-math.pi, high=math.pi, nan=True),
@@ -59,6 +61,8 @@ class SonarFrames:
         bearing_rad: axes of the beams ``(beams,)`` [rad], starboard positive, not necessarily even.
         time_s: time of each frame ``(frames,)``, or of each beam ``(frames, beams)`` [s].
         poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
+        beam_poses: poses of the sonar at the time of each beam ``(frames, beams, 6)``, where beams ping one after another.
+        body_poses: poses of the scene's bodies that move ``(frames, bodies, 6)`` [m, rad], by ``body_names``.
         height_m: height over the ground below, measured straight down ``(frames,)``; nan where nothing is below.
         level: how image values stand for level: ``linear`` (level = value * level_scale), ``dB``, ``gamma`` or ``contrast``.
         level_scale: what undoes the constant gain.
@@ -90,6 +94,9 @@ class SonarFrames:
     shape_names: tuple[str, ...] = ()
     object_names: tuple[str, ...] = ()
     attitude_rad: NDArray[np.float64] | None = None
+    beam_poses: NDArray[np.float64] | None = None
+    body_poses: NDArray[np.float64] | None = None
+    body_names: tuple[str, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -185,10 +192,12 @@ class SonarFrames:
             "sonar": np.array(self.sonar.model_dump_json()),
             "about": np.array(json.dumps(self.about)),
         }
-        optional = ("poses", "attitude_rad", "height_m", *LABELS)
+        optional = ("poses", "beam_poses", "body_poses", "attitude_rad", "height_m", *LABELS)
         table |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
-        if self.shape_names or self.object_names:
-            table["names"] = np.array(json.dumps({"shapes": self.shape_names, "objects": self.object_names}))
+        names = {"shapes": self.shape_names, "objects": self.object_names}
+        names |= {"bodies": self.body_names} if self.body_names else {}
+        if any(names.values()):
+            table["names"] = np.array(json.dumps(names))
         return table | ({} if self.poses is None else {"pitch_rad": self.poses[:, 3]})
 
     @classmethod
@@ -207,7 +216,7 @@ class SonarFrames:
             raise MitsonarError(f"{source}: {error}") from None
         values = {name: table[name] for name in COLUMNS if name in table}
         _check_values(values, source)
-        shapes, objects = (_texts(names, key, source) for key in ("shapes", "objects"))
+        shapes, objects, bodies = (_texts(names, key, source) for key in ("shapes", "objects", "bodies"))
         return cls(
             **values,
             sonar=sonar,
@@ -216,6 +225,7 @@ class SonarFrames:
             about=about,
             shape_names=shapes,
             object_names=objects,
+            body_names=bodies,
         )
 
     def save(self, path: str | Path) -> None:

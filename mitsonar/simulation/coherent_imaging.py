@@ -25,6 +25,7 @@ from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, po
 from mitsonar.simulation.hashed_points import MOST_CANDIDATES
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
 from mitsonar.simulation.mirror_tracing import MirrorTracer
+from mitsonar.simulation.moving_scene import SceneMotion
 from mitsonar.simulation.rendered_pings import CutRays, RenderedPings
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ class CoherentImager:
         sonar: of the model ``coherent``.
         mirrors: parts of shapes that reflect as mirrors, by the shapes' ids; default: none.
         views: the whole, or portions of the field of view.
+        motion: of bodies of the scene; default: all stands still.
 
     Attributes:
         sides: of the elevation, each rendered by itself: of the whole view 0, of portions +1 and -1.
@@ -66,32 +68,40 @@ class CoherentImager:
     """
 
     def __init__(
-        self, scene: mi.Scene, sonar: Sonar, mirrors: Mirroring = None, views: Sequence[View] | None = None
+        self,
+        scene: mi.Scene,
+        sonar: Sonar,
+        mirrors: Mirroring = None,
+        views: Sequence[View] | None = None,
+        motion: SceneMotion | None = None,
     ) -> None:
         self.views = check_views(views or [Whole(sonar)], mirrors)
         self.sides = tuple(dict.fromkeys(side_of(view) for view in self.views))
         self.sonar, self.former = sonar, BeamFormer(sonar)
-        self._given = scene, mirrors
+        self._given = scene, mirrors, motion
         self._kept_waves: dict[int, NDArray[np.float32]] = {}
         parts = mirror_of(scene, mirrors)
-        self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side) for side in self.sides}
+        self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side, motion) for side in self.sides}
         self.tracer = self.tracers[self.sides[0]]
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
-    def image(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.complex64], FieldCounts]:
+    def image(self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the complex image of one ping ``(bins, sides * beams)`` with its noise, and the counts of its rays.
 
         Args:
             pose: of the sonar ``(6,)`` [m, rad].
             ping: its number, of which the noise is a function.
+            time_s: when bodies that move are where they are [s].
         """
-        images, counts = zip(*(self._of_side(pose, ping, side) for side in self.sides), strict=True)
+        images, counts = zip(*(self._of_side(pose, ping, side, time_s) for side in self.sides), strict=True)
         return np.concatenate(images, axis=1) if len(images) > 1 else images[0], FieldCounts.joined(counts)
 
-    def _of_side(self, pose: NDArray[np.float64], ping: int, side: int) -> tuple[NDArray[np.complex64], FieldCounts]:
+    def _of_side(
+        self, pose: NDArray[np.float64], ping: int, side: int, time_s: float
+    ) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return what one side of the elevation, or both, give ``(bins, beams)``, and the counts of its rays."""
-        image, counts = self.echoes(pose, side)
+        image, counts = self.echoes(pose, side, time_s)
         if self.sonar.volume_db is not None:
             image = image + self.volume(ping, side)
         if self.sonar.noise_level_db is not None:
@@ -100,14 +110,17 @@ class CoherentImager:
             image = image * self._stripes
         return np.asarray(image, dtype=np.complex64), counts
 
-    def echoes(self, pose: NDArray[np.float64], side: int | None = None) -> tuple[NDArray[np.complex64], FieldCounts]:
+    def echoes(
+        self, pose: NDArray[np.float64], side: int | None = None, time_s: float = 0.0
+    ) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the complex image of the scene alone ``(bins, beams)``, without noise, volume and stripes, and the counts.
 
         Args:
             pose: of the sonar ``(6,)`` [m, rad].
             side: of the elevation, one of :attr:`sides`; default: the first.
+            time_s: when bodies that move are where they are [s].
         """
-        field, counts = (self.tracer if side is None else self.tracers[side]).field(pose)
+        field, counts = (self.tracer if side is None else self.tracers[side]).field(pose, time_s)
         if self.glints is not None:
             self.glints.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
@@ -117,7 +130,8 @@ class CoherentImager:
 
     def of_quality(self, quality: Quality) -> CoherentImager:
         """Return what renders the same scatterers with more or fewer rays."""
-        return CoherentImager(self._given[0], self.sonar.replace(quality=quality), self._given[1])
+        scene, mirrors, motion = self._given
+        return CoherentImager(scene, self.sonar.replace(quality=quality), mirrors, motion=motion)
 
     def in_views(self, pings: RenderedPings) -> list[RenderedPings]:
         """Return pings of :attr:`sides` ``(pings, bins, sides * beams)`` as one part for each view."""
@@ -128,9 +142,11 @@ class CoherentImager:
             found.append(replace(pings, levels=pings.levels[:, :, first + own.start : first + own.stop]))
         return found
 
-    def levels(self, pose: NDArray[np.float64], ping: int) -> tuple[NDArray[np.float32], Counts, CutRays]:
+    def levels(
+        self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0
+    ) -> tuple[NDArray[np.float32], Counts, CutRays]:
         """Return the levels of one ping after the gain ``(bins, sides * beams)`` float32, counts of rays, and cut ones."""
-        image, found = self.image(pose, ping)
+        image, found = self.image(pose, ping, time_s)
         power = image.real * image.real + image.imag * image.imag
         rays = (np.array([[number]]) for number in (found.inside, found.nearer, found.farther, found.missed))
         return np.asarray(power * self.gain[:, None], dtype=np.float32), Counts(*rays), self._cut_rays(found)
@@ -290,7 +306,11 @@ def point_notes(sonar: Sonar) -> list[str]:
 
 
 def coherent_imager(
-    scene: mi.Scene, sonar: Sonar, views: Sequence[View] | None, mirrors: Mirroring = None
+    scene: mi.Scene,
+    sonar: Sonar,
+    views: Sequence[View] | None,
+    mirrors: Mirroring = None,
+    motion: SceneMotion | None = None,
 ) -> CoherentImager | None:
     """Return what renders pings of the model ``coherent``; None for other models.
 
@@ -301,7 +321,7 @@ def coherent_imager(
         if mirrors:
             raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
         return None
-    return CoherentImager(scene, sonar, mirrors, views)
+    return CoherentImager(scene, sonar, mirrors, views, motion)
 
 
 def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:

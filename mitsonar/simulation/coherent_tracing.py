@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
-from mitsonar.plugins.surfaces import Hit, Surfaces
+from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.beam_former import BeamFormer, CommonFan
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain
 from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point, pick
 from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
+from mitsonar.simulation.moving_scene import MovingScene, SceneMotion
+from mitsonar.simulation.moving_tracing import MovingSurfaces, surfaces_of
 from mitsonar.simulation.variant import garbage_stays
 
 __all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
@@ -82,18 +84,25 @@ class CoherentTracer:
         former: gives the grid.
         mirrors: what shapes reflect as mirrors, and do not scatter; default: nothing.
         side: of the elevation whose points are summed: +1 up, -1 down, 0 both.
+        motion: of bodies of the scene, which take their points with them; default: all stands still.
 
     Attributes:
         pitch: of the lattice [m].
     """
 
     def __init__(
-        self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors | None = None, side: int = 0
+        self,
+        scene: mi.Scene,
+        sonar: Sonar,
+        former: BeamFormer,
+        mirrors: Mirrors | None = None,
+        side: int = 0,
+        motion: SceneMotion | None = None,
     ) -> None:
         assert sonar.frequency_hz is not None
-        self.side = side
+        self.side, self.motion = side, motion
         self.scene, self.sonar, self.former, self.fan = scene, sonar, former, CommonFan.of(sonar)
-        self.surfaces = Surfaces.of(scene).heard_by(sonar)
+        self.surfaces = surfaces_of(scene, sonar, motion)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.pitch = point_pitch(sonar)
         table = patch_amplitudes(None if sonar.speckle_nu is None else BLENDED * sonar.speckle_nu)
@@ -107,13 +116,15 @@ class CoherentTracer:
         self.mirrors = None if mirrors is None else mirrors.table()
         self.launch = self._compile()
 
-    def field(self, pose: NDArray[np.float64]) -> tuple[NDArray[np.complex64], FieldCounts]:
-        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad], and its counts."""
-        rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
+    def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
+        """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
+        scene: mi.Scene | MovingScene = self.scene
+        lines = to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64)
+        if self.motion is not None:
+            scene, lines = self.motion.at(time_s), self.motion.sonar_lines(pose, time_s)
+        rows = mi.Float64(lines.ravel().tolist())
         with garbage_stays():
-            real, imag, counts = self.launch(
-                self.index, self.scene, rows, self.surfaces.arrays(), self.patches, self.mirrors
-            )
+            real, imag, counts = self.launch(self.index, scene, rows, self.surfaces.arrays(), self.patches, self.mirrors)
         shape = self.former.sines, self.former.ranges
         field = np.empty(shape, np.complex64)
         field.real, field.imag = (np.array(part, copy=False).reshape(shape) for part in (real, imag))
@@ -124,7 +135,14 @@ class CoherentTracer:
         def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.fan, self.sonar, index, lines, self.side)
-            hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+            ray, surfaces = mi.Ray3f(rays.origin, rays.d), replace(self.surfaces, **tables)
+            if isinstance(surfaces, MovingSurfaces):  # all that follows is in the axes of the body that is hit
+                hit, body = surfaces.hit_in_body(scene, ray)
+                hit = replace(hit, shape_id=surfaces.own_lattice(scene, hit, body))
+                lines = [[dr.gather(mi.Float64, rows, body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
+                rays = FanRays(self.fan, self.sonar, index, lines, self.side)
+            else:
+                hit = surfaces.hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
             return self._sums(rays, hit, patches)

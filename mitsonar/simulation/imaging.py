@@ -15,6 +15,7 @@ from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.ping_groups import TimedPath, timed_path
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
+    from mitsonar.motion.moving_bodies import Moving, MovingBodies
     from mitsonar.simulation.expected_former import ExpectedFormer
     from mitsonar.simulation.mirror_parts import Mirroring
     from mitsonar.simulation.tracing import Tracer
 from mitsonar.simulation.labels import labels_above, labels_of
+from mitsonar.simulation.ping_moments import GroupedPings, check_timed, moments_of, sonar_of_one_ping
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
 
@@ -43,6 +46,7 @@ class Simulator:
         views: makes the images of a ping from its echoes; default: one, of all of them.
         mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
             materials (model ``coherent``); default: none.
+        moving: trajectories, or their files, by the ids of the shapes that follow them (docs/guides/moving.md).
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -59,14 +63,16 @@ class Simulator:
         *,
         views: Sequence[View] | None = None,
         mirrors: Mirroring = None,
+        moving: Moving | MovingBodies | None = None,
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
         from mitsonar.instruments.views import Whole
         from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.expected_former import expected_former
+        from mitsonar.simulation.moving_scene import motion_in
+        from mitsonar.simulation.moving_tracing import tracer_of
         from mitsonar.simulation.scene import sonar_in
-        from mitsonar.simulation.tracing import Tracer
         from mitsonar.simulation.view_tracers import view_tracers
 
         if sonar is None:
@@ -77,10 +83,15 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar = sonar
-        self.coherent = coherent_imager(scene, sonar, views, mirrors)
-        self.former = expected_former(sonar, views)
-        traced = sonar if self.former is None else self.former.traced
-        self.tracer = Tracer(scene, traced)
+        check_timed(sonar, moving, views, mirrors)
+        self.motion = motion_in(scene, moving)
+        one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
+        if one is not sonar:
+            self.grouped = GroupedPings(Simulator(scene, one, moving=moving, rays_per_launch=rays_per_launch), sonar)
+        self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
+        self.former = expected_former(one, views)
+        traced = one if self.former is None else self.former.traced
+        self.tracer = tracer_of(scene, traced, self.motion)
         self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
@@ -90,45 +101,56 @@ class Simulator:
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
 
-    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[RenderedPings]:
-        """Levels of consecutive pings in the first view; see :meth:`looks`."""
-        for looks in self.render_views(poses, first=first, labels=labels):
+    def pings(
+        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+    ) -> Iterator[RenderedPings]:
+        """Levels of consecutive pings in the first view; see :meth:`render_views`."""
+        for looks in self.render_views(poses, first=first, labels=labels, time_s=time_s):
             yield looks[0]
 
-    def render_views(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[list[RenderedPings]]:
+    def render_views(
+        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+    ) -> Iterator[list[RenderedPings]]:
         """Levels of consecutive pings, in batches, one of each view.
 
         Ping ``first + k`` draws its own jitter whatever the batches are.
 
         Args:
-            poses: of the sonar ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad].
+            poses: of the sonar ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad]; of each group of beams that pings by
+                itself ``(frames, groups, 6)``.
             first: number of the first ping.
             labels: per-pixel truth as well.
+            time_s: of the poses [s]; default: their number / ``frame_rate_hz``. Bodies that move are where they are then.
         """
-        table = np.atleast_2d(np.asarray(poses, dtype=float))
-        if table.ndim != 2 or table.shape[1] != 6 or not len(table) or not np.isfinite(table).all():
-            raise MitsonarError(f"poses must be finite numbers (frames, 6): got {table.shape}; give m and rad")
+        table, time = moments_of(self.sonar, poses, time_s, first)
+        if self.grouped is not None:
+            for pings in self.grouped.pings(table, time, first, labels):
+                yield [pings]
+            return
         if self.coherent is not None:
             if labels and self.coherent.sides != (0,):
                 raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
-            for place, pose in enumerate(table):
-                yield self.coherent.in_views(self._coherent_ping(pose, first + place, labels))
+            for place, (pose, own) in enumerate(zip(table, time, strict=True)):
+                yield self.coherent.in_views(self._coherent_ping(pose, own, first + place, labels))
             return
         for start in range(0, len(table), self.pings_per_launch):
-            yield self._launch(table[start : start + self.pings_per_launch], first + start, labels)
+            part = slice(start, start + self.pings_per_launch)
+            yield self._launch(table[part], time[part], first + start, labels)
 
-    def _coherent_ping(self, pose: NDArray[np.float64], number: int, labels: bool) -> RenderedPings:
+    def _coherent_ping(self, pose: NDArray[np.float64], time_s: float, number: int, labels: bool) -> RenderedPings:
         """Render one coherent ping. Labels are those of the expected levels, from the same surfaces."""
         assert self.coherent is not None
-        levels, counts, cut = self.coherent.levels(pose, number)
+        levels, counts, cut = self.coherent.levels(pose, number, time_s)
         if labels:
-            pings = self._launch(pose[None], number, True)[0]
+            pings = self._launch(pose[None], np.array([time_s]), number, True)[0]
             pings.levels, pings.expected, pings.cut = levels[None], pings.levels, cut
             return pings
-        height_m = self.tracer.height_m(self.tracer.scene, self.tracer.inputs(pose[None], number)[0])
+        height_m = self.tracer.height_m(self.tracer.scene_at(time_s), self.tracer.inputs(pose[None], number)[0])
         return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
 
-    def _launch(self, poses: NDArray[np.float64], first: int, labels: bool) -> list[RenderedPings]:
+    def _launch(
+        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], first: int, labels: bool
+    ) -> list[RenderedPings]:
         from mitsonar.simulation import binning
 
         key = (len(poses), labels)
@@ -137,8 +159,8 @@ class Simulator:
         inputs = self.tracer.inputs(poses, first)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
         with garbage_stays():
-            height, made = self._launches[key](self.tracer.scene, *inputs, tables)
-        height_m = np.array(height, dtype=float)
+            height, made = self._launches[key](self.tracer.scene_at(time_s), *inputs, tables)
+        height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
         for view, (image, counters, truth) in zip(self.views, made, strict=True):
             pings = RenderedPings(first, *binning.fetch(image, counters, len(poses), view), height_m)
@@ -202,16 +224,18 @@ class Simulator:
 
         return partial(launch, Rays.numbered(sonar, pings))
 
-    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
-        """One ping's echoes as NumPy arrays, in the order of the film."""
-        return self._own_tracer.film_echoes(pose, ping)
+    def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
+        """One ping's echoes as NumPy arrays, in the order of the film; all beams ping at ``time_s`` [s]."""
+        time_s = ping / self.sonar.frame_rate_hz if time_s is None else time_s
+        return self._own_tracer.film_echoes(pose, ping, time_s)
 
     @cached_property
     def _own_tracer(self) -> Tracer:
         """Return the tracer of the sonar's own rays: those of the launch may reach beyond the field of view."""
-        from mitsonar.simulation.tracing import Tracer
+        from mitsonar.simulation.moving_tracing import tracer_of
 
-        return self.tracer if self.former is None else Tracer(self.tracer.scene, self.sonar)
+        known = self.former is None and self.grouped is None
+        return self.tracer if known else tracer_of(self.tracer.scene, self.sonar, self.motion)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
@@ -245,7 +269,8 @@ class Simulator:
         if not isinstance(trajectory, Trajectory):
             poses = np.atleast_2d(np.asarray(trajectory, dtype=float))
             trajectory = Trajectory(poses, np.arange(len(poses)) / self.sonar.frame_rate_hz)
-        batches = self.pings(trajectory.poses, labels=labels)
+        timed = timed_path(self.sonar, trajectory)
+        batches = self.pings(timed.poses, labels=labels, time_s=timed.time_s)
         calibrated = gain is None
         if gain is None:
             gain, batches = constant_gain(batches)
@@ -259,27 +284,32 @@ class Simulator:
             heights.append(pings.height_m)
             truth.append(labels_above(pings, gain, label_floor))
         labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
-        for sentence in [*self.notes, *tally.warnings(self, trajectory.poses)]:
+        for sentence in [*self.notes, *tally.warnings(self, timed.frames.poses)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
-        return self._frames(np.concatenate(images), trajectory, np.concatenate(heights), gain, labelled)
+        return self._frames(np.concatenate(images), timed, np.concatenate(heights), gain, labelled)
 
     def _frames(
         self,
         image: NDArray[np.float32],
-        trajectory: Trajectory,
+        timed: TimedPath,
         height_m: NDArray[np.float64],
         gain: float,
         labelled: dict[str, Any],
     ) -> SonarFrames:
         """Return images and labels as frames of the sonar; with labels go the names that these refer to."""
         shapes, objects = self.label_names(bool(labelled))
+        time_s, beam_poses = timed.of_beams(self.sonar)
+        body_names, body_poses = self.bodies(timed.frames.time_s)
         return SonarFrames(
             image=image,
             range_m=self.sonar.range_m,
             bearing_rad=self.sonar.bearing_rad,
-            time_s=trajectory.time_s,
+            time_s=time_s,
             sonar=self.sonar,
-            poses=trajectory.poses,
+            poses=timed.frames.poses,
+            beam_poses=beam_poses,
+            body_poses=body_poses,
+            body_names=body_names,
             height_m=height_m,
             level=self.sonar.value_coding,
             level_scale=1 / gain,
@@ -292,8 +322,14 @@ class Simulator:
         """Return the names that labels refer to, of shapes and of objects; none without labels."""
         from mitsonar.simulation.scene import object_names_in, shape_names_in
 
-        scene = self.tracer.scene
-        return (shape_names_in(scene), object_names_in(scene)) if labels else ((), ())
+        if not labels:
+            return (), ()
+        objects = object_names_in(self.tracer.scene)
+        return shape_names_in(self.tracer.scene), objects if self.motion is None else self.motion.object_names(objects)
+
+    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
+        """Return the names of the bodies that move and their poses at times ``(times, bodies, 6)``; None: all is still."""
+        return ((), None) if self.motion is None else (self.motion.bodies.names, self.motion.bodies.poses(time_s))
 
     def step(
         self,
@@ -333,7 +369,8 @@ class Simulator:
                 f"a loop keeps its gain, {self.gain:g}: got {gain:g}; leave gain out, or call reset() to begin a new loop"
             )
         number = self._stepped
-        (pings,) = self.pings(table, first=number, labels=labels)
+        now = number / self.sonar.frame_rate_hz if time_s is None else time_s
+        (pings,) = self.pings(table, first=number, labels=labels, time_s=[now])
         if self.gain is None and (gain is not None or pings.levels.any()):
             self._gain_from = "set on the first frame with echoes" if gain is None else "as given"
             self.gain = constant_gain([pings])[0] if gain is None else gain
@@ -341,10 +378,10 @@ class Simulator:
         self._stepped = number + 1
         image = to_image(pings.levels, kept, self.sonar)
         self._warn_once(pings, image, table)
-        time = np.array([number / self.sonar.frame_rate_hz if time_s is None else time_s])
         noisy = image if noise is None else noise.apply(image, seed=seed, frames=np.array([number]))
         labelled = labels_above(pings, kept, label_floor)
-        return self._frames(noisy, Trajectory(table, time), pings.height_m, kept, labelled)
+        timed = TimedPath(Trajectory(table, np.array([now])), *moments_of(self.sonar, table, [now], number)[::-1])
+        return self._frames(noisy, timed, pings.height_m, kept, labelled)
 
     def reset(self) -> None:
         """Begin a new loop: the next :meth:`step` is ping 0, sets the gain anew, and may warn again."""

@@ -16,6 +16,7 @@ from PIL import Image
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.ping_groups import TimedPath, timed_path
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
@@ -48,7 +49,7 @@ SIMULATORS = ("mitsonar", "mitsuba", "drjit", "numpy")
 
 RENDERING = RunKind(
     "rendering",
-    outputs=("frames.npz", "frames.zarr", "images", "cartesian", "fan", "echoes", "poses.tum"),
+    outputs=("frames.npz", "frames.zarr", "images", "cartesian", "fan", "echoes", "bodies", "poses.tum"),
     notes={
         **{"frames_done": int, "gain": float, "tally": dict, "warnings": list},
         **{"shape_names": list, "object_names": list},
@@ -65,11 +66,16 @@ class Source(Protocol):
     notes: list[str]
     variant: str
 
-    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[RenderedPings]:
+    def pings(
+        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+    ) -> Iterator[RenderedPings]:
         """Levels of consecutive pings, in batches."""
 
-    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
+    def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """One ping's echoes in the order of the film."""
+
+    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
+        """Return the names of the bodies that move and their poses at times; None: all is still."""
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window [m]."""
@@ -138,16 +144,20 @@ def run(
     Raises:
         MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
     """
-    made = RunDirectory.begin(
-        folder, RENDERING, _asked(source, trajectory, outputs, origin), resume=resume, overwrite=overwrite
-    )
+    timed = timed_path(source.sonar, trajectory)
+    if outputs.exr and timed.time_s.ndim > 1:
+        raise MitsonarError("echoes of each ray are kept of frames that are one ping: leave --exr or ping_groups out")
+    asked = {**_asked(source, trajectory, outputs, origin), "frames": len(timed.frames)}
+    made = RunDirectory.begin(folder, RENDERING, asked, resume=resume, overwrite=overwrite)
     made.start(frames_done=0)
+    trajectory = timed.frames
     trajectory.save(made.path / "poses.tum", outputs.frame)
+    _save_bodies(source, trajectory, made.path / "bodies", outputs.frame)
     if (made.path / "frames.npz").exists():  # finished, or killed while the store was removed
         shutil.rmtree(made.path / "frames.zarr", ignore_errors=True)
     elif not made.finished:
         progress(made.count("frames_done", len(trajectory)))
-        store = _make_frames(source, trajectory, made, outputs, progress)
+        store = _make_frames(source, timed, made, outputs, progress)
         tally = progress_of(made, source.sonar, len(trajectory)).tally
         made.note(warnings=[*source.notes, *tally.warnings(source, trajectory.poses)])
         if len(trajectory) <= LONGEST_NPZ:
@@ -177,10 +187,20 @@ def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dic
     }
 
 
+def _save_bodies(source: Source, trajectory: Trajectory, folder: Path, frame: str) -> None:
+    """Write the path of each body that moves, a file each, at the times of the frames."""
+    names, poses = source.bodies(trajectory.time_s)
+    for number, name in enumerate(names):
+        assert poses is not None
+        folder.mkdir(exist_ok=True)
+        Trajectory(poses[:, number], trajectory.time_s).save(folder / f"{name.replace('/', '_')}.tum", frame)
+
+
 def _make_frames(
-    source: Source, trajectory: Trajectory, made: RunDirectory, outputs: Outputs, progress: Callable[[int], None]
+    source: Source, timed: TimedPath, made: RunDirectory, outputs: Outputs, progress: Callable[[int], None]
 ) -> FrameStore:
     """Write the frames that are missing; the run's notes follow each batch."""
+    trajectory = timed.frames
     folder, earlier, store = made.path, progress_of(made, source.sonar, len(trajectory)), None
     done, tally, gain = earlier.frames, earlier.tally, earlier.gain
     if done > 0:
@@ -188,7 +208,7 @@ def _make_frames(
         store.check(len(trajectory), source.sonar, done)
     if store is not None and done == len(trajectory):
         return store
-    batches = source.pings(trajectory.poses[done:], first=done, labels=outputs.labels)
+    batches = source.pings(timed.poses[done:], first=done, labels=outputs.labels, time_s=timed.time_s[done:])
     names = source.label_names(outputs.labels)
     if outputs.labels:
         made.notes |= {"shape_names": list(names[0]), "object_names": list(names[1])}
@@ -196,7 +216,7 @@ def _make_frames(
         gain, batches = constant_gain(batches)
         made.notes["gain"] = gain
     for pings in batches:
-        frames, image = _frames_of(pings, source.sonar, trajectory, outputs, gain, names)
+        frames, image = _frames_of(pings, source, timed, outputs, gain, names)
         store = store or FrameStore.create(folder / "frames.zarr", len(trajectory), frames)
         _write_pictures(folder, pings.first, frames, outputs)
         if outputs.exr:
@@ -269,7 +289,9 @@ class StoredEchoes:
         self.sonar = frames.sonar.replace(**change)
         self.notes: list[str] = []
 
-    def pings(self, poses: ArrayLike, *, first: int = 0, labels: bool = False) -> Iterator[RenderedPings]:
+    def pings(
+        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+    ) -> Iterator[RenderedPings]:
         """Levels of the stored frames, one at a time; ``poses`` only tells how many."""
         import drjit as dr
         import mitsuba as mi
@@ -290,13 +312,17 @@ class StoredEchoes:
             levels, counts = fetch(*develop(sums, 1, tracer), 1, tracer.view)
             yield RenderedPings(number, levels, counts, self.height_m[number : number + 1])
 
-    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
+    def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """Read the echoes of one frame's EXR."""
         return load_exr(self.folder / "echoes" / f"{ping:06d}.exr", self.traced)
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window [m]."""
         return self.film_echoes(pose, ping).outside(self.sonar)
+
+    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
+        """Return none: where bodies were is in the run that stored the echoes."""
+        return (), None
 
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return none: stored echoes have no labels."""
@@ -305,22 +331,28 @@ class StoredEchoes:
 
 def _frames_of(
     pings: RenderedPings,
-    sonar: Sonar,
-    trajectory: Trajectory,
+    source: Source,
+    timed: TimedPath,
     outputs: Outputs,
     gain: float,
     names: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> tuple[SonarFrames, NDArray[np.float32]]:
     """Return a batch as frames, and its images before noise."""
+    sonar = source.sonar
     image = to_image(pings.levels, gain, sonar)
     numbers = np.arange(pings.first, pings.first + len(pings))
+    time_s, beam_poses = timed.of_beams(sonar)
+    bodies, body_poses = source.bodies(timed.frames.time_s[numbers])
     frames = SonarFrames(
         image=np.ascontiguousarray(outputs.noise.apply(image, seed=sonar.seed, frames=numbers)),
         range_m=sonar.range_m,
         bearing_rad=sonar.bearing_rad,
-        time_s=trajectory.time_s[numbers],
+        time_s=time_s[numbers],
         sonar=sonar,
-        poses=trajectory.poses[numbers],
+        poses=timed.frames.poses[numbers],
+        beam_poses=None if beam_poses is None else beam_poses[numbers],
+        body_poses=body_poses,
+        body_names=bodies,
         height_m=pings.height_m,
         level=sonar.value_coding,
         level_scale=1 / gain,
@@ -355,5 +387,5 @@ def _write_echoes(folder: Path, source: Source, frames: SonarFrames, first: int)
     for index, pose in enumerate(frames.poses):
         path = folder / "echoes" / f"{first + index:06d}.exr"
         part = path.with_name(f".{path.stem}.part.exr")
-        save_exr(part, source.film_echoes(pose, first + index), source.sonar)
+        save_exr(part, source.film_echoes(pose, first + index, float(frames.time_s[index])), source.sonar)
         part.replace(path)

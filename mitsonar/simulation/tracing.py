@@ -29,6 +29,7 @@ class Rays:
 
     Attributes:
         ping: number of the ping in the launch.
+        moment: number of the pose in the launch: that of the ping, or of its group of beams.
         ray: number of the ray in its ping.
         column: ray across, ``beam * across + k``.
         row: ray over elevation, 0 the highest.
@@ -46,6 +47,11 @@ class Rays:
         strip, place = self.ray // (wide * sonar.rays_per_beam), self.ray % (wide * sonar.rays_per_beam)
         self.column, self.row = strip * wide + place % wide, place // wide
         self.beam = self.column // sonar.across
+        self.moment = self.ping
+        if sonar.ping_groups > 1:
+            every = sonar.group_order == "interleaved"
+            group = self.beam % sonar.ping_groups if every else self.beam * sonar.ping_groups // sonar.beams
+            self.moment = self.ping * sonar.ping_groups + group
         self.film = self.row * sonar.columns + self.column
 
     @staticmethod
@@ -84,36 +90,47 @@ class Tracer:
         self.notes = self.surfaces.notes
 
     def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
-        """Return the inputs of a launch: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces."""
-        matrices = to_world_matrices(poses)[:, :3].astype(np.float32)
-        keys = [self.sensor.key(first_ping + k) for k in range(len(matrices))]
+        """Return the inputs of a launch: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces.
+
+        Poses are ``(pings, 6)``, or ``(pings, groups, 6)`` where groups of beams ping one after another.
+        """
+        matrices = to_world_matrices(np.reshape(poses, (-1, 6)))[:, :3].astype(np.float32)
+        keys = [self.sensor.key(first_ping + k) for k in range(len(np.atleast_2d(poses)))]
         # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
         return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
     def rays_of(self, rays: Rays, rows: mi.Float, keys: mi.UInt32) -> tuple[mi.Ray3f, imaging_sonar_sensor.Fan]:
         """Return the rays in the world, and their fan with its directions in world axes."""
         fan = self.sensor.fan(rays.column, rays.row, dr.gather(mi.UInt32, keys, rays.ping))
-        lines = [dr.gather(mi.Vector4f, rows, rays.ping * 3 + axis) for axis in range(3)]
+        lines = [dr.gather(mi.Vector4f, rows, rays.moment * 3 + axis) for axis in range(3)]
         fan = fan.carried(lines)
         return mi.Ray3f(mi.Point3f(*(line.w for line in lines)), fan.d), fan
 
-    def echoes(self, scene: mi.Scene, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: LaunchTables) -> Echoes:
+    def echoes(self, scene: DeviceArray, ray: mi.Ray3f, fan: imaging_sonar_sensor.Fan, tables: LaunchTables) -> Echoes:
         """Trace the rays of :meth:`rays_of`; the echoes are not evaluated yet."""
         edges = self.sonar.model == "physical"
         return echo_integrator.Echo.measure(scene, replace(self.surfaces, **tables), ray, fan, edges=edges)
 
-    def film_echoes(self, pose: ArrayLike, ping: int) -> Echoes:
-        """Trace one ping and return its echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film."""
+    def scene_at(self, time_s: ArrayLike) -> DeviceArray:
+        """Return what is traced at the moments of a launch's pings [s]: the scene, for nothing moves here."""
+        return self.scene
+
+    def film_echoes(self, pose: ArrayLike, ping: int, time_s: float = 0.0) -> Echoes:
+        """Trace one ping and return its echoes as NumPy arrays ``(rays_per_beam * columns,)``, in the order of the film.
+
+        All beams ping at once.
+        """
         rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
-        rows, keys, tables = self.inputs(np.reshape(pose, (1, 6)), ping)
-        traced = self.echoes(self.scene, *self.rays_of(rays, rows, keys), tables)
+        rows, keys, tables = self.inputs(np.tile(np.reshape(pose, (1, 1, 6)), (1, self.sonar.ping_groups, 1)), ping)
+        scene = self.scene_at([time_s] * self.sonar.ping_groups)
+        traced = self.echoes(scene, *self.rays_of(rays, rows, keys), tables)
         values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
         for name, target in values.items():
             dr.scatter(target, getattr(traced, name), rays.film)
         dr.eval(values)
         return Echoes(**{name: np.array(value) for name, value in values.items()})
 
-    def height_m(self, scene: mi.Scene, rows: mi.Float) -> DeviceArray:
+    def height_m(self, scene: DeviceArray, rows: mi.Float) -> DeviceArray:
         """Return the height of each pose over what is straight below it [m]; nan where there is nothing."""
         line = dr.arange(mi.UInt32, dr.width(rows) // 12) * 3
         return height_below(scene, mi.Point3f(*(dr.gather(mi.Vector4f, rows, line + axis).w for axis in range(3))))

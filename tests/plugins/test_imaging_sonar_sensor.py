@@ -78,7 +78,14 @@ def test_properties_are_those_of_a_sonar() -> None:
         **{"elevation_pattern": "box", "scatterers_per_cell": 5.0, "scatterer_spacing_m": 0.01, "speckle_nu": 2.0},
         **{"speckle_patch_m": 0.2, "source_level_db": 210.0, "noise_level_db": 60.0, "absorption_db_per_m": 0.3},
         **{"temperature_c": 4.0, "salinity_psu": 0.5, "water_depth_m": 3.0, "ph": 7.0, "gain_absorption": True},
-        **{"volume_db": -70.0, "near_glow_db": 30.0, "near_glow_m": 0.4},
+        **{
+            "ping_groups": 5,
+            "group_order": "sequential",
+            "group_interval_s": 0.004,
+            "volume_db": -70.0,
+            "near_glow_db": 30.0,
+            "near_glow_m": 0.4,
+        },
         **{"near_glow_edge_db": 12.0, "near_glow_spread_db": 2.0, "near_glow_still": 0.9},
         **{"crosstalk_db": -49.0, "stripes_db": 0.5, "coding": "gamma", "coding_db": 90.0, "coding_gamma": 0.6},
     }

@@ -1,0 +1,213 @@
+"""A scene with bodies that move: the still shapes as one scene, each moving shape as one of its own, rays carried to it.
+
+A ray is turned to the axes of each body and traced there, and the nearest hit counts. No tree is ever built anew: a million
+triangles that move cost what a million that stand still do. A ray carries the number of its moment as its time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.motion.moving_bodies import Moving, MovingBodies
+from mitsonar.motion.pose import to_world_matrices
+from mitsonar.simulation.device_arrays import DeviceArray
+
+__all__ = ["MovingScene", "SceneMotion", "carried_back", "motion_in"]
+
+
+@dataclass
+class MovingScene:
+    """The input of a launch that :meth:`SceneMotion.at` makes; it is traced as a scene of Mitsuba is.
+
+    Attributes:
+        still: all that stands still.
+        shapes: a scene of each moving shape, in its own axes.
+        copies: number of bodies of each of these.
+        rows: world to body, 12 numbers by moment and body; body 0 is the still scene.
+        spheres: middle and radius around each moving shape, in its own axes.
+    """
+
+    still: mi.Scene
+    shapes: list[mi.Scene]
+    copies: list[int]
+    rows: mi.Float
+    spheres: list[mi.Vector4f]
+
+    def ray_intersect_preliminary(
+        self, ray: mi.Ray3f, coherent: DeviceArray = True, active: DeviceArray = True
+    ) -> mi.PreliminaryIntersection3f:
+        """Trace rays to the nearest surface; ``shape`` and ``prim_uv`` are of the body's own axes."""
+        return self.find(ray, active)[0]
+
+    def find(self, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[mi.PreliminaryIntersection3f, DeviceArray]:
+        """Trace rays to the nearest surface; return what they meet and the number of the body, 0 for still shapes."""
+        coherent: DeviceArray = True
+        best: DeviceArray = self.still.ray_intersect_preliminary(mi.Ray3f(ray.o, ray.d), coherent=coherent, active=active)
+        body = dr.zeros(mi.UInt32, dr.width(ray.d))
+        first = 1
+        for scene, copies, sphere in zip(self.shapes, self.copies, self.spheres, strict=True):
+            if copies == 1:
+                best, body = self._nearer(scene, sphere, ray, mi.UInt32(first), best, body, active)
+            else:
+                best, body = self._nearest_copy(scene, sphere, ray, (first, copies), best, body, active)
+            first += copies
+        return best, body
+
+    def _nearest_copy(
+        self,
+        scene: mi.Scene,
+        sphere: mi.Vector4f,
+        ray: mi.Ray3f,
+        which: tuple[int, int],
+        best: DeviceArray,
+        body: DeviceArray,
+        active: DeviceArray,
+    ) -> tuple[DeviceArray, DeviceArray]:
+        """Look through the bodies of one shape in a loop: the kernel stays as short as that of one body."""
+        first, copies = which
+        number = mi.UInt32(first) + dr.zeros(mi.UInt32, dr.width(ray.d))
+
+        def step(number: DeviceArray, best: DeviceArray, body: DeviceArray) -> tuple[DeviceArray, ...]:
+            best, body = self._nearer(scene, sphere, ray, number, best, body, active)
+            return number + 1, best, body
+
+        found = dr.while_loop((number, best, body), lambda number, best, body: number < first + copies, step)
+        return found[1], found[2]
+
+    def _nearer(
+        self,
+        scene: mi.Scene,
+        sphere: mi.Vector4f,
+        ray: mi.Ray3f,
+        number: DeviceArray,
+        best: DeviceArray,
+        body: DeviceArray,
+        active: DeviceArray,
+    ) -> tuple[DeviceArray, DeviceArray]:
+        """Return the nearer of what was found so far and of a body; rays that miss its sphere are not traced."""
+        own = self.carried(ray, number)
+        way: DeviceArray = mi.Point3f(sphere.x, sphere.y, sphere.z) - own.o
+        along = dr.dot(way, own.d)
+        reach = dr.squared_norm(way - own.d * along) < dr.square(sphere.w)
+        own.maxt = best.t
+        coherent: DeviceArray = True
+        found: DeviceArray = scene.ray_intersect_preliminary(
+            own, coherent=coherent, active=active & reach & (along > -sphere.w)
+        )
+        nearer = found.is_valid() & (found.t < best.t)
+        return dr.select(nearer, found, best), dr.select(nearer, number, body)
+
+    def lines(self, moment: DeviceArray, body: DeviceArray) -> list[mi.Vector4f]:
+        """Return the three rows of what turns the world's axes to those of bodies."""
+        begin = (moment * self.stride + body) * 3
+        return [dr.gather(mi.Vector4f, self.rows, begin + axis) for axis in range(3)]
+
+    def carried(self, ray: mi.Ray3f, body: DeviceArray) -> mi.Ray3f:
+        """Return rays in the axes of bodies."""
+        lines = self.lines(mi.UInt32(ray.time), body)
+        origin = mi.Point3f(*(line.x * ray.o.x + line.y * ray.o.y + line.z * ray.o.z + line.w for line in lines))
+        return mi.Ray3f(origin, mi.Vector3f(*(line.x * ray.d.x + line.y * ray.d.y + line.z * ray.d.z for line in lines)))
+
+    @property
+    def stride(self) -> int:
+        """Return the bodies of a moment, with the still scene."""
+        return 1 + sum(self.copies)
+
+
+def carried_back(lines: list[mi.Vector4f], v: mi.Vector3f) -> mi.Vector3f:
+    """Return directions of bodies' axes in the world's, by the rows of :meth:`MovingScene.lines`."""
+    first, second, third = lines
+    turned: DeviceArray = mi.Vector3f(first.x, first.y, first.z) * v.x
+    turned += mi.Vector3f(second.x, second.y, second.z) * v.y + mi.Vector3f(third.x, third.y, third.z) * v.z
+    return mi.Vector3f(turned)
+
+
+class SceneMotion:
+    """What moves in a scene, on the host.
+
+    Args:
+        scene: any; its moving shapes lie in their own axes.
+        bodies: that move.
+
+    Attributes:
+        still: a scene of the other shapes.
+
+    Raises:
+        MitsonarError: a shape that the scene does not have.
+    """
+
+    def __init__(self, scene: mi.Scene, bodies: MovingBodies) -> None:
+        self.scene, self.bodies = scene, bodies
+        shapes = list(scene.shapes())
+        names = [shape.id() for shape in shapes]
+        for name in bodies.shapes:
+            if name not in names:
+                raise MitsonarError(f"moving: the scene has no shape {name}: {nearest_names(name, names)}")
+        moved = dict.fromkeys(bodies.shapes)
+        self.numbers = {name: names.index(name) for name in moved}
+        self.copies = [bodies.shapes.count(name) for name in moved]
+        self.still = _scene_of([shape for shape in shapes if shape.id() not in moved])
+        self._movers = [_scene_of([shapes[number]]) for number in self.numbers.values()]
+        self._spheres = [_sphere(shapes[number]) for number in self.numbers.values()]
+        dr.make_opaque(self._spheres)
+
+    def at(self, time_s: ArrayLike) -> MovingScene:
+        """Return the scene at moments ``(moments,)`` [s]; rays name theirs by its number, as their time."""
+        rows = self.bodies.from_world(time_s)
+        rest = np.broadcast_to(np.eye(4)[:3], (len(rows), 1, 3, 4))
+        table = np.concatenate([rest, rows], axis=1).astype(np.float32)
+        return MovingScene(self.still, self._movers, self.copies, mi.Float(table.ravel().tolist()), self._spheres)
+
+    def sonar_lines(self, pose: NDArray[np.float64], time_s: float) -> NDArray[np.float64]:
+        """Return three rows of the sonar's ``to_world`` in the world's axes, and in each body's ``(1 + bodies, 3, 4)``."""
+        own = to_world_matrices(pose.reshape(1, 6))[0]
+        rows = self.bodies.from_world(time_s)[0]
+        return np.concatenate([own[None, :3], rows @ own])
+
+    @cached_property
+    def first_objects(self) -> int:
+        """Return the number below that of the first body's object: the largest that a mesh of the scene gives."""
+        largest = 0
+        for shape in self.scene.shapes():
+            if shape.is_mesh() and shape.has_attribute("face_id")[0]:
+                largest = max(largest, int(np.array(shape.attribute_buffer("face_id")).max(initial=0)))
+        return largest
+
+    def object_names(self, known: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names of objects by their numbers: those of the scene's meshes, then those of the bodies."""
+        blank = ("",) * (self.first_objects + 1 - len(known))
+        return (*known[: self.first_objects + 1], *blank, *self.bodies.names)
+
+
+def motion_in(scene: mi.Scene, moving: Moving | MovingBodies | None) -> SceneMotion | None:
+    """Return what moves in a scene; None where nothing does."""
+    if not moving:
+        return None
+    return SceneMotion(scene, moving if isinstance(moving, MovingBodies) else MovingBodies.of(moving))
+
+
+def _scene_of(shapes: list[mi.Shape]) -> mi.Scene:
+    """Return a scene of some shapes of another."""
+    names = [shape.id() for shape in shapes]
+    numbered = {f"shape{number}": shape for number, shape in enumerate(shapes)}
+    scene = mi.load_dict({"type": "scene", **numbered}, optimize=False)  # merged meshes would be other shapes
+    assert isinstance(scene, mi.Scene)
+    for shape, name in zip(shapes, names, strict=True):
+        shape.set_id(name)  # the loader has changed it
+    return scene
+
+
+def _sphere(shape: mi.Shape) -> mi.Vector4f:
+    """Return middle and radius of a sphere around a shape, a little wider for rounding."""
+    box = shape.bbox()
+    low, high = (np.array(end, dtype=float).ravel() for end in (box.min, box.max))
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    margin = 1e-4 * (1 + float(np.abs(np.stack([low, high])).max()))
+    return mi.Vector4f(*middle.tolist(), radius + margin)

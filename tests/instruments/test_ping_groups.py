@@ -1,0 +1,69 @@
+"""Groups of beams that ping one after another, and heads that turn: times and poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.ping_groups import group_of_beams, scanned, scans, timed_path
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
+
+ONE = Sonar.create(beams=1, azimuth_fov_deg=2, elevation_fov_deg=25, range_min=0.5, range_max=7.5)
+
+
+def test_groups_of_a_didson_and_of_neighbours() -> None:
+    sonar = Sonar.create(beams=96, ping_groups=8)
+    assert (np.bincount(group_of_beams(sonar)) == 12).all()
+    np.testing.assert_array_equal(np.nonzero(group_of_beams(sonar) == 3)[0], 3 + 8 * np.arange(12))
+    np.testing.assert_array_equal(group_of_beams(sonar.replace(group_order="sequential")), np.arange(96) // 12)
+
+
+def test_one_ping_a_frame_leaves_a_path_as_it_is() -> None:
+    path = Trajectory.between(Pose(0, 0, 1), Pose(0, 1, 1), 3, 1.0)
+    timed = timed_path(Sonar(), path)
+    assert timed.poses is path.poses
+    assert timed.time_s is path.time_s
+
+
+def test_pings_lie_about_the_time_of_the_frame() -> None:
+    sonar = Sonar.create(beams=8, ping_groups=4, group_interval_s=0.1)
+    path = Trajectory.between(Pose(0, 0, 1), Pose(0, 3, 1, 0, 0, 0.6), 4, 1.0)
+    timed = timed_path(sonar, path)
+    np.testing.assert_allclose(timed.time_s.mean(axis=1), path.time_s)
+    np.testing.assert_allclose(timed.poses[..., 1], timed.time_s, atol=1e-12)  # 1 m/s, also before the first pose
+    np.testing.assert_allclose(timed.poses[..., 5], 0.2 * timed.time_s, atol=1e-12)
+    times, poses = timed.of_beams(sonar)
+    assert poses is not None
+    np.testing.assert_array_equal(times[:, 5], timed.time_s[:, 1])
+    np.testing.assert_array_equal(poses[:, 5], timed.poses[:, 1])
+
+
+def test_sweeps_follow_one_another() -> None:
+    sonar = scanned(ONE, overhead_s=0.005)
+    assert scans(sonar)
+    assert sonar.beams == 400
+    sweep = 400 * (2 * 7.5 / 1500 + 0.005)
+    timed = timed_path(sonar, Trajectory.between(Pose(0, 0, 1), Pose(0, 8, 1), 17, 1.0))
+    assert timed.time_s.shape == (2, 400)
+    np.testing.assert_allclose(np.diff(timed.time_s.ravel()), sweep / 400)
+    np.testing.assert_allclose(timed.frames.time_s, (0.5 * sweep, 1.5 * sweep))
+
+
+@pytest.mark.parametrize(
+    ("sector", "step", "said"), [(360, 0.7, "whole number of steps"), (400, 1, "at most 360"), (90, 0, "whole number")]
+)
+def test_sectors_are_checked(sector: float, step: float, said: str) -> None:
+    with pytest.raises(MitsonarError, match=said):
+        scanned(ONE, sector_deg=sector, step_deg=step)
+
+
+def test_mistakes_are_told() -> None:
+    with pytest.raises(MitsonarError, match="one beam"):
+        scanned(Sonar())
+    with pytest.raises(MitsonarError, match="each ping group has a beam"):
+        Sonar.create(beams=4, ping_groups=5)
+    with pytest.raises(MitsonarError, match="a sweep lasts"):
+        timed_path(scanned(ONE), Trajectory.between(Pose(0, 0, 1), Pose(0, 1, 1), 2, 1.0))
