@@ -52,7 +52,8 @@ def first_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float
 def strongest_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: float, above_noise_db: float) -> Detected:
     """Find the middle of the strongest echo of each beam: the centroid of its energy.
 
-    The echo is the run of bins around the strongest that exceed the threshold of :func:`first_echoes`. Noise is taken off.
+    The echo is the run of bins around the strongest that exceed the threshold of :func:`first_echoes`, with one bin on each
+    side; speckle may interrupt it for two bins. Noise is taken off.
 
     Args:
         levels: intensities ``(..., bins)``.
@@ -63,7 +64,10 @@ def strongest_echoes(levels: Array, range_m: Array, noise: Array, *, below_db: f
     """
     levels, _, above = _thresholds(levels, noise, below_db, above_noise_db)
     strongest = np.where(above, levels, 0).argmax(axis=-1)[..., None]
-    echo = _joined(above, strongest)
+    wide = above.copy()
+    wide[..., 1:] |= above[..., :-1]
+    wide[..., :-1] |= above[..., 1:]
+    echo = _joined(wide, strongest)
     energy = np.where(echo, np.maximum(levels - noise, 0), 0)
     total = energy.sum(axis=-1)
     middle = (energy * range_m).sum(axis=-1) / np.where(total > 0, total, 1)

@@ -64,7 +64,9 @@ class Sounder(BaseModel):
         own = set(cls.model_fields) - {"fan"}
         wrong = sorted(set(fields) - own - set(Sonar.model_fields))
         if wrong:
-            raise MitsonarError(f"unknown instrument key {wrong[0]}: {nearest_names(wrong[0], own | set(Sonar.model_fields))}")
+            raise MitsonarError(
+                f"unknown instrument key {wrong[0]}: {nearest_names(wrong[0], own | set(Sonar.model_fields))}"
+            )
         fan = Sonar.create(**{key: value for key, value in fields.items() if key not in own or key == "name"})
         try:
             return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})

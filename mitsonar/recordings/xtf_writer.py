@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.whole_files import write_whole

@@ -73,9 +73,7 @@ class DvlReadings:
         std = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         names = [f"{axis}_m_s" for axis in AXES] + [f"{axis}_std_m_s" for axis in AXES] + ["altitude_m"]
         names += [f"range_{k}_m" for k in range(1, beams + 1)] + [f"range_rate_{k}_m_s" for k in range(1, beams + 1)]
-        table = np.column_stack(
-            [self.velocity, std, self.altitude_m, self.soundings.range_m[..., 0], self.range_rate]
-        )
+        table = np.column_stack([self.velocity, std, self.altitude_m, self.soundings.range_m[..., 0], self.range_rate])
         text = io.StringIO()
         text.write(",".join(["time_s", "locked", *names]) + "\n")
         for time_s, locked, row in zip(self.soundings.time_s, self.locked, table, strict=True):

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["SoundedPings", "SounderSimulator"]
 
-FIRST = ("altimeter", "dvl")
-"""Kinds that take the first echo; the others take the strongest."""
+FEW = 8
+"""Pings of a batch of the model coherent, which renders fan by fan: so many are lost when a run is killed."""
 
 
 class SoundedPings(NamedTuple):
@@ -67,7 +67,7 @@ class SounderSimulator:
         """
         table = np.atleast_2d(np.asarray(poses, dtype=float))
         fans = len(self.sounder.channels)
-        together = max(1, self.simulator.pings_per_launch // fans)
+        together = FEW if self.simulator.coherent is not None else max(1, self.simulator.pings_per_launch // fans)
         for start in range(0, len(table), together):
             own = self.sounder.fan_poses(table[start : start + together])
             rendered = list(self.simulator.pings(own.reshape(-1, 6), first=(first + start) * fans))
@@ -77,7 +77,7 @@ class SounderSimulator:
 
     def detect(self, levels: NDArray[np.float32]) -> Detected:
         """Detect an echo in each beam of levels ``(pings, channels, bins, beams)``: arrays ``(pings, channels, beams)``."""
-        find = first_echoes if self.sounder.kind in FIRST else strongest_echoes
+        find = first_echoes if self.sounder.kind == "altimeter" else strongest_echoes
         limits = {"below_db": self.sounder.below_db, "above_noise_db": self.sounder.above_noise_db}
         return find(np.moveaxis(levels, 2, -1).astype(float), self.sounder.fan.range_m, self.noise, **limits)
 
