@@ -43,6 +43,7 @@ def application() -> typer.Typer:
         reproduce_command,
         serve_command,
         sonar_command,
+        sound_command,
         train_command,
         view_command,
         world_command,
@@ -59,6 +60,7 @@ def application() -> typer.Typer:
     app.command()(render_command.render)
     app.command()(impulse_command.impulse)
     app.command()(image_command.image)
+    app.command()(sound_command.sound)
     app.command()(presets_command.presets)
     app.command()(presets_command.scenes)
     app.command()(doctor_command.doctor)

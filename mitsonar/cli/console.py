@@ -47,6 +47,7 @@ INSTRUMENT = {"model": "--model", "seed": "--seed"}
 OPTIONS: dict[str, dict[str, str]] = {
     "render": INSTRUMENT,
     "crlb": INSTRUMENT,
+    "sound": INSTRUMENT,
     "serve": {**INSTRUMENT, "rate_hz": "--rate"},
     "impulse": {**INSTRUMENT, "velocity": "--velocity"},
     "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},

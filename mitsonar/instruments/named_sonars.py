@@ -19,7 +19,7 @@ from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.whole_files import read_yaml
 
-__all__ = ["NamedSonar", "load_sonar", "named_sonars", "preset", "sonar_from"]
+__all__ = ["NamedSonar", "fields_in", "load_sonar", "named_sonars", "preset", "presets_in", "sonar_from"]
 
 
 class NamedSonar(NamedTuple):
@@ -39,8 +39,13 @@ class NamedSonar(NamedTuple):
 @cache
 def named_sonars() -> dict[str, NamedSonar]:
     """Return all presets by name, from the files of the package."""
+    return presets_in("presets")
+
+
+def presets_in(folder: str) -> dict[str, NamedSonar]:
+    """Return the presets in a folder of the package by name."""
     found = {}
-    for path in sorted((files("mitsonar.instruments") / "presets").iterdir(), key=lambda path: path.name):
+    for path in sorted((files("mitsonar.instruments") / folder).iterdir(), key=lambda path: path.name):
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
         keys = table["keys"].items()
         values, sources = ({key: one[part] for key, one in keys} for part in ("value", "source"))
@@ -73,26 +78,35 @@ def load_sonar(name_or_file: str | Path) -> Sonar:
         first, *over = (part.strip() for part in text.split(","))
         sonar = load_sonar(first)
         for one in over:
-            sonar = sonar.replace(**{key: value for key, value in _fields_in(one).items() if key != "name"})
+            sonar = sonar.replace(**{key: value for key, value in fields_in(one).items() if key != "name"})
         return sonar
     if not text.lower().endswith((".yaml", ".yml")):
         if text in named_sonars() or not Path(text).exists():
             return preset(text)
         raise MitsonarError(f"a sonar's file ends in .yaml: got {text}; rename it, or name a preset")
-    fields = _fields_in(text)
+    fields = fields_in(text)
     fields.setdefault("name", Path(text).stem)
     return sonar_from(fields)
 
 
-def _fields_in(text: str) -> dict[str, Any]:
-    """Return the fields in a sonar's YAML file."""
+def fields_in(text: str, what: str = "a sonar", page: str = "sonars") -> dict[str, Any]:
+    """Return the fields in a YAML file.
+
+    Args:
+        text: path of the file.
+        what: whose they are, for errors.
+        page: of the guides that tells of them.
+
+    Raises:
+        MitsonarError: unreadable, or no `key: value` lines.
+    """
     try:
-        fields = read_yaml(text, "sonar file")
+        fields = read_yaml(text, f"{what.split()[-1]} file")
     except MitsonarError as error:
-        more = "; see docs/guides/sonars.md" if "not YAML" in str(error) else " or a preset's name"
+        more = f"; see docs/guides/{page}.md" if "not YAML" in str(error) else " or a preset's name"
         raise MitsonarError(f"{error}{more}") from None
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
-        raise MitsonarError(f"{text} must hold `key: value` lines of a sonar; see docs/guides/sonars.md")
+        raise MitsonarError(f"{text} must hold `key: value` lines of {what}; see docs/guides/{page}.md")
     return fields
 
 

@@ -1,0 +1,64 @@
+"""``mitsonar sound``: side-scans, altimeters, profilers, DVLs and 3-D sonars along a path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.render_command import SIX, Frame, path_for, scene_parameters, sonar_changes
+
+__all__ = ["sound"]
+
+
+@answered
+def sound(
+    scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
+    instrument: Annotated[
+        str,
+        typer.Option(help="sidescan, altimeter, profiler, dvl, range-image, a preset (`mitsonar presets`) or a YAML file."),
+    ],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/INSTRUMENT).")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of pings.")] = None,
+    start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {SIX}.")] = None,
+    end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
+    trajectory: Annotated[Path | None, typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`.")] = None,
+    frame: Frame = "mitsonar",
+    model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
+    quality: Annotated[str | None, typer.Option(help="draft, standard or fine: rays by the error wanted.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: range_max=20.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of jitter, speckle and noise.")] = None,
+    rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
+    parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
+) -> None:
+    """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
+    from mitsonar.instruments.named_sounders import load_sounder
+    from mitsonar.io.provenance import file_digest
+    from mitsonar.mapping.sounding_run import run_sounder
+    from mitsonar.motion.conventions import convention_named
+    from mitsonar.simulation.scene import find_scene, load_scene
+    from mitsonar.simulation.sounding import SounderSimulator
+
+    named = convention_named(frame).name
+    changes: dict[str, Any] = sonar_changes(set_ or [], quality)
+    changes |= {} if model is None else {"model": model}
+    changes |= {} if seed is None else {"seed": seed}
+    sounder = load_sounder(instrument)
+    sounder = sounder.replace(**changes) if changes else sounder
+    parameters = scene_parameters(parameter or [])
+    loaded = load_scene(scene, **parameters)
+    flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame)
+    simulator = SounderSimulator(loaded, sounder, rays_per_launch=rays_per_launch)
+    origin = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+    options = {"frame": named, "overwrite": overwrite, "resume": resume}
+    folder = out or Path("out") / sounder.name
+    with progress_bar("sounding", len(flown), "pings") as progress:
+        report = run_sounder(simulator, flown, folder, origin=origin, progress=progress, **options)
+    for sentence in report.warnings:
+        warn(sentence)
+    say(f"{len(flown)} pings ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
+    say(f"{report.found:,} of {report.beams:,} beams have an echo; files: {', '.join(report.files)}")
