@@ -1,0 +1,93 @@
+"""What a body that moves costs, and that nothing changes where nothing moves.
+
+    python benchmarks/bench_moving.py [--triangles 1000000] [--pings 9]
+    python benchmarks/bench_moving.py --quick            # 20,000 triangles, 3 pings
+
+A seabed of that many triangles and a body of as many, in the models physical and coherent: milliseconds a ping where the
+body stands still in the scene, and where it moves; medians, the two in turn. A frame of eight groups too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+from bench_impulse import cpu
+from numpy.typing import NDArray
+
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.pose import Pose
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.variant import ensure_variant
+
+WARM = 4
+"""Pings that are not counted: Dr.Jit records a launch anew once or twice."""
+
+POSE = np.array([0, 0, 2.5, 0.61, 0, 0])
+MODELS = {
+    "physical": {"quality": "standard"},
+    "coherent": {"model": "coherent", "frequency_hz": 1.8e6, "bearing": "cone", "quality": "draft"},
+}
+
+
+def main() -> None:
+    """Measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--triangles", type=int, default=1_000_000)
+    parser.add_argument("--pings", type=int, default=9)
+    parser.add_argument("--quick", action="store_true", help="20,000 triangles, 3 pings")
+    asked = parser.parse_args()
+    triangles, pings = (20_000, 3) if asked.quick else (asked.triangles, asked.pings)
+    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, {ensure_variant()}, {triangles:,} triangles still and as many that move\n")
+    print("| model | still ms | moving ms | ratio | 8 ping groups ms | ratio |\n|---|---|---|---|---|---|")
+    for name, changes in MODELS.items():
+        print(row(name, changes, triangles, pings), flush=True)
+
+
+def row(name: str, changes: dict[str, object], triangles: int, pings: int) -> str:
+    """Return a row of the table."""
+    import mitsuba as mi
+
+    sonar = Sonar.create(**changes)
+    shapes = {"floor": relief(triangles, 12.0, 0), "body": relief(triangles, 0.6, 1)}
+    placed = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    fly = Trajectory.between(Pose(0, 4, 0.4), Pose(0.2, 4.3, 0.4), 2, 1.0)
+    makers = [
+        Simulator(placed, sonar),
+        Simulator(placed, sonar, moving={"body": fly}),
+        Simulator(placed, sonar.replace(ping_groups=8)),
+    ]
+    took = np.array([[ping_s(one, number) for one in makers] for number in range(pings + WARM)])[WARM:]
+    still, moving, groups = np.median(took, axis=0) * 1e3
+    return f"| {name} | {still:.0f} | {moving:.0f} | {moving / still:.2f} | {groups:.0f} | {groups / still:.2f} |"
+
+
+def ping_s(simulator: Simulator, number: int) -> float:
+    """Return the seconds of one ping."""
+    begun = time.perf_counter()
+    next(simulator.pings(POSE, first=number, time_s=[number / 10]))
+    return time.perf_counter() - begun
+
+
+def relief(triangles: int, size: float, seed: int) -> object:
+    """Return a square relief as a mesh."""
+    import mitsuba as mi
+
+    side = max(2, round((triangles / 2) ** 0.5) + 1)
+    line = np.linspace(-size / 2, size / 2, side)
+    rough = 0.02 * np.random.default_rng(seed).standard_normal((side, side))
+    vertex = np.stack([*np.meshgrid(line, line, indexing="ij"), rough], -1).astype(np.float32)
+    corner: NDArray[np.int64] = np.arange(side * side).reshape(side, side)
+    a, b, c, d = corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    mesh = mi.Mesh("relief", side * side, len(faces))
+    values = mi.traverse(mesh)
+    values["vertex_positions"], values["faces"] = vertex.ravel(), faces.ravel().astype(np.uint32)
+    values.update()
+    return mesh
+
+
+if __name__ == "__main__":
+    main()
