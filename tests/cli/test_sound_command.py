@@ -1,0 +1,90 @@
+"""``mitsonar sound`` and moving bodies of ``mitsonar render`` as a user meets them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import Command, refused
+
+from mitsonar.mapping.sensor_files import load_sensors
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.records.echogram import Echogram
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.soundings import Soundings
+
+FILES = {
+    "sidescan": {"echogram.npz", "sidescan.xtf", "waterfall.png", "soundings.npz", "poses.tum"},
+    "altimeter": {"echogram.npz", "echogram.png", "soundings.npz", "soundings.csv", "poses.tum"},
+    "profiler": {"soundings.npz", "soundings.csv", "soundings.png", "soundings.ply", "poses.tum"},
+    "dvl": {"soundings.npz", "dvl.csv", "dvl.png", "sensors.csv", "poses.tum"},
+}
+PATH = ("--trajectory", "shipped", "--frames", 4, "--quality", "draft", "--model", "physical")
+
+
+@pytest.mark.parametrize("instrument", FILES)
+def test_each_instrument_writes_what_it_promises(mitsonar: Command, tmp_path: Path, instrument: str) -> None:
+    out = tmp_path / "out"
+    done = mitsonar("sound", "flat_floor", "--instrument", instrument, *PATH, "-o", out)
+    assert done.returncode == 0, done.stderr
+    assert {one.name for one in out.iterdir()} == FILES[instrument] | {"run.json"}
+    found = Soundings.load(out / "soundings.npz")
+    assert len(found) == 4
+    assert found.found.any()
+    if instrument in ("sidescan", "altimeter"):
+        assert Echogram.load(out / "echogram.npz").levels.max() > 0
+    if instrument == "dvl":
+        assert load_sensors(out / "sensors.csv").forward is not None
+
+
+def test_a_finished_run_is_kept(mitsonar: Command, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    asked = ("sound", "flat_floor", "--instrument", "altimeter", *PATH, "-o", out)
+    assert mitsonar(*asked).returncode == 0
+    before = (out / "soundings.npz").read_bytes()
+    refused(mitsonar(*asked), "exists")
+    again = mitsonar(*asked, "--resume")
+    assert again.returncode == 0, again.stderr
+    assert (out / "soundings.npz").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (("--instrument", "sonarr"), "sonarr"),
+        (("--instrument", "dvl", "--set", "beams=4"), "one beam a fan"),
+        (("--instrument", "dvl", "--set", "rangemax=4"), "rangemax"),
+    ],
+)
+def test_mistakes_are_one_sentence(mitsonar: Command, tmp_path: Path, wrong: tuple[str, ...], says: str) -> None:
+    refused(mitsonar("sound", "flat_floor", *wrong, "-o", tmp_path / "out"), says)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_body_moves_and_a_run_tells_where(mitsonar: Command, tmp_path: Path) -> None:
+    """A ball that swims past: labels name it, its path lies in the run, and another path is another run."""
+    scene, out = tmp_path / "ball.xml", tmp_path / "out"
+    scene.write_text(
+        """<scene version="3.0.0"><sensor type="imaging_sonar">
+  <integer name="beams" value="16"/><integer name="rays_per_beam" value="60"/><integer name="rays_across" value="2"/>
+  <integer name="range_bins" value="64"/><float name="range_min" value="2"/><float name="range_max" value="6"/>
+  <transform name="to_world"><lookat origin="0,0,2.5" target="0,3.57,0" up="0,0,1"/></transform></sensor>
+<shape type="rectangle" id="floor"><transform name="to_world"><scale value="20"/></transform></shape>
+<shape type="sphere" id="ball"><float name="radius" value="0.3"/></shape></scene>"""
+    )
+    poses = np.array([[-0.5, 3.5, 0.4, 0, 0, 0], [0.5, 3.5, 0.4, 0, 0, 0]], dtype=float)
+    Trajectory(poses, np.array([0.0, 0.4])).save(tmp_path / "ball.tum")
+    asked = ("render", scene, "--frames", 5, "--labels", "--moving", f"ball={tmp_path / 'ball.tum'}", "-o", out)
+    done = mitsonar(*asked)
+    assert done.returncode == 0, done.stderr
+    frames = SonarFrames.load(out)
+    assert frames.body_names == ("ball",)
+    assert frames.body_poses is not None
+    np.testing.assert_allclose(frames.body_poses[:, 0, 0], np.linspace(-0.5, 0.5, 5), atol=1e-6)
+    assert frames.object_id is not None
+    number = frames.object_names.index("ball")
+    beams = [np.nonzero((one == number).any(axis=0))[0].mean() for one in frames.object_id]
+    assert (np.diff(beams) > 0).all()  # to starboard
+    assert len(Trajectory.load_tum(out / "bodies" / "ball.tum")) == 5
+    refused(mitsonar("render", scene, "--moving", f"bell={tmp_path / 'ball.tum'}", "-o", tmp_path / "no"), "bell", "ball")
