@@ -24,10 +24,10 @@ Click = Any
 FOLDER = Path(__file__).parent / "reference"
 
 GROUPS = {
-    "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar"),
+    "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar", "load_sounder", "Sounder"),
     "Poses and paths": ("Pose", "Motion", "Trajectory"),
-    "Simulation": ("Simulator", "ChannelSimulator", "load_noise", "NoiseModel"),
-    "Records": ("SonarFrames", "ImpulseResponses", "load_frames", "open_recording", "write_mcap"),
+    "Simulation": ("Simulator", "ChannelSimulator", "SounderSimulator", "load_noise", "NoiseModel"),
+    "Records": ("SonarFrames", "ImpulseResponses", "Echogram", "Soundings", "load_frames", "open_recording", "write_mcap"),
     "Estimation and mapping": (
         "create_estimator",
         "Estimate",

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from mitsonar.instruments.channel_sonar import ChannelSonar
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.named_sounders import load_sounder
+    from mitsonar.instruments.sounder import Sounder
     from mitsonar.mapping.mosaic import build_mosaic
     from mitsonar.mapping.odometry import odometry
     from mitsonar.mapping.open_frames import load_frames
@@ -43,16 +45,20 @@ if TYPE_CHECKING:
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.recordings.mcap_writer import write_mcap
     from mitsonar.recordings.open_recording import open_recording
+    from mitsonar.records.echogram import Echogram
     from mitsonar.records.impulse_responses import ImpulseResponses
     from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.soundings import Soundings
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
+    from mitsonar.simulation.sounding import SounderSimulator
 
 __all__ = [
     "ChannelSimulator",
     "ChannelSonar",
     "DataStore",
+    "Echogram",
     "Estimate",
     "ImpulsePairs",
     "ImpulseResponses",
@@ -66,6 +72,9 @@ __all__ = [
     "Sonar",
     "SonarFrames",
     "SonarPairs",
+    "Sounder",
+    "SounderSimulator",
+    "Soundings",
     "Trajectory",
     "VehicleSensors",
     "build_mosaic",
@@ -78,6 +87,7 @@ __all__ = [
     "load_scene",
     "load_sensors",
     "load_sonar",
+    "load_sounder",
     "make_dataset",
     "odometry",
     "open_recording",
@@ -90,6 +100,7 @@ _MODULES = {
     "ChannelSimulator": "simulation.channel",
     "ChannelSonar": "instruments.channel_sonar",
     "DataStore": "datasets.store",
+    "Echogram": "records.echogram",
     "Estimate": "estimation.estimator",
     "ImpulsePairs": "datasets.response_pairs",
     "ImpulseResponses": "records.impulse_responses",
@@ -103,6 +114,9 @@ _MODULES = {
     "Sonar": "instruments.imaging_sonar",
     "SonarFrames": "records.sonar_frames",
     "SonarPairs": "datasets.torch_pairs",
+    "Sounder": "instruments.sounder",
+    "SounderSimulator": "simulation.sounding",
+    "Soundings": "records.soundings",
     "Trajectory": "motion.trajectory",
     "VehicleSensors": "mapping.vehicle_sensors",
     "build_mosaic": "mapping.mosaic",
@@ -115,6 +129,7 @@ _MODULES = {
     "load_scene": "simulation.scene",
     "load_sensors": "mapping.sensor_files",
     "load_sonar": "instruments.named_sonars",
+    "load_sounder": "instruments.named_sounders",
     "make_dataset": "datasets.generation",
     "odometry": "mapping.odometry",
     "save_sensors": "mapping.sensor_files",

@@ -140,6 +140,7 @@ def test_a_scene_of_one_s_own(tmp_path: Path) -> None:
         ({"receivers": [{"name": "a b"}]}, "a name is letters"),
         ({"labels": ["depth"]}, "labels"),
         ({"labels": ["shadow"], "store": "vectors"}, "labels are pixels"),
+        ({"sonar": {"ping_groups": 8}}, "one pose"),
         ({"split": {"train": 0.5}}, "add up to 1"),
         ({"mount": {"pitch_deg": 100}}, "pitch_deg"),
         ({"flight": {"height_m": float("nan")}}, "above 0"),
