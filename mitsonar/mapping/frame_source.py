@@ -115,6 +115,7 @@ class FrameSource:
         """Take frames whose times, poses, attitudes and heights are in memory, and whose images are read on demand."""
         time = np.asarray(time_s, dtype=float)
         time = time.mean(axis=1) if time.ndim == 2 else time
+        like = replace(like, beam_poses=None, body_poses=None, body_names=())  # as labels: truth that is not kept
         return cls(name, like, time, images, poses, attitude_rad, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:

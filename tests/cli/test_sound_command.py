@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import Command, refused
 
+from mitsonar.mapping.open_frames import load_frames
 from mitsonar.mapping.sensor_files import load_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echogram import Echogram
@@ -88,3 +89,21 @@ def test_a_body_moves_and_a_run_tells_where(mitsonar: Command, tmp_path: Path) -
     assert (np.diff(beams) > 0).all()  # to starboard
     assert len(Trajectory.load_tum(out / "bodies" / "ball.tum")) == 5
     refused(mitsonar("render", scene, "--moving", f"bell={tmp_path / 'ball.tum'}", "-o", tmp_path / "no"), "bell", "ball")
+
+
+def test_frames_that_take_time_are_read_and_followed(mitsonar: Command, tmp_path: Path) -> None:
+    """The file keeps a time and a pose for each beam; odometry and conversions take the middle of each frame."""
+    run, out = tmp_path / "run", tmp_path / "path"
+    asked = ("--trajectory", "shipped", "--frames", 3, "--model", "physical", "--quality", "draft", "--set", "ping_groups=8")
+    assert mitsonar("render", "flat_floor", *asked, "-o", run).returncode == 0
+    kept = SonarFrames.load(run)
+    assert kept.time_s.shape == (3, 96)
+    assert kept.beam_poses is not None
+    assert kept.beam_poses.shape == (3, 96, 6)
+    read = load_frames(run)
+    np.testing.assert_allclose(read.time_s, kept.time_s.mean(axis=1))
+    np.testing.assert_array_equal(read.image, kept.image)
+    done = mitsonar("odometry", run, "--estimator", "zero", "-o", out)
+    assert done.returncode == 0, done.stderr
+    done = mitsonar("recording", "convert", run, "-o", tmp_path / "again")
+    assert done.returncode == 0, done.stderr
