@@ -54,7 +54,7 @@ def sound(
     flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame)
     simulator = SounderSimulator(loaded, sounder, rays_per_launch=rays_per_launch)
     origin = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
-    options = {"frame": named, "overwrite": overwrite, "resume": resume}
+    options: dict[str, Any] = {"frame": named, "overwrite": overwrite, "resume": resume}
     folder = out or Path("out") / sounder.name
     with progress_bar("sounding", len(flown), "pings") as progress:
         report = run_sounder(simulator, flown, folder, origin=origin, progress=progress, **options)

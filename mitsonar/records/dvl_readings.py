@@ -48,7 +48,7 @@ class DvlReadings:
     @property
     def locked(self) -> NDArray[np.bool_]:
         """Return in which pings the velocity is known ``(pings,)``."""
-        return np.isfinite(self.velocity).all(axis=1)
+        return np.asarray(np.isfinite(self.velocity).all(axis=1), dtype=np.bool_)
 
     @property
     def altitude_m(self) -> Array:

@@ -22,7 +22,8 @@ def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any
     """Write arrays and the instrument to an npz file, whole or absent."""
     buffer = io.BytesIO()
     told = sounder.model_dump(mode="json", exclude={"fan"}) | {"fan": sounder.fan.model_dump(mode="json")}
-    np.savez_compressed(buffer, sounder=np.array(json.dumps(told)), **arrays)
+    table: dict[str, Any] = {"sounder": np.array(json.dumps(told)), **arrays}
+    np.savez_compressed(buffer, **table)
     write_whole(Path(path), buffer.getvalue())
 
 

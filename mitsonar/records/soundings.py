@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,5 +124,5 @@ class Soundings:
         low, high = np.percentile(level, [2, 98])
         grey = np.clip((level - low) / max(high - low, 1e-9), 0, 1) * 255
         colours = np.column_stack([grey, grey, grey, np.full_like(grey, 255)]).astype(np.uint8)
-        cloud = trimesh.PointCloud(self.points()[self.found], colors=colours)
+        cloud: Any = trimesh.PointCloud(self.points()[self.found], colors=colours)  # type: ignore[no-untyped-call]
         return bytes(cloud.export(file_type="ply"))
