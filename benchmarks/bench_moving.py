@@ -26,7 +26,7 @@ WARM = 4
 """Pings that are not counted: Dr.Jit records a launch anew once or twice."""
 
 POSE = np.array([0, 0, 2.5, 0.61, 0, 0])
-MODELS = {
+MODELS: dict[str, dict[str, object]] = {
     "physical": {"quality": "standard"},
     "coherent": {"model": "coherent", "frequency_hz": 1.8e6, "bearing": "cone", "quality": "draft"},
 }

@@ -115,6 +115,7 @@ def test_height_is_over_what_stands_still() -> None:
     path = Trajectory.between(Pose(0, 0, 1.5), Pose(0, 1, 1.5), 2, 1.0)
     frame = separate(floor=floor(), skid=plate((0, 0, -0.5), (0, 0, 1), half=0.4))
     frames = Simulator(frame, SONAR, moving={"skid": path}).render(path)
+    assert frames.height_m is not None
     np.testing.assert_allclose(frames.height_m, 1.5, atol=1e-5)
 
 
