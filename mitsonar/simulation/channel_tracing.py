@@ -19,7 +19,7 @@ from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables, padded
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.scatterers import Scatterers
 from mitsonar.simulation.tracing import height_below, hidden
-from mitsonar.simulation.variant import garbage_stays
+from mitsonar.simulation.variant import replayed
 
 __all__ = ["ChannelTracer", "EchoBatch", "EchoValues"]
 
@@ -81,10 +81,8 @@ class ChannelTracer:
         if (receiver, wanted) not in self.launches:
             self.launches[receiver, wanted] = self._compile(receiver, wanted)
         table = mi.Float64(link_table(self.sonar, receiver, pose, velocity))
-        with garbage_stays():
-            received = self.launches[receiver, wanted](
-                mi.UInt32(padded(asked)), self.scene, table, self.source.tables(receiver)
-            )
+        launch, inputs = self.launches[receiver, wanted], (mi.UInt32(padded(asked)), self.scene, table)
+        received = replayed(launch, *inputs, self.source.tables(receiver))
         return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point,
 from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
 from mitsonar.simulation.moving_scene import MovingScene, SceneMotion
 from mitsonar.simulation.moving_tracing import MovingSurfaces, surfaces_of
-from mitsonar.simulation.variant import garbage_stays
+from mitsonar.simulation.variant import replayed
 
 __all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
 
@@ -123,8 +123,8 @@ class CoherentTracer:
         if self.motion is not None:
             scene, lines = self.motion.at(time_s), self.motion.sonar_lines(pose, time_s)
         rows = mi.Float64(lines.ravel().tolist())
-        with garbage_stays():
-            real, imag, counts = self.launch(self.index, scene, rows, self.surfaces.arrays(), self.patches, self.mirrors)
+        inputs = self.index, scene, rows, self.surfaces.arrays(), self.patches, self.mirrors
+        real, imag, counts = replayed(self.launch, *inputs)
         shape = self.former.sines, self.former.ranges
         field = np.empty(shape, np.complex64)
         field.real, field.imag = (np.array(part, copy=False).reshape(shape) for part in (real, imag))

@@ -19,7 +19,7 @@ from mitsonar.instruments.ping_groups import TimedPath, timed_path
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.simulation.variant import ensure_variant, garbage_stays
+from mitsonar.simulation.variant import ensure_variant, replayed
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -158,8 +158,7 @@ class Simulator:
             self._launches[key] = self._compile(*key)
         inputs = self.tracer.inputs(poses, first)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
-        with garbage_stays():
-            height, made = self._launches[key](self.tracer.scene_at(time_s), *inputs, tables)
+        height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
         for view, (image, counters, truth) in zip(self.views, made, strict=True):

@@ -42,7 +42,7 @@ from mitsonar.simulation.beam_former import BeamFormer, CommonFan
 from mitsonar.simulation.coherent_tracing import STRIP, FanRays, add_waves, elevation_gain
 from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.mirror_parts import Mirrors, parts_at, smooth_share
-from mitsonar.simulation.variant import garbage_stays
+from mitsonar.simulation.variant import replayed
 
 __all__ = ["MirrorTracer"]
 
@@ -113,16 +113,14 @@ class MirrorTracer:
             MitsonarWarning: once, where cells exceed half the Fresnel radius and no finer ones were traced.
         """
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
-        with garbage_stays():
-            wanted = np.array(self.survey(self.index, self.scene, rows, self.surfaces.arrays(), self.table))
+        wanted = np.array(replayed(self.survey, self.index, self.scene, rows, self.surfaces.arrays(), self.table))
         cell = np.flatnonzero(wanted)
         if not len(cell):
             return
         parts = self._parts(np.abs(wanted[cell]))
         self._tell(wanted[cell], parts)
         inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
-        with garbage_stays():
-            real, imag = self.launch(inputs, self.scene, rows, self.surfaces.arrays(), self.table)
+        real, imag = replayed(self.launch, inputs, self.scene, rows, self.surfaces.arrays(), self.table)
         field.real += np.array(real, copy=False).reshape(field.shape)
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 

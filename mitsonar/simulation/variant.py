@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mitsonar.errors import MitsonarError, nearest_names
 
@@ -16,8 +14,8 @@ __all__ = [
     "backend",
     "current_variant",
     "ensure_variant",
-    "garbage_stays",
     "release_memory",
+    "replayed",
     "thread_count",
     "use_threads",
 ]
@@ -91,13 +89,21 @@ def thread_count() -> int:
     return max(1, int(dr.thread_count()))
 
 
-@contextmanager
-def garbage_stays() -> Iterator[None]:
-    """Suspend garbage collection while a launch is recorded: Dr.Jit 1.5 ends the process where an array is freed then."""
+def replayed(launch: Any, *inputs: object) -> Any:
+    """Run a frozen launch; record it anew where Dr.Jit refuses to replay it.
+
+    Garbage collection waits meanwhile: Dr.Jit 1.5 ends the process where an array is freed while a launch is recorded. It
+    refuses a replay where other scenes came or went since, as they do with the garbage.
+    """
     was = gc.isenabled()
     gc.disable()
     try:
-        yield
+        return launch(*inputs)
+    except RuntimeError as error:
+        if "registry entries" not in str(error):
+            raise
+        launch.clear()
+        return launch(*inputs)
     finally:
         if was:
             gc.enable()

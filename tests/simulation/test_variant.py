@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+
 import drjit as dr
 import mitsuba as mi
 import pytest
 from helpers import run_python
 
 from mitsonar.errors import MitsonarError
-from mitsonar.simulation.variant import VARIANTS, backend, ensure_variant
+from mitsonar.simulation.variant import VARIANTS, backend, ensure_variant, replayed
 
 
 def test_a_usable_variant_is_kept(variant: str) -> None:
@@ -69,3 +71,30 @@ def test_cuda_and_llvm_see_the_same() -> None:
         for name in ("cuda_ad_mono", "llvm_ad_mono")
     )
     assert cuda == pytest.approx(llvm, rel=1e-5)
+
+
+class _Launch:
+    """Refuses once, as Dr.Jit does."""
+
+    def __init__(self, message: str) -> None:
+        self.message, self.calls = message, list[object]()
+
+    def __call__(self, value: int) -> int:
+        self.calls.append((value, gc.isenabled()))
+        if "clear" not in self.calls:
+            raise RuntimeError(self.message)
+        return value + 1
+
+    def clear(self) -> None:
+        self.calls.append("clear")
+
+
+def test_launch_that_cannot_be_replayed_is_recorded_anew() -> None:
+    refused = _Launch("assign_with_registry(): The number of registry entries (3) did not match")
+    assert replayed(refused, 4) == 5
+    assert refused.calls == [(4, False), "clear", (4, False)]  # nothing is collected meanwhile
+    assert gc.isenabled()
+    broken = _Launch("out of memory")
+    with pytest.raises(RuntimeError, match="out of memory"):
+        replayed(broken, 4)
+    assert broken.calls == [(4, False)]
