@@ -89,9 +89,9 @@ def render(
     refuse_noise(outputs.noise, instrument)
     path = path_for(instrument, attitude, scene, frames, start, end, trajectory, frame)
     folder = out or Path("out") / find_scene(scene).stem
-    if mirrors and instrument.model != "coherent":
+    if mirrors and instrument.model != "coherent" and instrument.bounces == 1:
         raise MitsonarError(
-            f"--mirrors needs the model coherent: got {instrument.model}; leave it out, or give --model coherent"
+            f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one of them"
         )
     bodies = moving_bodies(moving or [], named)
     simulator = Simulator(

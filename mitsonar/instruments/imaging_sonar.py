@@ -126,6 +126,9 @@ class Sonar(Instrument):
         "physical",
         description="coherent: with speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's",
     )
+    bounces: int = Field(
+        1, ge=1, le=3, description="largest number of reflections of a path: 1, 2 or 3 (docs/guides/multipath.md)"
+    )
     gain_exponent: int = Field(
         0,
         ge=0,
@@ -248,6 +251,11 @@ class Sonar(Instrument):
         if self.pulse_m is not None and self.bandwidth_hz is not None:
             raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
         check_groups(self)
+        if self.bounces > 1 and self.model == "thesis":
+            raise ValueError(
+                f"the model thesis knows one reflection: got bounces {self.bounces}; leave bounces out, or use physical or "
+                "coherent"
+            )
         if self.model == "coherent":
             self._check_coherent()
         if self.beam_pattern != "box":

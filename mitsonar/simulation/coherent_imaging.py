@@ -318,8 +318,11 @@ def coherent_imager(
         MitsonarError: receivers elsewhere, cones, or portions with mirrors; mirrors in other models.
     """
     if sonar.model != "coherent":
-        if mirrors:
-            raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
+        if mirrors and sonar.bounces == 1:
+            raise MitsonarError(
+                f"the model {sonar.model} has no mirrors: give the sonar model coherent"
+                + (", or bounces 2" if sonar.model == "physical" else "")
+            )
         return None
     return CoherentImager(scene, sonar, mirrors, views, motion)
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,7 +44,7 @@ class Simulator:
         sonar: the instrument; default: the scene's ``imaging_sonar``.
         views: makes the images of a ping from its echoes; default: one, of all of them.
         mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
-            materials (model ``coherent``); default: none.
+            materials (model ``coherent``, and ``physical`` with several ``bounces``); default: none.
         moving: trajectories, or their files, by the ids of the shapes that follow them (docs/guides/moving.md).
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
@@ -68,8 +67,10 @@ class Simulator:
     ) -> None:
         self.variant = ensure_variant()
         from mitsonar.instruments.views import Whole
+        from mitsonar.simulation.bounce_sums import bounce_sums
         from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.expected_former import expected_former
+        from mitsonar.simulation.image_launch import ImageLaunch
         from mitsonar.simulation.moving_scene import motion_in
         from mitsonar.simulation.moving_tracing import tracer_of
         from mitsonar.simulation.scene import sonar_in
@@ -87,7 +88,9 @@ class Simulator:
         self.motion = motion_in(scene, moving)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
-            self.grouped = GroupedPings(Simulator(scene, one, moving=moving, rays_per_launch=rays_per_launch), sonar)
+            self.grouped = GroupedPings(
+                Simulator(scene, one, mirrors=mirrors, moving=moving, rays_per_launch=rays_per_launch), sonar
+            )
         self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
         self.former = expected_former(one, views)
         traced = one if self.former is None else self.former.traced
@@ -97,6 +100,9 @@ class Simulator:
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
         self.pings_per_launch = max(1, rays_per_launch // max(traced.rays, cells))
+        self.bounces = bounce_sums(scene, one, traced, mirrors)
+        formed = None if self.former is None else one
+        self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
@@ -143,7 +149,7 @@ class Simulator:
         levels, counts, cut = self.coherent.levels(pose, number, time_s)
         if labels:
             pings = self._launch(pose[None], np.array([time_s]), number, True)[0]
-            pings.levels, pings.expected, pings.cut = levels[None], pings.levels, cut
+            pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
             return pings
         height_m = self.tracer.height_m(self.tracer.scene_at(time_s), self.tracer.inputs(pose[None], number)[0])
         return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
@@ -155,15 +161,17 @@ class Simulator:
 
         key = (len(poses), labels)
         if key not in self._launches:
-            self._launches[key] = self._compile(*key)
+            self._launches[key] = self._maker.compiled(*key)
         inputs = self.tracer.inputs(poses, first)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
-        height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables)
+        mirrors = None if self.bounces is None else self.bounces.tables_of_mirrors
+        height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables, mirrors)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
-        for view, (image, counters, truth) in zip(self.views, made, strict=True):
+        for view, (image, counters, truth, single) in zip(self.views, made, strict=True):
             pings = RenderedPings(first, *binning.fetch(image, counters, len(poses), view), height_m)
             if labels:
+                pings.expected = None if single is None else binning.fetch(single, counters, len(poses), view)[0]
                 pings.labels = labels_of(pings, truth, self.tracer.sonar.rays)
             looks.append(pings if self.former is None else self._formed(pings, self.former))
         return looks
@@ -171,57 +179,8 @@ class Simulator:
     def _formed(self, pings: RenderedPings, former: ExpectedFormer) -> RenderedPings:
         """Return pings of traced boxes as the beams and the pulse spread them; labels are those of the boxes."""
         labels = {name: former.crop(values) for name, values in pings.labels.items()}
-        expected = former.crop(pings.levels) if labels else None
+        expected = former.crop(pings.echoes) if labels else None
         return RenderedPings(pings.first, former.levels(pings.levels), pings.counts, pings.height_m, labels, expected)
-
-    def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
-        """Compile the fused launch.
-
-        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python.
-        """
-        import drjit as dr
-
-        from mitsonar.simulation.binning import accumulate, develop, strongest
-        from mitsonar.simulation.elevation_pattern import elevation_gain
-        from mitsonar.simulation.tracing import Rays
-
-        tracer, sonar, own = self.tracer, self.tracer.sonar, self.sonar
-
-        @dr.freeze
-        def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any) -> Any:
-            rays = Rays(sonar, index)
-            ray, fan = tracer.rays_of(rays, rows, keys)
-            echoes = tracer.echoes(scene, ray, fan, surfaces)
-            if self.former is not None:
-                echoes = replace(
-                    echoes, reflectivity=echoes.reflectivity * dr.square(elevation_gain(own, dr.tan(fan.elevation)))
-                )
-            looks = [
-                tracer.view_echoes(scene, rays, fan, echoes, table)
-                for tracer, table in zip(self.view_tracers, tables, strict=True)
-            ]
-            sums = [
-                accumulate(seen, rays.ping, pings, tracer) for seen, tracer in zip(looks, self.view_tracers, strict=True)
-            ]
-            truths: list[Any] = [None] * len(looks)
-            if labels:
-                truths = [
-                    (
-                        strongest(seen, rays.ping, rays.ray, pings, view),
-                        seen.elevation,
-                        seen.echoes.shape_id,
-                        seen.echoes.object_id,
-                    )
-                    for seen, view in zip(looks, self.views, strict=True)
-                ]
-            dr.eval(sums, truths)  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
-            made = [
-                (*develop(total, pings, tracer), truth)
-                for total, tracer, truth in zip(sums, self.view_tracers, truths, strict=True)
-            ]
-            return tracer.height_m(scene, rows), made
-
-        return partial(launch, Rays.numbered(sonar, pings))
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """One ping's echoes as NumPy arrays, in the order of the film; all beams ping at ``time_s`` [s]."""

@@ -286,7 +286,7 @@ class StoredEchoes:
         change |= {} if window is None else {"range_min": window[0], "range_max": window[1]}
         if frames.sonar.model == "coherent":  # echoes have no phase: what can be binned are expected levels in hard boxes
             change |= {"model": "physical", "pattern": "box"}
-        self.sonar = frames.sonar.replace(**change)
+        self.sonar = frames.sonar.replace(**change, bounces=1)  # echoes are of one reflection
         self.notes: list[str] = []
 
     def pings(
