@@ -238,13 +238,17 @@ def add_waves(
 
 @dataclass
 class SeenPoint:
-    """A point as the sonar sees it: exact range [m], sine of the bearing, tangent of the elevation, cosine, its ray."""
+    """A point as the sonar sees it: exact range [m], sine of the bearing, tangent of the elevation, cosine, its ray.
+
+    ``ahead``: whether its direction lies in the fan.
+    """
 
     range_m: DeviceArray
     sine: DeviceArray
     tangent: DeviceArray
     cosine: DeviceArray
     mine: DeviceArray
+    ahead: DeviceArray
 
 
 class FanRays:
@@ -266,7 +270,7 @@ class FanRays:
     """
 
     def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]], side: int = 0) -> None:
-        self.fan, self.cone, self.lines = fan, sonar.bearing == "cone", lines
+        self.fan, self.cone, self.lines, self.sonar, self.index = fan, sonar.bearing == "cone", lines, sonar, index
         strip, place = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
         self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
@@ -291,6 +295,10 @@ class FanRays:
             by_tangent = (-cos_e * cos_e * sin_e * u, -cos_e * cos_e * sin_e * cos_b, cos_e * cos_e * cos_e)
         self.by_sine, self.by_tangent = self._world(*by_sine), self._world(*by_tangent)
         self.origin = mi.Point3f(*(mi.Float(line[3]) for line in self.lines))
+
+    def from_lines(self, lines: list[list[Any]]) -> FanRays:
+        """Return the same rays of a sonar elsewhere, of both sides of the elevation."""
+        return FanRays(self.fan, self.sonar, self.index, lines)
 
     def _world(self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray) -> mi.Vector3f:
         """Turn (starboard, forward, up) into the world's axes."""
@@ -330,7 +338,8 @@ class FanRays:
         column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
         row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
         mine = (column == self.column) & (row == self.row) & (forward > 0)
-        return SeenPoint(range_m, sine, tangent, cosine, mine)
+        ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
+        return SeenPoint(range_m, sine, tangent, cosine, mine, ahead)
 
     def _along(self, points: HashedPoints, way: list[DeviceArray], column: int) -> DeviceArray:
         """Return the component of vectors along one axis of the sensor."""
