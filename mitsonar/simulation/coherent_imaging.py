@@ -23,6 +23,7 @@ from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
 from mitsonar.simulation.corner_tracing import CornerTracer
+from mitsonar.simulation.diffuse_field import DiffuseField
 from mitsonar.simulation.ghost_tracing import GhostTracer
 from mitsonar.simulation.hashed_points import MOST_CANDIDATES
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
@@ -88,6 +89,7 @@ class CoherentImager:
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
         several = parts is not None and sonar.bounces > 1
         self.ghosts = GhostTracer(self.tracer) if several else None
+        self.diffuse = DiffuseField(self.tracer) if sonar.bounces > 1 else None
         self.corners = CornerTracer(scene, sonar, self.former, parts) if parts is not None and several else None
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
@@ -128,10 +130,9 @@ class CoherentImager:
         field, counts = (self.tracer if side is None else self.tracers[side]).field(pose, time_s)
         if self.glints is not None:
             self.glints.add(pose, field)
-        if self.ghosts is not None:
-            self.ghosts.add(pose, field)
-        if self.corners is not None:
-            self.corners.add(pose, field)
+        for further in (self.ghosts, self.corners, self.diffuse):
+            if further is not None:
+                further.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)

@@ -265,6 +265,7 @@ class FanRays:
         side: of the elevation: +1 up, -1 down, 0 both.
 
     Attributes:
+        sine, tangent: of the bearing and of the elevation of each ray.
         on_side: rays of that side; a point's side is that of its ray.
         inside: those of them in the field of view.
     """
@@ -275,10 +276,12 @@ class FanRays:
         self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
-        t = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
+        t: DeviceArray = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
         sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
         self.on_side = mi.Bool(True) if side == 0 else (t > 0) == (side > 0)
         self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1]) & self.on_side
+        self.sine: DeviceArray = u
+        self.tangent: DeviceArray = t
         self._aim(u, t)
 
     def _aim(self, u: DeviceArray, t: DeviceArray) -> None:
@@ -304,6 +307,14 @@ class FanRays:
         """Turn (starboard, forward, up) into the world's axes."""
         rows = [[mi.Float(value) for value in line[:3]] for line in self.lines]
         return mi.Vector3f(*(row[0] * -starboard + row[1] * up + row[2] * forward for row in rows))
+
+    def direction(self, u: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+        """Return sine of the bearing and tangent of the elevation of directions, and whether these lie in the fan."""
+        port, up, forward = (sum(mi.Float(line[axis]) * u[row] for row, line in enumerate(self.lines)) for axis in range(3))
+        level = dr.sqrt(port * port + forward * forward)
+        sine, tangent = -port if self.cone else -port / level, up / (forward if self.cone else level)
+        ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
+        return sine, tangent, ahead
 
     def _steep(self, hit: Hit) -> DeviceArray:
         """Return the cosine between normal and ray, kept away from 0."""

@@ -156,7 +156,7 @@ class CornerTracer(MirrorTracer):
         level *= dr.norm(dr.cross(across, down)) / (length * distance)
         turn: DeviceArray = (d + last.u) * (self.wavenumber / 2)
         level *= sinc(dr.dot(turn, across)) * sinc(dr.dot(turn, down))
-        sine, tangent, ahead = self._direction(rays, last.u)
+        sine, tangent, ahead = rays.direction(last.u)
         level *= elevation_gain_of_ends(self.sonar, tangent, rays.tangent)
         if self.sonar.beam_pattern == "two_way":
             level *= overlap(self.sonar, sine - rays.sine)
@@ -166,14 +166,3 @@ class CornerTracer(MirrorTracer):
         sin, cos = dr.sincos((mi.Float(dr.round(turns) - turns) + 0.25) * (2 * math.pi))
         kept = last.heard & ahead & (steep + back < 2 * MOST_STRETCH * steep)
         add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), kept)
-
-    def _direction(self, rays: FinerRays, u: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-        """Return sine of the bearing and tangent of the elevation of directions, and whether they lie in the fan."""
-        port, up, forward = (
-            sum(mi.Float(line[axis]) * u[row] for row, line in enumerate(rays.lines)) for axis in range(3)
-        )
-        level = dr.sqrt(port * port + forward * forward)
-        sine = -port if rays.cone else -port / level
-        tangent = up / (forward if rays.cone else level)
-        ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
-        return sine, tangent, ahead
