@@ -131,7 +131,8 @@ class CornerTracer(MirrorTracer):
             )
             mixed |= (also != heard) | (also & heard & ~alike)
             near |= also
-        steps = [dr.norm(step) for step in now.rays.steps_on(now.hit)]
+        d = now.rays.d
+        steps = [dr.norm(step - d * dr.dot(d, step)) for step in now.rays.steps_on(now.hit)]
         longest = dr.select(steps[0] > steps[1], steps[0], steps[1])
         needed = self._cells(longest, mi.Float(0), mi.Float(last.distance))
         smooth = dr.select(heard, dr.select(needed > 1, needed, 1), 0)
