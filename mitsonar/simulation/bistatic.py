@@ -113,7 +113,9 @@ class ReceiverTracer:
         return dr.select(flatter(normal, fan.d, toward), (end + back) * 0.5, otherwise)
 
 
-def half_path_rate(range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray) -> DeviceArray:
+def half_path_rate(
+    range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray
+) -> DeviceArray:
     """Return the change of half a path by an angle of its ray, on the tangent plane [m/rad].
 
     Args:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -130,9 +129,7 @@ class BounceSums:
                 sums = accumulate(heard, rays.ping, pings, self.tracer, sums, counted=False)
         return sums
 
-    def _heard(
-        self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays
-    ) -> list[ViewEchoes]:
+    def _heard(self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays) -> list[ViewEchoes]:
         """Return the arrivals in the beams that hear them, a path and its reverse where both are to be added."""
         sonar, traced = self.sonar, self.traced
         level = self._levels(arrival, echoes)
@@ -186,12 +183,6 @@ class BounceSums:
 def _scaled(echoes: Echoes, gain: DeviceArray) -> Echoes:
     """Return echoes of which a part is heard."""
     return replace(echoes, reflectivity=echoes.reflectivity * gain)
-
-
-def bright_shapes(surfaces: Surfaces) -> bool:
-    """Return whether a table holds a reflectivity above 1 / pi: more than all that arrives would be sent on."""
-    rows = np.array(surfaces.facets).reshape(-1, 4)[:, 3]
-    return bool((rows > 1 / math.pi + 1e-6).any())
 
 
 def bounce_sums(scene: mi.Scene, sonar: Sonar, traced: Sonar, mirroring: Mirroring) -> BounceSums | None:

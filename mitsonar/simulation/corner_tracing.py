@@ -75,7 +75,9 @@ class LastMirror:
 class CornerTracer(MirrorTracer):
     """Sum the echoes of two and more mirrors one after the other; arguments as of :class:`MirrorTracer`."""
 
-    def _chains(self, scene: mi.Scene, tables: Any, rays: FanRays, table: mi.Float) -> Iterator[tuple[MirroredRays, LastMirror]]:
+    def _chains(
+        self, scene: mi.Scene, tables: Any, rays: FanRays, table: mi.Float
+    ) -> Iterator[tuple[MirroredRays, LastMirror]]:
         """Yield rays at their second mirror, at their third, and what these send back."""
         surfaces = replace(self.surfaces, **tables)
         now = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1))
@@ -126,9 +128,7 @@ class CornerTracer(MirrorTracer):
             also = dr.gather(mi.Bool, heard, other)
             chord: DeviceArray = dr.gather(mi.Vector3f, place, other) - place
             apart: DeviceArray = dr.norm(dr.gather(mi.Vector3f, image, other) - image)
-            alike = (apart <= ONE_PLANE * (1 + now.hit.t)) & (
-                dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * dr.norm(chord)
-            )
+            alike = (apart <= ONE_PLANE * (1 + now.hit.t)) & (dr.abs(dr.dot(normal, chord)) <= LEVEL_PART * dr.norm(chord))
             mixed |= (also != heard) | (also & heard & ~alike)
             near |= also
         d = now.rays.d
@@ -140,14 +140,14 @@ class CornerTracer(MirrorTracer):
 
     # ---------------------------------------------------------------- second launch
 
-    def _sum(self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]) -> None:
+    def _sum(
+        self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
+    ) -> None:
         """Add the echo of each ray's cell to the grid."""
         for now, last in self._chains(scene, tables, rays, table):
             self._add_last(rays, now, last, sums)
 
-    def _add_last(
-        self, rays: FinerRays, now: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]
-    ) -> None:
+    def _add_last(self, rays: FinerRays, now: MirroredRays, last: LastMirror, sums: tuple[mi.UInt64, mi.UInt64]) -> None:
         """Add what the last mirror sends back."""
         hit, d = now.hit, now.rays.d
         across, down = now.rays.steps_on(hit)

@@ -91,7 +91,9 @@ class GhostTracer:
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
             for number in range(2, self.sonar.bounces + 1):
                 now = mirrored_on(scene, surfaces, now, mirrors, self.wavenumber)
-                self._sum(scene, rays, now, mirrors, patches, (sums[0], sums[1]), retro=number == 2 and self.sonar.bounces > 2)
+                self._sum(
+                    scene, rays, now, mirrors, patches, (sums[0], sums[1]), retro=number == 2 and self.sonar.bounces > 2
+                )
             dr.eval(sums)
             return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
 
@@ -161,14 +163,18 @@ class GhostTracer:
         wave = (half, *self._turned(half, point))
         seen = active[0] & there.mine & here.ahead
         if self.sonar.beam_pattern == "two_way":
-            gain = elevation_gain_of_ends(self.sonar, there.tangent, here.tangent) * overlap(self.sonar, there.sine - here.sine)
+            gain = elevation_gain_of_ends(self.sonar, there.tangent, here.tangent) * overlap(
+                self.sonar, there.sine - here.sine
+            )
             self._add(sums, (there.sine + here.sine) * 0.5, both * gain * 2, wave, seen)
         else:
             for one, other in ((there, here), (here, there)):
                 gain = elevation_gain_of_ends(self.sonar, one.tangent, other.tangent)
                 self._add(sums, one.sine, both * gain, wave, seen)
         if active[1] is not None:
-            gain = now.gain * there.cosine / dr.square(far) * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
+            gain = (
+                now.gain * there.cosine / dr.square(far) * elevation_gain_of_ends(self.sonar, there.tangent, there.tangent)
+            )
             wave = (there.range_m, *self._turned(there.range_m, point))
             self._add(sums, there.sine, level * gain, wave, active[1] & there.mine)
 

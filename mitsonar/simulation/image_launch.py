@@ -64,11 +64,14 @@ class ImageLaunch:
                 own = replace(tracer.surfaces, **surfaces)
                 more = bounces.sums(scene, own, rays, lines, seen, key, mirrors, pings)
             looks = self._looks(scene, rays, fan, echoes, tables)
-            sums = [
-                accumulate(seen, rays.ping, pings, own) for seen, own in zip(looks, self.view_tracers, strict=True)
+            sums = [accumulate(seen, rays.ping, pings, own) for seen, own in zip(looks, self.view_tracers, strict=True)]
+            truths = [
+                self._truth(seen, rays, pings, view) if labels else None
+                for seen, view in zip(looks, self.views, strict=True)
             ]
-            truths = [self._truth(seen, rays, pings, view) if labels else None for seen, view in zip(looks, self.views, strict=True)]
-            dr.eval(sums, more, truths)  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
+            dr.eval(
+                sums, more, truths
+            )  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
             made = []
             for total, own, truth in zip(sums, self.view_tracers, truths, strict=True):
                 first = develop(total, pings, own)

@@ -68,6 +68,7 @@ class Simulator:
         self.variant = ensure_variant()
         from mitsonar.instruments.views import Whole
         from mitsonar.simulation.bounce_sums import bounce_sums
+        from mitsonar.simulation.bright_surfaces import bright_notes
         from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.expected_former import expected_former
         from mitsonar.simulation.image_launch import ImageLaunch
@@ -96,6 +97,7 @@ class Simulator:
         traced = one if self.former is None else self.former.traced
         self.tracer = tracer_of(scene, traced, self.motion)
         self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
+        self.notes = [*self.notes, *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ())]
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)

@@ -78,7 +78,9 @@ def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirr
         other = "mirrors" if mirrors else "bounces"
         raise MitsonarError(f"{other} are of still scenes: leave {other} or bodies that move out")
     if sonar.bounces > 1 and any(not isinstance(view, Whole) for view in views or ()):
-        raise MitsonarError("receivers elsewhere and portions hear one reflection: leave bounces out, or render the whole view")
+        raise MitsonarError(
+            "receivers elsewhere and portions hear one reflection: leave bounces out, or render the whole view"
+        )
     if what and any(not isinstance(view, Whole) for view in views or ()):
         raise MitsonarError(f"receivers elsewhere and portions have no {what}: render the whole view")
 

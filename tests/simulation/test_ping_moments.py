@@ -110,5 +110,3 @@ def test_what_has_no_groups_is_refused() -> None:
         next(simulator.pings(np.zeros((1, 7, 6))))
     with pytest.raises(MitsonarError, match="one for each pose"):
         next(simulator.pings(np.zeros((2, 6)), time_s=[0.0]))
-    with pytest.raises(MitsonarError, match="mirrors are of still scenes"):
-        Simulator(wall(), COHERENT, mirrors={"wall": (0.5, 0.0)})
