@@ -23,7 +23,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.coherent_tracing import FanRays, add_waves
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
