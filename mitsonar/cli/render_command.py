@@ -57,7 +57,8 @@ def render(
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
     mirrors: Annotated[
-        bool, typer.Option("--mirrors", help="Glints of smooth materials (model coherent); see docs/guides/coherent.md.")
+        bool,
+        typer.Option("--mirrors", help="Smooth materials glint (coherent) and mirror (bounces); docs/guides/multipath.md."),
     ] = False,
     moving: Annotated[
         list[str] | None,
@@ -91,7 +92,7 @@ def render(
     folder = out or Path("out") / find_scene(scene).stem
     if mirrors and instrument.model != "coherent" and instrument.bounces == 1:
         raise MitsonarError(
-            f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one of them"
+            f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one"
         )
     bodies = moving_bodies(moving or [], named)
     simulator = Simulator(

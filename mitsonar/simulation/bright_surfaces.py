@@ -32,6 +32,6 @@ def bright_notes(scene: mi.Scene, surfaces: Surfaces) -> list[str]:
         return []
     names = ", ".join(sorted(found)[:3]) + (" ..." if len(found) > 3 else "")
     return [
-        f"reflectivities above 1/pi = 0.318 send on more than arrives: paths of several reflections by way of {names} are too "
-        "loud; give a reflectance of 0.318 at most, or a material"
+        f"reflectivities above 1/pi = 0.318 send on more than arrives: paths of several reflections by way of {names} are "
+        "too loud; give a reflectance of 0.318 at most, or a material"
     ]

@@ -9,8 +9,8 @@ area of the cell on the last mirror, dX its steps by one column (u) and row (t),
 "shooting and bouncing rays" (Ling, Chou, Lee 1989). The ray tells how the path leaves; the line to P tells how it arrives.
 Its reverse is another ray's.
 
-As for one mirror a first launch finds what to divide: cells whose neighbours meet other mirrors are divided most. What leaves
-the last mirror farther than 60 deg from the line to the sonar fades, and ends at 90 deg.
+As for one mirror a first launch finds what to divide: cells whose neighbours meet other mirrors are divided most. What
+leaves the last mirror farther than 60 deg from the line to the sonar fades, and ends at 90 deg.
 """
 
 from __future__ import annotations

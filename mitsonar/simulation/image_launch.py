@@ -1,4 +1,4 @@
-"""The fused launch of the models ``physical`` and ``thesis``: rays, echoes, views and sums of several pings in one kernel."""
+"""The fused launch of the models ``physical`` and ``thesis``: rays, echoes, views, sums of many pings in one kernel."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class ImageLaunch:
     def compiled(self, pings: int, labels: bool) -> Callable[..., Any]:
         """Compile the launch.
 
-        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes scene, rows of
-        poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns heights, and of each view the
+        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes scene, rows
+        of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns heights, and of each view the
         levels, counters, truth for labels, and the levels of one reflection where labels go by these.
         """
         tracer, bounces = self.tracer, self.bounces
