@@ -2,8 +2,8 @@
 
 Their energies are sums over rays (:mod:`mitsonar.simulation.bounce_walk`) in coarse cells of sine and range, about as large
 as beam and pulse resolve. Each node of the grid in a cell gets its part of the energy times a complex Gaussian number, a
-hash of (seed, node). So the speckle is that of very many paths, and a sonar at rest sees it unchanged; its grain does not move with
-the ground.
+hash of (seed, node). So the speckle is that of very many paths, and a sonar at rest sees it unchanged; its grain does not
+move with the ground.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class ImageLaunch:
         """Compile the launch.
 
         It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes scene, rows
-        of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns heights, and of each view the
-        levels, counters, truth for labels, and the levels of one reflection where labels go by these.
+        of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns heights, and of each view
+        the levels, counters, truth for labels, and the levels of one reflection where labels go by these.
         """
         tracer, bounces = self.tracer, self.bounces
 

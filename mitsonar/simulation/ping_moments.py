@@ -59,8 +59,8 @@ def sonar_of_one_ping(sonar: Sonar) -> Sonar | None:
     """Return the sonar whose pings make up the frames; None where one launch traces all groups, each from its own pose.
 
     That is so where the beams are apart: boxes. Where each beam is formed of more than its own rays, or hears those of
-    others by way of several reflections, all beams of the fan are formed at each group's pose, and those of the group are kept. A
-    head that turns has one beam.
+    others by way of several reflections, all beams of the fan are formed at each group's pose, and those of the group are
+    kept. A head that turns has one beam.
     """
     if sonar.ping_groups == 1 or (sonar.beam_pattern == "box" and sonar.bounces == 1):
         return None

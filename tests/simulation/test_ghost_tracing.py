@@ -15,7 +15,8 @@ from mitsonar.simulation.imaging import Simulator
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]
 
 SONAR = Sonar.create(model="coherent", frequency_hz=9e5, beams=48, azimuth_fov_deg=28.8, elevation_fov_deg=60.0,
-                     range_min=3.5, range_max=6.0, range_bins=500, elevation_pattern="box", absorption_db_per_m=0.0, bounces=3)  # fmt: skip
+                     range_min=3.5, range_max=6.0, range_bins=500, elevation_pattern="box", absorption_db_per_m=0.0,
+                     bounces=3)  # fmt: skip
 
 K = 2 * math.pi * 9e5 / 1500
 SURFACE = 0.8
