@@ -123,10 +123,11 @@ class BounceSums:
         walk = Walk(
             scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, fan.below, fan.above, fan.aside, width
         )
-        sums = None
+        sums: mi.UInt64 | None = None
         for arrival in walk.arrivals(begin, rays.ray, keys):
             for heard in self._heard(arrival, echoes, fan, lines, rays):
                 sums = accumulate(heard, rays.ping, pings, self.tracer, sums, counted=False)
+        assert sums is not None
         return sums
 
     def _heard(self, arrival: Arrival, echoes: Echoes, fan: Fan, lines: list[mi.Vector4f], rays: Rays) -> list[ViewEchoes]:

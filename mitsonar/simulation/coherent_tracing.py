@@ -279,7 +279,9 @@ class FanRays:
         t: DeviceArray = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
         sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
         self.on_side = mi.Bool(True) if side == 0 else (t > 0) == (side > 0)
-        self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1]) & self.on_side
+        aside: DeviceArray = dr.abs(u)
+        lift: DeviceArray = dr.abs(t)
+        self.inside = (aside <= sides[0]) & (lift <= sides[1]) & self.on_side
         self.sine: DeviceArray = u
         self.tangent: DeviceArray = t
         self._aim(u, t)
@@ -313,8 +315,9 @@ class FanRays:
         port, up, forward = (sum(mi.Float(line[axis]) * u[row] for row, line in enumerate(self.lines)) for axis in range(3))
         level = dr.sqrt(port * port + forward * forward)
         sine, tangent = -port if self.cone else -port / level, up / (forward if self.cone else level)
-        ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
-        return sine, tangent, ahead
+        aside: DeviceArray = dr.abs(sine)
+        lift: DeviceArray = dr.abs(tangent)
+        return sine, tangent, (forward > 0) & (aside <= self.fan.sine) & (lift <= self.fan.tangent)
 
     def _steep(self, hit: Hit) -> DeviceArray:
         """Return the cosine between normal and ray, kept away from 0."""

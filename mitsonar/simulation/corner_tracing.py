@@ -89,12 +89,13 @@ class CornerTracer(MirrorTracer):
         hit, d = now.hit, now.rays.d
         reflection, roughness_m = parts_at(table, hit)
         image, origin = (mi.Point3d(*(line[3] for line in one.lines)) for one in (now.rays, rays))
-        place: DeviceArray = image + mi.Vector3d(d) * mi.Float64(hit.t)
+        ray: DeviceArray = mi.Vector3d(d)
+        place: DeviceArray = image + ray * mi.Float64(hit.t)
         way = place - origin
         distance, length = dr.norm(way), dr.norm(place - image)
         u: DeviceArray = mi.Vector3f(way / distance)
         share = facing_share(dr.dot(reflected(d, hit.n), -u))
-        heard = hit.valid & (reflection != 0) & (share > 0) & (mi.Float(length) < MOST_STRETCH * mi.Float(distance))
+        heard = hit.valid & (reflection != 0) & (share > 0) & (length < distance * MOST_STRETCH)
         heard &= dr.dot(hit.n, u) * dr.dot(hit.n, d) > 0
         half = mi.Float(length + distance) * 0.5
         heard &= (half > self.former.first_range) & (half < self.last)
@@ -108,10 +109,10 @@ class CornerTracer(MirrorTracer):
         @dr.freeze
         def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
             rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
-            wanted = mi.Float(0)
+            wanted: DeviceArray = mi.Float(0)
             for now, last in self._chains(scene, tables, rays, table):
-                own = self._parts_of(rays, now, last)
-                wanted = dr.select(dr.abs(own) > dr.abs(wanted), own, wanted)
+                own: DeviceArray = self._parts_of(rays, now, last)
+                wanted = dr.select(dr.square(own) > dr.square(wanted), own, wanted)
             return wanted
 
         return survey

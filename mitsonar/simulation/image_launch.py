@@ -61,18 +61,17 @@ class ImageLaunch:
                 key = dr.gather(mi.UInt32, keys, rays.ping) if tracer.sonar.jittered else mi.UInt32(tracer.sensor.key(0))
                 lines = [dr.gather(mi.Vector4f, rows, rays.moment * 3 + axis) for axis in range(3)]
                 seen = fan, echoes, reflection
-                own = replace(tracer.surfaces, **surfaces)
-                more = bounces.sums(scene, own, rays, lines, seen, key, mirrors, pings)
+                known = replace(tracer.surfaces, **surfaces)
+                more = bounces.sums(scene, known, rays, lines, seen, key, mirrors, pings)
             looks = self._looks(scene, rays, fan, echoes, tables)
             sums = [accumulate(seen, rays.ping, pings, own) for seen, own in zip(looks, self.view_tracers, strict=True)]
             truths = [
                 self._truth(seen, rays, pings, view) if labels else None
                 for seen, view in zip(looks, self.views, strict=True)
             ]
-            dr.eval(
-                sums, more, truths
-            )  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
-            made = []
+            # all that reads the echoes in one kernel, before any sum is read: rays are traced once
+            dr.eval(sums, more, truths)
+            made: list[tuple[Any, ...]] = []
             for total, own, truth in zip(sums, self.view_tracers, truths, strict=True):
                 first = develop(total, pings, own)
                 if more is None:

@@ -46,8 +46,9 @@ def lambert_direction(normal: DeviceArray, d: DeviceArray, ray: DeviceArray, key
     """
     first, second = mi.sample_tea_32(ray, key, ROUNDS)
     place = mi.Point2f((mi.Float(first >> 8) + 0.5) * 2.0**-24, (mi.Float(second >> 8) + 0.5) * 2.0**-24)
-    facing = mi.Normal3f(normal * dr.select(dr.dot(normal, d) > 0, -1.0, 1.0))
-    return mi.Frame3f(facing).to_world(mi.warp.square_to_cosine_hemisphere(place))
+    facing: DeviceArray = mi.Vector3f(normal * dr.select(dr.dot(normal, d) > 0, -1.0, 1.0))
+    drawn: DeviceArray = mi.warp.square_to_cosine_hemisphere(place)
+    return mi.Vector3f(mi.Frame3f(facing).to_world(drawn))
 
 
 def mirrored_lines(lines: list[list[Any]], normal: DeviceArray, place: DeviceArray) -> list[list[Any]]:
