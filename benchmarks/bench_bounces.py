@@ -84,7 +84,12 @@ def tank() -> mi.Scene:
         grey = {"type": "diffuse", "reflectance": {"type": "uniform", "value": reflectance}}
         return {"type": "rectangle", "to_world": look @ mi.ScalarTransform4f().scale(8), "bsdf": grey}
 
-    walls = ([3, 2, 2], [-1, 0, 0]), ([-3, 2, 2], [1, 0, 0]), ([0, 4.5, 2], [0, -1, 0]), ([0, -2.5, 2], [0, 1, 0])
+    walls: list[tuple[list[float], list[float]]] = [
+        ([3, 2, 2], [-1, 0, 0]),
+        ([-3, 2, 2], [1, 0, 0]),
+        ([0, 4.5, 2], [0, -1, 0]),
+        ([0, -2.5, 2], [0, 1, 0]),
+    ]
     scene: dict[str, Any] = {f"wall{number}": plate(*wall, 0.05) for number, wall in enumerate(walls)}
     scene |= {"floor": plate([0, 0, 0], [0, 0, 1], 0.05), "surface": plate([0, 0, 4], [0, 0, -1], 0.05)}
     for number, at in enumerate(([-0.4, 3.0, 0.15], [0.3, 3.5, 0.15], [0.7, 2.8, 0.15])):

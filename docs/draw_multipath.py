@@ -26,7 +26,7 @@ SPAN_DB = 60.0
 
 POSE = [0.3, -1.5, 1.2, math.radians(8), 0, math.radians(12)]
 MIRRORS = {"surface": (-1.0, 0.0), "back": (0.7, 2e-5), "starboard": (0.7, 2e-5)}
-PLATES = {
+PLATES: dict[str, tuple[list[float], list[float]]] = {
     "floor": ([0, 0, 0], [0, 0, 1]),
     "surface": ([0, 0, 4], [0, 0, -1]),
     "back": ([0, 4.5, 2], [0, -1, 0]),
