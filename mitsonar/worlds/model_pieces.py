@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import struct
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -61,9 +60,13 @@ class Piece:
     picture: bytes | None = None
 
     def moved(self, turn: NDArray[np.float64], shift: NDArray[np.float64]) -> Self:
-        """Return the geometry with vertices ``turn @ v - shift``; where ``turn`` mirrors, its triangles keep their fronts."""
+        """Return the geometry with vertices ``turn @ v - shift``. Where ``turn`` mirrors, triangles keep their fronts."""
         faces = self.faces[:, ::-1] if np.linalg.det(turn) < 0 else self.faces
         return replace(self, vertices=self.vertices @ turn.T - shift, faces=faces)
+
+    def uniform(self, reflectivity: float) -> Self:
+        """Return the geometry with one reflectivity, without picture."""
+        return replace(self, reflectivity=np.full(len(self.faces), reflectivity), uv=None, picture=None)
 
 
 def reflectivity_of(reflectivity: str | float) -> str | float:
