@@ -52,9 +52,9 @@ class RefusedError(Exception):
 
 def main() -> None:
     """Read the stage that standard input asks for; print ``{"error": ...}`` where it cannot be read."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    for kind, most in ((resource.RLIMIT_AS, MEMORY), (resource.RLIMIT_CPU, SECONDS), (resource.RLIMIT_CORE, 0)):
+        known = [limit for limit in resource.getrlimit(kind) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(kind, (min([most, *known]), min([most, *known])))
     asked = json.loads(sys.stdin.read())
     try:
         check_layers(asked["path"], [Path(root) for root in asked["roots"]])
