@@ -3,8 +3,8 @@
     python benchmarks/bench_environments.py [--envs 64] [--steps 10]
     python benchmarks/bench_environments.py --quick            # 8 environments, 2 steps
 
-Frames a second of `SonarVectorEnv`, which steps all environments in one launch, and of `SonarEnv`, one step for each; medians
-of the rounds, the two in turn; both count their clearance rays.
+Frames a second of `SonarVectorEnv`, which steps all environments in one launch, and of `SonarEnv`, one step for each;
+medians of the rounds, the two in turn; both count their clearance rays.
 """
 
 from __future__ import annotations
