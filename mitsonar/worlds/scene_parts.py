@@ -84,11 +84,13 @@ def rigid(matrix: Matrix) -> Matrix:
 
 
 def _box(size: Mapping[str, float]) -> trimesh.Trimesh:
-    return trimesh.creation.box((size["x"], size["y"], size["z"]))
+    made: trimesh.Trimesh = trimesh.creation.box((size["x"], size["y"], size["z"]))
+    return made
 
 
 def _sphere(size: Mapping[str, float]) -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(SUBDIVISIONS, size["radius"])
+    made: trimesh.Trimesh = trimesh.creation.icosphere(SUBDIVISIONS, size["radius"])
+    return made
 
 
 def _ellipsoid(size: Mapping[str, float]) -> trimesh.Trimesh:
@@ -97,7 +99,8 @@ def _ellipsoid(size: Mapping[str, float]) -> trimesh.Trimesh:
 
 
 def _cylinder(size: Mapping[str, float]) -> trimesh.Trimesh:
-    return trimesh.creation.cylinder(size["radius"], size["length"], SECTIONS)
+    made: trimesh.Trimesh = trimesh.creation.cylinder(size["radius"], size["length"], SECTIONS)
+    return made
 
 
 def _capsule(size: Mapping[str, float]) -> trimesh.Trimesh:

@@ -61,7 +61,7 @@ def main() -> None:
         stage = Usd.Stage.Open(asked["path"])
         arrays: dict[str, NDArray[Any]] = {}
         told = read_stage(stage, asked["collision"], arrays)
-        np.savez(sys.argv[1], **arrays)
+        np.savez(sys.argv[1], **arrays)  # type: ignore[arg-type]  # the stubs take a name for allow_pickle
     except RefusedError as error:
         told = {"error": str(error)}
     except Tf.ErrorException as error:
@@ -243,10 +243,9 @@ def _own_colours(
         if colour is not None and faces.size and faces.min() >= 0 and faces.max() < len(counts):
             colours[faces] = colour
     whole = _material_colour(prim)
-    if whole is None:
-        painted = _display_colours(prim, counts, corners, points)
-        whole = np.nan if painted is None else painted
-    colours = np.where(np.isnan(colours), whole, colours)
+    whole = _display_colours(prim, counts, corners, points) if whole is None else whole
+    if whole is not None:
+        colours = np.where(np.isnan(colours), whole, colours)
     return None if np.isnan(colours).all() else colours
 
 
