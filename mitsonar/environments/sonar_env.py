@@ -89,7 +89,7 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         reward = float(fleet.rewards(moved)[0])
         return _first(observed(fleet, moved.image, moved.altitude_m)), reward, ended, cut, told
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of the last ping's fan ``(rows, columns, 3)``, forward up; None before it, or without a mode."""
         if self.render_mode is None or self._image is None:
             return None
