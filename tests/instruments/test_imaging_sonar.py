@@ -38,6 +38,7 @@ DEFAULTS = {
     "pattern": None,
     "shading": "hann",
     "elevation_pattern": None,
+    "bounces": 1,
     "ping_groups": 1,
     "group_order": "interleaved",
     "group_interval_s": None,
