@@ -45,8 +45,10 @@ def beam_at(sonar: Sonar, bearing: DeviceArray) -> tuple[DeviceArray, DeviceArra
     inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
     beam = mi.UInt32(dr.select(inside, place, 0))
     if sonar.beam_width_deg is not None and sonar.model == "physical":
-        axes = mi.Float(sonar.bearing_rad.tolist())
-        inside &= dr.abs(bearing - dr.gather(mi.Float, axes, beam)) <= sonar.beam_width_rad / 2
+        part = (mi.Float(beam) + (0.5 - sonar.beams / 2)) * (2 / sonar.beams)  # a table would be no input of the launch
+        axis = part * half if sonar.beam_layout == "even" else dr.asin(part * math.sin(half))
+        away: DeviceArray = dr.abs(bearing - axis)
+        inside &= away <= sonar.beam_width_rad / 2
     return beam, inside
 
 

@@ -115,6 +115,20 @@ def test_a_ghost_of_another_bearing_is_heard_by_arrays_that_only_receive() -> No
     assert heard["two_way"].sum() < 1e-3 * heard["receive"].sum()
 
 
+@pytest.mark.parametrize("layout", ["even", "sine"])
+def test_beams_narrower_than_their_spacing_hear_their_width(layout: str) -> None:
+    """Half as wide: of light between plates both ends must lie in beams, so less than half is heard."""
+    loaded = scene(ground=floor(diffuse(0.2)), wall=plate((0, 5, 0), (0, -1, 0), half=3.0, bsdf=diffuse(0.2)))
+    pose = np.array([0, 0, 2.0, math.radians(25), 0, 0])
+    seen = []
+    for part in (1.0, 0.5):
+        width = part * SONAR.azimuth_fov_deg / SONAR.beams
+        sonar = SONAR.replace(beam_layout=layout, beam_width_deg=width)
+        one, two = (next(iter(Simulator(loaded, sonar.replace(bounces=n)).pings(pose))).levels.sum() for n in (1, 2))
+        seen.append((two - one) / one)
+    assert 0 < seen[1] < 0.7 * seen[0]
+
+
 def test_labels_are_those_of_one_reflection() -> None:
     loaded = scene(ground=floor(diffuse(0.2)), wall=plate((0, 5, 0), (0, -1, 0), half=3.0, bsdf=diffuse(0.2)))
     pose = np.array([0, 0, 2.0, math.radians(25), 0, 0])
