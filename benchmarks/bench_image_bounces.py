@@ -1,6 +1,6 @@
 """What a ping with two and with three reflections costs, in the time of one.
 
-    python benchmarks/bench_bounces.py [--json] [--quick] [--variant cuda_ad_mono]
+    python benchmarks/bench_image_bounces.py [--json] [--quick] [--variant cuda_ad_mono]
 
 Milliseconds of processor time of all threads, medians within one run; rows take turns. `objects`: the shipped scene, whose
 floor and bodies are rough. `tank`: the same bodies between four smooth walls below a flat surface; walls and surface are
