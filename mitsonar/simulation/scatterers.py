@@ -34,7 +34,7 @@ from mitsonar.simulation.lattice_points import Patches, SurfacePoints, lattice_p
 __all__ = ["Scatterers"]
 
 MOST = 2**26
-"""Largest number of points of a scene, 32 bytes each: place, normal, strength and phase."""
+"""Largest number of points of a scene, 36 bytes each: place, normal, strength, phase and shape."""
 
 A_BUCKET = 256
 """Points in a bucket, about: few enough to fit a field of view closely, enough to keep the buckets few."""
@@ -85,6 +85,7 @@ class Scatterers:
         normal: unit normal of the surface ``(points, 3)`` float32.
         strength: reflectivity times the area that a point represents, times |zeta|^2 ``(points,)`` float32 [m2].
         phase: of zeta ``(points,)`` float32, -pi..pi [rad].
+        shape: place in ``scene.shapes()`` of the shape that has the point ``(points,)`` int32.
         first: index of the first point of each bucket, and the number of points ``(buckets + 1,)``.
         one_sided: whether a bucket's points lie on closed bodies, visible from outside only ``(buckets,)``.
     """
@@ -93,6 +94,7 @@ class Scatterers:
     normal: NDArray[np.float32]
     strength: NDArray[np.float32]
     phase: NDArray[np.float32]
+    shape: NDArray[np.int32]
     first: NDArray[np.int64]
     one_sided: NDArray[np.bool_]
 
@@ -103,12 +105,13 @@ class Scatterers:
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
         """
-        parts, closed = [], []
+        parts, closed, shapes = [], [], []
         for number, shape in enumerate(scene.shapes()):
             if shape.bsdf() is not None:
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
                 parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
+                shapes.append(np.full(len(parts[-1].strength), number, np.int32))
         if not sum(map(len, closed)):
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
@@ -117,7 +120,8 @@ class Scatterers:
         place, normal, strength, phase = (np.concatenate(values) for values in zip(*parts, strict=True))
         one_sided = np.concatenate(closed)
         order, first = _buckets(place, np.where(one_sided, _side(normal), 0))
-        return cls(place[order], normal[order], strength[order], phase[order], first, one_sided[order[first[:-1]]])
+        points = (values[order] for values in (place, normal, strength, phase, np.concatenate(shapes)))
+        return cls(*points, first, one_sided[order[first[:-1]]])
 
     def __len__(self) -> int:
         return len(self.strength)
