@@ -141,10 +141,11 @@ class ChannelTracer:
 
         @dr.freeze
         def launch(index: mi.UInt32, scene: mi.Scene, table: mi.Float64, tables: DeviceArray) -> list[DeviceArray]:
-            direct = out + back == 0
-            link = (
-                LinkGeometry(self.sonar, receiver, table) if direct else MirroredLink(self.sonar, receiver, table, out, back)
-            )
+            link: LinkGeometry
+            if out + back == 0:
+                link = LinkGeometry(self.sonar, receiver, table)
+            else:
+                link = MirroredLink(self.sonar, receiver, table, out, back)
             received = self.source.received(link, index, scene, tables)
             values = [getattr(received, name) for name in wanted]
             dr.eval(values)
@@ -171,10 +172,16 @@ class _WorldScatterers:
         self.sonar = sonar
         self.scatterers: Scatterers
         self.stored: mi.Float
-        if like is not None and _points_of(like.sonar) == _points_of(sonar):
+        self.smooth: frozenset[int] | None = None
+        if mirrors is not None or sonar.direct:
+            places = (
+                [] if mirrors is None else np.flatnonzero((mirrors.reflection != 0) & (mirrors.roughness_m == 0)).tolist()
+            )
+            self.smooth = frozenset(places)
+        if like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth:
             self.scatterers, self.stored = like.scatterers, like.stored
         else:
-            self.scatterers = Scatterers.of(scene, sonar)
+            self.scatterers = Scatterers.of(scene, sonar, self.smooth)
             self.stored = self._rows()
         self.wavenumber = 2 * math.pi / sonar.wavelength_m
         self.roughness: mi.Float | None = None  # rms height of each point's mirror; below 0: it is no mirror

@@ -79,6 +79,8 @@ def facet_echoes(
 
     arrival, wavenumber = delay(middle), 2 * np.pi * carrier_hz / sound_speed
     phase = 2 * np.pi * carrier_hz * (delay(mirror.corners) - arrival[:, None])
+    # curvature raises the corners' mean; over the triangle it is a quarter of that
+    phase -= 0.75 * phase.mean(axis=1, keepdims=True)
     smooth = np.exp(-((wavenumber * mirror.roughness_m * total) ** 2) / 2)
     weight = wavenumber / (4 * np.pi) * mirror.reflection * smooth * total * twice / 2 / np.maximum(sent * received, 1e-18)
     return FacetEchoes(arrival, 1j * weight * phase_mean(phase), u[0], u[1], sent + received, cosines[0] * cosines[1] > 0)

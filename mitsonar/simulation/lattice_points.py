@@ -29,6 +29,14 @@ BEYOND = 1e-5
 """Part of a ray's length by which the next one begins behind a surface that was hit."""
 
 
+ROUNDING = 5e-6
+"""The same as a part of the coordinate, forty times its rounding: or a ray would meet a far, small shape without end."""
+
+
+GRAZING, STRIDE = 1e-4, 1000.0
+"""Cosine below which a ray lies within a surface, and the factor of the part above there."""
+
+
 class SurfacePoints(NamedTuple):
     """Points of a shape.
 
@@ -126,7 +134,8 @@ class _Search:
         if self.patches is not None and self.table is not None:
             amplitude *= patch_weight((p, q), bits, key, self.table, dr.width(self.table), self.patches.side_m)
         begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)  # from where the surface faces
-        a, skip = dr.full(mi.Float, begin, len(numbers)), way * BEYOND * (cells.ends[1] - cells.ends[0])
+        reach = max(BEYOND * (cells.ends[1] - cells.ends[0]), ROUNDING * max(abs(end) for end in cells.ends))
+        a, skip = dr.full(mi.Float, begin, len(numbers)), way * reach
         u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
         made: list[SurfacePoints] = []
         while True:
@@ -137,8 +146,13 @@ class _Search:
             if not len(going):
                 return made
             kept = mi.UInt32(padded(going.astype(np.uint32)))
-            p, q, amplitude, turn, at = (dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at))
-            a = at + skip
+            # a ray within a surface leaves it in few steps; such a surface has no points on this axis
+            grazing = dr.abs(pick(mi.UInt32(cells.axis), hit.n)[2]) < GRAZING
+            step = dr.select(grazing, mi.Float(skip * STRIDE), mi.Float(skip)) + dr.zeros(mi.Float, dr.width(at))
+            p, q, amplitude, turn, at, step = (
+                dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at, step)
+            )
+            a = at + step
             dr.eval(p, q, amplitude, turn, a)
 
     def _kept(

@@ -99,19 +99,27 @@ class Scatterers:
     one_sided: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, scene: mi.Scene, sonar: ChannelSonar) -> Scatterers:
+    def of(cls, scene: mi.Scene, sonar: ChannelSonar, smooth: frozenset[int] | None = None) -> Scatterers:
         """Place scatterers on a scene's shapes.
+
+        Args:
+            scene: any.
+            sonar: gives number and seed of the points.
+            smooth: places in the scene of perfect mirrors, which scatter nothing; where it is given there may be no points.
 
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
         """
         parts, closed, shapes = [], [], []
         for number, shape in enumerate(scene.shapes()):
-            if shape.bsdf() is not None:
+            if shape.bsdf() is not None and number not in (smooth or ()):
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
                 parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
                 shapes.append(np.full(len(parts[-1].strength), number, np.int32))
+        if not sum(map(len, closed)) and smooth is not None:
+            none = np.zeros((0, 3), np.float32)
+            return cls(none, none, none[:, 0], none[:, 0], np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, bool))
         if not sum(map(len, closed)):
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
@@ -151,6 +159,8 @@ class Scatterers:
             axes: :attr:`FieldOfView.axes` in the world ``(3, 3)``.
             field: shape of the field of view.
         """
+        if not len(self):
+            return np.zeros(0, np.uint32)
         blocks, buckets = self.spheres
         near = blocks.may_be_seen(np.arange(len(blocks.radius)), eye, axes, field)
         inner = (near[:, None] * A_BLOCK + np.arange(A_BLOCK)).ravel()
