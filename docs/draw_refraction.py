@@ -35,9 +35,7 @@ def main() -> None:
         for away in TABLE_M:
             x = np.array([float(away)])
             bend, error, depth = sag_m(x, gradient)[0], range_error_m(x, gradient)[0], speed_error_m(x, gradient, 5.0)[0]
-            print(
-                f"{gradient} 1/s, {away} m: {bend:.3f} m aside, range {1e3 * error:.3f} mm, deeper {1e3 * depth:.1f} mm"
-            )
+            print(f"{gradient} 1/s, {away} m: {bend:.3f} m aside, range {1e3 * error:.3f} mm, deeper {1e3 * depth:.1f} mm")
 
 
 def sag_m(range_m: NDArray[np.float64], gradient: float) -> NDArray[np.float64]:

@@ -33,10 +33,6 @@ ROUNDING = 5e-6
 """The same as a part of the coordinate, forty times its rounding: or a ray would meet a far, small shape without end."""
 
 
-GRAZING, STRIDE = 1e-4, 1000.0
-"""Cosine below which a ray lies within a surface, and the factor of the part above there."""
-
-
 class SurfacePoints(NamedTuple):
     """Points of a shape.
 
@@ -119,7 +115,9 @@ class _Search:
     """Follows rays through one shape."""
 
     def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None) -> None:
+        name = shape.id()
         self.scene: mi.Scene = mi.load_dict({"type": "scene", "shape": shape})
+        shape.set_id(name)  # Mitsuba renames it
         self.surfaces = Surfaces.of(self.scene)
         self.pitch, self.patches = pitch, patches
         self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED * patches.nu))
@@ -146,13 +144,8 @@ class _Search:
             if not len(going):
                 return made
             kept = mi.UInt32(padded(going.astype(np.uint32)))
-            # a ray within a surface leaves it in few steps; such a surface has no points on this axis
-            grazing = dr.abs(pick(mi.UInt32(cells.axis), hit.n)[2]) < GRAZING
-            step = dr.select(grazing, mi.Float(skip * STRIDE), mi.Float(skip)) + dr.zeros(mi.Float, dr.width(at))
-            p, q, amplitude, turn, at, step = (
-                dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at, step)
-            )
-            a = at + step
+            p, q, amplitude, turn, at = (dr.gather(mi.Float, value, kept) for value in (p, q, amplitude, turn, at))
+            a = at + skip
             dr.eval(p, q, amplitude, turn, a)
 
     def _kept(

@@ -109,10 +109,9 @@ class MirrorPaths:
         """Return which ways nothing blocks ``(n,)``, and their reflection coefficients ``(n,)``."""
         if length not in self.launches:
             self.launches[length] = _compile_open(length, self.wavenumber)
-        inputs = [image, rows.reshape(len(image), -1)]
+        inputs = [np.broadcast_to(heard_at, image.shape), image, rows.reshape(len(image), -1)]
         columns = [mi.Float64(padded(column)) for part in inputs for column in part.T]
-        place = mi.Float64([float(value) for value in heard_at])
-        seen, factor = replayed(self.launches[length], columns, place, self.scene)
+        seen, factor = replayed(self.launches[length], columns, self.scene)
         return np.broadcast_to(np.array(seen), len(image)), np.broadcast_to(np.array(factor, dtype=float), len(image))
 
     def _by_facets(self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets) -> EchoValues:
@@ -131,9 +130,10 @@ class MirrorPaths:
         middle = mirror.corners.mean(axis=1)
         normal = np.cross(mirror.corners[:, 1] - mirror.corners[:, 0], mirror.corners[:, 2] - mirror.corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-30)[:, None]
-        columns = [mi.Float(padded(column.astype(np.float32))) for part in (middle, normal) for column in part.T]
-        places = mi.Float([float(value) for value in table[:6]])
-        return np.broadcast_to(np.array(replayed(self.shadows, columns, places, self.scene)), len(middle))
+        places = (np.broadcast_to(table[start : start + 3], middle.shape) for start in (0, 3))
+        inputs = (middle, normal, *places)
+        columns = [mi.Float(padded(column.astype(np.float32))) for part in inputs for column in part.T]
+        return np.broadcast_to(np.array(replayed(self.shadows, columns, self.scene)), len(middle))
 
     def _tell(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
         """Note once where facets are too large for the integral."""
@@ -149,12 +149,11 @@ def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceAr
     """Record the launch that follows ways by ``length`` planes from a receiver to the transmitter."""
 
     @dr.freeze
-    def launch(columns: list[mi.Float64], place: mi.Float64, scene: mi.Scene) -> list[DeviceArray]:
-        count = dr.width(columns[0])
-        at = [dr.gather(mi.Float64, place, mi.UInt32(axis)) + dr.zeros(mi.Float64, count) for axis in range(3)]
+    def launch(columns: list[mi.Float64], scene: mi.Scene) -> list[DeviceArray]:
+        at = columns[:3]
         point = ScatteringPoints(mi.Point3f(*at), at, mi.Normal3f(0, 0, 0))
-        rows = [PlaneRow.of(columns[3 + (ROW + 1) * k : 3 + (ROW + 1) * (k + 1)]) for k in range(length)]
-        seen, factor = unfolded(scene, point, columns[:3], rows, wavenumber, dr.full(mi.Bool, True, count))
+        rows = [PlaneRow.of(columns[6 + (ROW + 1) * k : 6 + (ROW + 1) * (k + 1)]) for k in range(length)]
+        seen, factor = unfolded(scene, point, columns[3:6], rows, wavenumber, mi.Bool(True))
         dr.eval(seen, factor)
         return [seen, factor]
 
@@ -165,11 +164,11 @@ def _compile_shadows() -> Callable[..., DeviceArray]:
     """Record the launch that tests which facets two places see."""
 
     @dr.freeze
-    def launch(columns: list[mi.Float], places: mi.Float, scene: mi.Scene) -> DeviceArray:
-        at, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:])
-        seen = dr.full(mi.Bool, True, dr.width(columns[0]))
-        for start in (0, 3):
-            place = mi.Point3f(*(dr.gather(mi.Float, places, mi.UInt32(start + axis)) for axis in range(3)))
+    def launch(columns: list[mi.Float], scene: mi.Scene) -> DeviceArray:
+        at, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:6])
+        seen = mi.Bool(True)
+        for start in (6, 9):
+            place = mi.Point3f(*columns[start : start + 3])
             way = at - place
             distance = dr.norm(way)
             seen = seen & ~hidden(scene, at, normal, way / distance, distance, seen)

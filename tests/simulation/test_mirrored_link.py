@@ -99,11 +99,11 @@ def test_without_mirrors_nothing_changes() -> None:
 
 def test_a_screen_hides_a_ghost_or_the_target() -> None:
     """A screen below the surface's foot hides its ghosts; one in the direct way leaves the ghost there and back."""
-    above = plate((0.5, 4.0, 8.0), (0, -1, 0), half=1.9, bsdf=diffuse(0.0))
+    above = plate((0.5, 4.0, 8.0), (0.13, -1, 0.07), half=1.8, bsdf=diffuse(0.0))
     paths = ChannelSimulator(unmerged(**target(screen=above)), instrument(), mirrors={"surface": SURFACE}).paths(POSE)
     assert len(paths.by("surface-scatterer").delay_s) == len(paths.by("scatterer-surface").delay_s) == 0
     assert len(paths.by("scatterer").delay_s) == 1
-    below = plate((0.5, 4.0, 3.0), (0, -1, 0), half=3.0, bsdf=diffuse(0.0))
+    below = plate((0.5, 4.0, 3.0), (0.13, -1, 0.07), half=2.9, bsdf=diffuse(0.0))
     paths = ChannelSimulator(unmerged(**target(screen=below)), instrument(), mirrors={"surface": SURFACE}).paths(POSE)
     assert len(paths.by("scatterer").delay_s) == len(paths.by("surface-scatterer").delay_s) == 0
     assert len(paths.by("surface-scatterer-surface").delay_s) == 1
