@@ -25,7 +25,15 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial
 from mitsonar.plugins.material_laws import law_rows, material_of, mirror_rows, weighed
 
-__all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces", "facet_points", "reflectances_of", "reflectivity_at"]
+__all__ = [
+    "DEFAULT_REFLECTIVITY",
+    "Hit",
+    "Surfaces",
+    "facet_points",
+    "reflectances_of",
+    "reflectivity_at",
+    "registry_index",
+]
 
 DEFAULT_REFLECTIVITY = 0.5
 
@@ -99,7 +107,7 @@ class Surfaces:
             MitsonarError: a shape with several materials.
         """
         shapes = scene.shapes()
-        size = 1 + max((_registry_index(shape) for shape in shapes), default=0)
+        size = 1 + max((registry_index(shape) for shape in shapes), default=0)
         rows = [[-1, 0, -1, -1] for _ in range(size)]
         constant = [-1.0] * size
         facets: list[mi.Float] = []
@@ -109,7 +117,7 @@ class Surfaces:
         named: dict[str, list[str]] = {"approximated": [], "without": []}
         facet_count = corner_count = 0
         for number, shape in enumerate(shapes):
-            index = _registry_index(shape)
+            index = registry_index(shape)
             rows[index][2] = number
             if shape.bsdf() is None:  # an instance: Mitsuba evaluates the shapes of its group
                 continue
@@ -227,7 +235,8 @@ class Surfaces:
         return si
 
 
-def _registry_index(shape: mi.Shape) -> int:
+def registry_index(shape: mi.Shape) -> int:
+    """Return the number by which kernels know a shape: that of ``found.shape``."""
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(index[0])
 
