@@ -123,7 +123,8 @@ def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], flo
     keep = area > 0
     normal, corners, area = normal[keep] / area[keep, None], corners[keep], area[keep]
     size = max(1.0, float(np.abs(corners).max(initial=0)))
-    left, planes = np.ones(len(normal), dtype=bool), []
+    left = np.ones(len(normal), dtype=bool)
+    planes: list[tuple[NDArray[np.float64], float]] = []
     while left.any():
         if len(planes) == MOST_PLANES:
             return None

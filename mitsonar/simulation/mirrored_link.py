@@ -78,7 +78,8 @@ def unfolded(
         u = mi.Vector3f(*(axis / length(way) for axis in way))
         active = active & _meets(scene, mi.Point3f(*at), normal, u, row, active)
         normal = mi.Normal3f(*row.normal)
-        cosine = dr.abs(dr.dot(normal, u))
+        facing: DeviceArray = mi.Vector3f(*row.normal)
+        cosine = dr.abs(dr.dot(facing, u))
         factor = factor * mi.Float(row.reflection) * smooth_share(mi.Float(row.roughness_m), cosine, wavenumber)
         at, far = foot, row.image
     last = [a - b for a, b in zip(at, far, strict=True)]

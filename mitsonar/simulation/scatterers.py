@@ -128,8 +128,8 @@ class Scatterers:
         place, normal, strength, phase = (np.concatenate(values) for values in zip(*parts, strict=True))
         one_sided = np.concatenate(closed)
         order, first = _buckets(place, np.where(one_sided, _side(normal), 0))
-        points = (values[order] for values in (place, normal, strength, phase, np.concatenate(shapes)))
-        return cls(*points, first, one_sided[order[first[:-1]]])
+        of_shape, sided = np.concatenate(shapes)[order], one_sided[order[first[:-1]]]
+        return cls(place[order], normal[order], strength[order], phase[order], of_shape, first, sided)
 
     def __len__(self) -> int:
         return len(self.strength)
