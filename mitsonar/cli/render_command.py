@@ -183,6 +183,7 @@ def path_for(
     frame: str,
 ) -> Trajectory:
     """Return the poses that the options say."""
+    from mitsonar.instruments.ping_groups import frame_period_s
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import shipped_trajectory
@@ -205,7 +206,14 @@ def path_for(
     if begin is None:
         raise MitsonarError(f"the scene gives no pose: give one with --from ({SIX}), or --trajectory FILE.tum")
     if last is None:
-        return Trajectory.between(begin, begin, frames or 1, sonar.frame_rate_hz)
+        return Trajectory.between(begin, begin, _ends(sonar, frames or 1), 1 / frame_period_s(sonar))
     if frames is None or frames < 2:
         raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
-    return Trajectory.between(begin, Pose.from_degrees(last), frames, sonar.frame_rate_hz)
+    return Trajectory.between(begin, Pose.from_degrees(last), _ends(sonar, frames), 1 / frame_period_s(sonar))
+
+
+def _ends(sonar: Sonar, frames: int) -> int:
+    """Return the poses of a path that has so many frames; those of a head that turns are the sweeps between poses."""
+    from mitsonar.instruments.ping_groups import scans
+
+    return frames + 1 if scans(sonar) and frames > 1 else frames
