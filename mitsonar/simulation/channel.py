@@ -95,6 +95,9 @@ class ChannelSimulator:
     def __init__(self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None) -> None:
         self.sonar = sonar
         from mitsonar.simulation.channel_tracing import ChannelTracer
+        from mitsonar.simulation.moving_files import refuse_motion
+
+        refuse_motion(scene, "impulse responses")
 
         self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer)
         self.notes = self.tracer.notes
