@@ -111,5 +111,8 @@ def _run_sensor(
 def _told(one: Mounted) -> dict[str, Any]:
     """Return what tells a sensor again."""
     instrument = one.instrument
-    keys = instrument.model_dump(mode="json") if isinstance(instrument, Sonar | Sounder | ChannelSonar) else str(instrument)
-    return {"keys": keys, "mount": list(one.mount)}
+    if isinstance(instrument, Sonar | Sounder | ChannelSonar):
+        return {"keys": instrument.model_dump(mode="json"), "mount": list(one.mount)}
+    from mitsonar.simulation.camera import told_of
+
+    return {"keys": told_of(instrument), "mount": list(one.mount)}

@@ -14,7 +14,7 @@ from mitsonar.motion.moving_bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices, vehicle_rotation
 from mitsonar.simulation.moving_scene import SceneMotion, motion_in
 
-__all__ = ["CameraSimulator", "camera_of"]
+__all__ = ["CameraSimulator", "camera_of", "told_of"]
 
 PATH_DEPTH = 8
 """Bounces of light in a scene without an integrator of its own for cameras."""
@@ -83,6 +83,13 @@ class CameraSimulator:
                 yield picture[..., 0] if grey and picture.ndim == 3 else picture
         finally:
             _turn(self.camera, place)  # a scene's camera stays where the scene has it
+
+
+def told_of(camera: mi.Sensor) -> dict[str, str]:
+    """Return what tells a camera again, but for its place."""
+    values = mi.traverse(camera)
+    told = {name: str(values[name]) for name in values.keys() if not name.endswith("to_world")}  # noqa: SIM118  no dict
+    return told | {"type": type(camera).__name__}
 
 
 def _turn(camera: mi.Sensor, to_world: mi.Transform4f) -> None:

@@ -12,7 +12,7 @@ from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.simulation.camera import CameraSimulator
+from mitsonar.simulation.camera import CameraSimulator, told_of
 from mitsonar.simulation.render_run import SIMULATORS
 from mitsonar.simulation.variant import current_variant
 
@@ -53,7 +53,7 @@ def run_camera(
     Raises:
         MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
     """
-    asked = {**origin, "variant": current_variant(), "camera": str(simulator.camera), "frames": len(flown)}
+    asked = {**origin, "variant": current_variant(), "camera": told_of(simulator.camera), "frames": len(flown)}
     asked |= {"samples": simulator.samples, "frame": frame}
     asked["poses_sha256"] = digest(flown.poses.tobytes(), flown.time_s.tobytes())
     run = RunDirectory.begin(folder, PHOTOGRAPHS, asked, resume=resume, overwrite=overwrite)
