@@ -78,16 +78,21 @@ class CameraSimulator:
                 if self.motion is not None:
                     _place(self.scene, self.motion, float(now))
                 _turn(self.camera, mi.Transform4f(to_world_matrices(pose)[0].tolist()))
-                film = mi.render(self.scene, sensor=self.camera, integrator=self.integrator, spp=self.samples, seed=number)
-                picture = np.array(mi.util.convert_to_bitmap(film))
+                picture = self._picture(number)
                 yield picture[..., 0] if grey and picture.ndim == 3 else picture
         finally:
             _turn(self.camera, place)  # a scene's camera stays where the scene has it
 
+    def _picture(self, number: int) -> NDArray[np.uint8]:
+        """Render the scene as it is now; ``number`` seeds the noise of rendering."""
+        module: Any = mi  # its types lack conversions of seeds and films
+        film = module.render(self.scene, sensor=self.camera, integrator=self.integrator, spp=self.samples, seed=number)
+        return np.array(module.util.convert_to_bitmap(film))
+
 
 def told_of(camera: mi.Sensor) -> dict[str, str]:
     """Return what tells a camera again, but for its place."""
-    values = mi.traverse(camera)
+    values: Any = mi.traverse(camera)
     told = {name: str(values[name]) for name in values.keys() if not name.endswith("to_world")}  # noqa: SIM118  no dict
     return told | {"type": type(camera).__name__}
 
@@ -123,7 +128,7 @@ def _with_instances(scene: mi.Scene, motion: SceneMotion) -> mi.Scene:
 
 def _place(scene: mi.Scene, motion: SceneMotion, time_s: float) -> None:
     """Move the instances, and the vertices of what deforms, to where they are at a time [s]."""
-    values = mi.traverse(scene)
+    values: Any = mi.traverse(scene)
     for one in motion.deformed:
         group = f"group{motion.numbers[one.mesh.id()]}."
         (key,) = [key for key in values.keys() if key.startswith(group) and key.endswith("vertex_positions")]  # noqa: SIM118

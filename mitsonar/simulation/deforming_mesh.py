@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -60,7 +62,7 @@ class DeformingMesh:
             return
         vertices = self.vertices(time_s)
         assert self.scene is not None
-        values = mi.traverse(self.scene)
+        values: Any = mi.traverse(self.scene)  # its types lack the keys
         (name,) = [key for key in values.keys() if key.endswith("vertex_positions")]  # noqa: SIM118  no dict
         values[name] = mi.Float(vertices.ravel().tolist())
         values.update()
@@ -79,6 +81,6 @@ def _copied(mesh: mi.Mesh) -> mi.Mesh:
     new.update()
     if mesh.has_attribute("face_id")[0]:
         numbers = mesh.attribute_buffer("face_id")
-        made.add_attribute("face_id", dr.width(numbers) // mesh.face_count(), np.array(numbers))
+        made.add_attribute("face_id", dr.width(numbers) // mesh.face_count(), np.array(numbers).tolist())
     made.set_id(mesh.id())
     return made

@@ -173,7 +173,7 @@ class SceneMotion:
         Bodies that deform have one shape at all of them: that of the middle.
         """
         for one in self.deformed:
-            one.deform(float(np.mean(time_s)))
+            one.deform(float(np.asarray(time_s, dtype=float).mean()))
             place = list(self.numbers).index(one.mesh.id())
             self._spheres[place] = _sphere(one.mesh)
             dr.make_opaque(self._spheres[place])
