@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from mitsonar.simulation.scene import load_scene
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
+    from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
 
 __all__ = [
     "ChannelSimulator",
@@ -99,8 +100,10 @@ __all__ = [
     "load_sounder",
     "load_vehicle",
     "make_dataset",
+    "net_mesh",
     "odometry",
     "open_recording",
+    "particle_mesh",
     "range_rates",
     "save_sensors",
     "simulated_sensors",
@@ -148,7 +151,9 @@ _MODULES = {
     "load_sounder": "instruments.named_sounders",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",
+    "net_mesh": "worlds.water_bodies",
     "odometry": "mapping.odometry",
+    "particle_mesh": "worlds.water_bodies",
     "open_recording": "recordings.open_recording",
     "range_rates": "records.range_rates",
     "save_sensors": "mapping.sensor_files",
