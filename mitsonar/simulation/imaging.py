@@ -88,7 +88,7 @@ class Simulator:
         check_timed(sonar, self.motion, views, mirrors)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
-            bodies = self.motion.bodies if self.motion else {}
+            bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}
             self.grouped = GroupedPings(Simulator(scene, one, moving=bodies, rays_per_launch=rays_per_launch), sonar)
         self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
         self.former = expected_former(one, views)

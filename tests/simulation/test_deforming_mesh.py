@@ -49,7 +49,7 @@ def test_a_ball_that_grows_comes_nearer(balls: list[Path], changes: dict[str, An
     sonar = SONAR.replace(range_bins=700, **changes)
     growing = Deforming(fixed(Pose(0, AWAY_M, 0)), load_meshes(balls, 1.0, loop=False))
     scene = separate(ball={"type": "ply", "filename": str(balls[0])}, floor=floor(half=0.1))
-    path = Trajectory(np.zeros((5, 6)), np.arange(5) * 0.5)
+    path = Trajectory(np.zeros((5, 6)), np.linspace(0, 2, 5))
     frames = Simulator(scene, sonar, moving={"ball": growing}).render(path, gain=1e3, labels=not changes).to_linear()
     found = [first_range(image, frames.range_m) for image in frames.image]
     np.testing.assert_allclose(found, AWAY_M - 0.5 - 0.5 * path.time_s, atol=tolerance)
