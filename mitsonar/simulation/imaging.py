@@ -16,6 +16,7 @@ from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.ping_groups import TimedPath, timed_path
+from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
@@ -46,7 +47,7 @@ class Simulator:
         views: makes the images of a ping from its echoes; default: one, of all of them.
         mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
             materials (model ``coherent``); default: none.
-        moving: trajectories, or their files, by the ids of the shapes that follow them (docs/guides/moving.md).
+        moving: trajectories, or their files, by the shapes' ids (docs/guides/moving.md); default: as the shapes say.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -83,11 +84,12 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar = sonar
-        check_timed(sonar, moving, views, mirrors)
         self.motion = motion_in(scene, moving)
+        check_timed(sonar, self.motion, views, mirrors)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
-            self.grouped = GroupedPings(Simulator(scene, one, moving=moving, rays_per_launch=rays_per_launch), sonar)
+            bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}
+            self.grouped = GroupedPings(Simulator(scene, one, moving=bodies, rays_per_launch=rays_per_launch), sonar)
         self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
         self.former = expected_former(one, views)
         traced = one if self.former is None else self.former.traced
@@ -96,7 +98,8 @@ class Simulator:
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        self.pings_per_launch = max(1, rays_per_launch // max(traced.rays, cells))
+        deforms = self.motion is not None and bool(self.motion.deformed)  # a launch has one shape of each body
+        self.pings_per_launch = 1 if deforms else max(1, rays_per_launch // max(traced.rays, cells))
         self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
@@ -156,9 +159,10 @@ class Simulator:
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._compile(*key)
+        scene = self.tracer.scene_at(time_s)  # first: bodies may deform, and the inputs are of their normals
         inputs = self.tracer.inputs(poses, numbers)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
-        height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables)
+        height, made = replayed(self._launches[key], scene, *inputs, tables)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
         for view, (image, counters, truth) in zip(self.views, made, strict=True):
@@ -298,7 +302,6 @@ class Simulator:
         """Return images and labels as frames of the sonar; with labels go the names that these refer to."""
         shapes, objects = self.label_names(bool(labelled))
         time_s, beam_poses = timed.of_beams(self.sonar)
-        body_names, body_poses = self.bodies(timed.frames.time_s)
         return SonarFrames(
             image=image,
             range_m=self.sonar.range_m,
@@ -307,8 +310,7 @@ class Simulator:
             sonar=self.sonar,
             poses=timed.frames.poses,
             beam_poses=beam_poses,
-            body_poses=body_poses,
-            body_names=body_names,
+            **self.bodies(timed.frames.time_s).fields(),
             height_m=height_m,
             level=self.sonar.value_coding,
             level_scale=1 / gain,
@@ -326,9 +328,9 @@ class Simulator:
         objects = object_names_in(self.tracer.scene)
         return shape_names_in(self.tracer.scene), objects if self.motion is None else self.motion.object_names(objects)
 
-    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
-        """Return the names of the bodies that move and their poses at times ``(times, bodies, 6)``; None: all is still."""
-        return ((), None) if self.motion is None else (self.motion.bodies.names, self.motion.bodies.poses(time_s))
+    def bodies(self, time_s: ArrayLike) -> BodyStates:
+        """Return the names of the bodies that move, their poses and velocities at times; none where all is still."""
+        return BodyStates() if self.motion is None else self.motion.bodies.states(time_s)
 
     def step(
         self,
