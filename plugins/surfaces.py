@@ -13,6 +13,7 @@ Reflectivity of a surface is one number in 0..1; colours count by their luminanc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -25,7 +26,15 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial
 from mitsonar.plugins.material_laws import law_rows, material_of, mirror_rows, weighed
 
-__all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces", "facet_points", "reflectances_of", "reflectivity_at"]
+__all__ = [
+    "DEFAULT_REFLECTIVITY",
+    "Hit",
+    "Surfaces",
+    "facet_points",
+    "reflectances_of",
+    "reflectivity_at",
+    "registry_index",
+]
 
 DEFAULT_REFLECTIVITY = 0.5
 
@@ -92,14 +101,18 @@ class Surfaces:
     notes: list[str]
 
     @classmethod
-    def of(cls, scene: mi.Scene) -> Surfaces:
+    def of(cls, scene: mi.Scene, shapes: Sequence[mi.Shape] | None = None) -> Surfaces:
         """Return the tables of a scene. Materials have one reflectivity for all angles; see :meth:`heard_by`.
+
+        Args:
+            scene: that is traced.
+            shapes: that stand for those of the scene, in their order; default: they themselves.
 
         Raises:
             MitsonarError: a shape with several materials.
         """
-        shapes = scene.shapes()
-        size = 1 + max((_registry_index(shape) for shape in shapes), default=0)
+        shapes = scene.shapes() if shapes is None else shapes
+        size = 1 + max((registry_index(shape) for shape in shapes), default=0)
         rows = [[-1, 0, -1, -1] for _ in range(size)]
         constant = [-1.0] * size
         facets: list[mi.Float] = []
@@ -109,7 +122,7 @@ class Surfaces:
         named: dict[str, list[str]] = {"approximated": [], "without": []}
         facet_count = corner_count = 0
         for number, shape in enumerate(shapes):
-            index = _registry_index(shape)
+            index = registry_index(shape)
             rows[index][2] = number
             if shape.bsdf() is None:  # an instance: Mitsuba evaluates the shapes of its group
                 continue
@@ -141,6 +154,19 @@ class Surfaces:
         )
         dr.eval(tables.arrays())
         return tables
+
+    def turn_facets(self, mesh: mi.Mesh) -> None:
+        """Read the normals of a mesh anew: its vertices have moved. Reflectivities stay."""
+        first = int(self.shapes[4 * registry_index(mesh)])
+        if first < 0:
+            return
+        facet = dr.arange(mi.UInt32, mesh.face_count())
+        normal = facet_points(mesh, facet, mi.Point2f(1 / 3)).n
+        facets = mi.Float(self.facets)
+        for place, value in enumerate((normal.x, normal.y, normal.z)):
+            dr.scatter(facets, value, (facet + first) * 4 + place)
+        self.facets = facets
+        dr.eval(self.facets)
 
     def arrays(self) -> dict[str, DeviceArray]:
         """Return the tables by name: the inputs of a launch."""
@@ -227,7 +253,8 @@ class Surfaces:
         return si
 
 
-def _registry_index(shape: mi.Shape) -> int:
+def registry_index(shape: mi.Shape) -> int:
+    """Return the number by which kernels know a shape: that of ``found.shape``."""
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(index[0])
 

@@ -51,6 +51,10 @@ def impulse(
         list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3.")
     ] = None,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    mirrors: Annotated[
+        bool,
+        typer.Option("--mirrors", help="Paths by way of smooth materials; see docs/guides/impulse-responses.md."),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
 ) -> None:
@@ -66,7 +70,8 @@ def impulse(
     flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory, frame)
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
-    simulator = ChannelSimulator(loaded, sonar)
+    origin |= {"mirrors": True} if mirrors else {}
+    simulator = ChannelSimulator(loaded, sonar, mirrors="materials" if mirrors else None)
     with progress_bar("measuring", len(flown), "pings") as progress:
         report = run_impulse(
             simulator, flown, speeds, folder, origin=origin, overwrite=overwrite, resume=resume, progress=progress

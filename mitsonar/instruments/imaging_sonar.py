@@ -143,6 +143,9 @@ class Sonar(Instrument):
     group_interval_s: float | None = Field(
         None, ge=0, le=1e3, description="from the ping of a group to the next [s]; default: 2 range_max / sound_speed"
     )
+    group_overhead_s: float = Field(
+        0.0, ge=0, le=1e3, description="what a ping takes beyond its echo [s], where group_interval_s is not given"
+    )
     quality: Quality = Field(
         "standard", description="rays of `physical`: draft, standard or fine; `mitsonar presets` prints what each errs by"
     )

@@ -15,6 +15,7 @@ from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.ping_groups import TimedPath, timed_path
+from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
@@ -45,7 +46,7 @@ class Simulator:
         views: makes the images of a ping from its echoes; default: one, of all of them.
         mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
             materials (model ``coherent``, and ``physical`` with several ``bounces``); default: none.
-        moving: trajectories, or their files, by the ids of the shapes that follow them (docs/guides/moving.md).
+        moving: trajectories, or their files, by the shapes' ids (docs/guides/moving.md); default: as the shapes say.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -85,12 +86,13 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar = sonar
-        check_timed(sonar, moving, views, mirrors)
         self.motion = motion_in(scene, moving)
+        check_timed(sonar, self.motion, views, mirrors)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
+            bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}
             self.grouped = GroupedPings(
-                Simulator(scene, one, mirrors=mirrors, moving=moving, rays_per_launch=rays_per_launch), sonar
+                Simulator(scene, one, mirrors=mirrors, moving=bodies, rays_per_launch=rays_per_launch), sonar
             )
         self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
         self.former = expected_former(one, views)
@@ -101,7 +103,8 @@ class Simulator:
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        self.pings_per_launch = max(1, rays_per_launch // max(traced.rays, cells))
+        deforms = self.motion is not None and bool(self.motion.deformed)  # a launch has one shape of each body
+        self.pings_per_launch = 1 if deforms else max(1, rays_per_launch // max(traced.rays, cells))
         self.bounces = bounce_sums(scene, one, traced, mirrors)
         formed = None if self.former is None else one
         self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
@@ -164,10 +167,11 @@ class Simulator:
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._maker.compiled(*key)
+        scene = self.tracer.scene_at(time_s)  # first: bodies may deform, and the inputs are of their normals
         inputs = self.tracer.inputs(poses, numbers)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
         mirrors = None if self.bounces is None else self.bounces.tables_of_mirrors
-        height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables, mirrors)
+        height, made = replayed(self._launches[key], scene, *inputs, tables, mirrors)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
         for view, (image, counters, truth, single) in zip(self.views, made, strict=True):
@@ -259,7 +263,6 @@ class Simulator:
         """Return images and labels as frames of the sonar; with labels go the names that these refer to."""
         shapes, objects = self.label_names(bool(labelled))
         time_s, beam_poses = timed.of_beams(self.sonar)
-        body_names, body_poses = self.bodies(timed.frames.time_s)
         return SonarFrames(
             image=image,
             range_m=self.sonar.range_m,
@@ -268,8 +271,7 @@ class Simulator:
             sonar=self.sonar,
             poses=timed.frames.poses,
             beam_poses=beam_poses,
-            body_poses=body_poses,
-            body_names=body_names,
+            **self.bodies(timed.frames.time_s).fields(),
             height_m=height_m,
             level=self.sonar.value_coding,
             level_scale=1 / gain,
@@ -287,9 +289,9 @@ class Simulator:
         objects = object_names_in(self.tracer.scene)
         return shape_names_in(self.tracer.scene), objects if self.motion is None else self.motion.object_names(objects)
 
-    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
-        """Return the names of the bodies that move and their poses at times ``(times, bodies, 6)``; None: all is still."""
-        return ((), None) if self.motion is None else (self.motion.bodies.names, self.motion.bodies.poses(time_s))
+    def bodies(self, time_s: ArrayLike) -> BodyStates:
+        """Return the names of the bodies that move, their poses and velocities at times; none where all is still."""
+        return BodyStates() if self.motion is None else self.motion.bodies.states(time_s)
 
     def step(
         self,

@@ -42,6 +42,7 @@ DEFAULTS = {
     "ping_groups": 1,
     "group_order": "interleaved",
     "group_interval_s": None,
+    "group_overhead_s": 0.0,
     "focus_m": None,
     "scatterers_per_cell": 6.0,
     "scatterer_spacing_m": None,

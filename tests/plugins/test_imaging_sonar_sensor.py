@@ -83,6 +83,7 @@ def test_properties_are_those_of_a_sonar() -> None:
             "ping_groups": 5,
             "group_order": "sequential",
             "group_interval_s": 0.004,
+            "group_overhead_s": 0.001,
             "volume_db": -70.0,
             "near_glow_db": 30.0,
             "near_glow_m": 0.4,

@@ -1,0 +1,138 @@
+"""The flat mirrors of a scene as planes, and the others as facets, in double precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.simulation.mirror_parts import Mirrors
+
+__all__ = ["MOST_FACETS", "MOST_PLANES", "FlatMirrors", "MirrorFacets", "MirrorPlane", "flat_mirrors"]
+
+MOST_PLANES = 16
+"""Planes of a mesh, at most; one of more is a curved surface."""
+
+MOST_FACETS = 2_000_000
+"""Triangles of a curved mirror, at most: 1 ms of processor time a thousand and ping."""
+
+SAME_PLANE = 2e-6
+"""Facets are on one plane where normals and offsets (as a part of the mesh's size) differ by less."""
+
+
+@dataclass(frozen=True)
+class MirrorPlane:
+    """One plane of a mirror, ``normal . x = offset``; both sides reflect.
+
+    Attributes:
+        name: of the shape.
+        shape: its place in ``scene.shapes()``.
+        normal: unit vector ``(3,)``.
+        offset: [m].
+        reflection: coefficient V of pressures, -1 to 1.
+        roughness_m: rms height [m].
+    """
+
+    name: str
+    shape: int
+    normal: NDArray[np.float64]
+    offset: float
+    reflection: float
+    roughness_m: float
+
+
+@dataclass(frozen=True)
+class MirrorFacets:
+    """The triangles of a mirror that is no plane.
+
+    Attributes:
+        name: of the shape.
+        corners: ``(facets, 3, 3)`` [m].
+        reflection, roughness_m: see :class:`MirrorPlane`.
+    """
+
+    name: str
+    corners: NDArray[np.float64]
+    reflection: float
+    roughness_m: float
+
+
+@dataclass(frozen=True)
+class FlatMirrors:
+    """Mirrors of a scene: planes, facets of what is not flat, and notes on shapes that mirror nothing."""
+
+    planes: list[MirrorPlane] = field(default_factory=list)
+    facets: list[MirrorFacets] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
+    """Find the planes of a scene's mirrors: rectangles, disks, and meshes of up to :data:`MOST_PLANES` planes.
+
+    Args:
+        scene: any.
+        mirrors: parts of its shapes.
+
+    Raises:
+        MitsonarError: a curved mirror of more than :data:`MOST_FACETS` triangles.
+    """
+    found = FlatMirrors()
+    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+        assert mirrors is not None
+        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        if part[0] == 0:
+            continue
+        name = shape.id()
+        kind = shape.class_name()
+        if not isinstance(shape, mi.Mesh) and kind not in ("Rectangle", "Disk"):
+            found.notes.append(
+                f"shape {name} ({kind.lower()}) is curved and mirrors nothing in impulse responses: give it as a mesh"
+            )
+            continue
+        corners = _triangles(shape)
+        planes = _planes(corners)
+        if planes is not None:
+            found.planes.extend(MirrorPlane(name, place, normal, offset, *part) for normal, offset in planes)
+        elif len(corners) > MOST_FACETS:
+            raise MitsonarError(
+                f"the mirror {name} has {len(corners):,} triangles: at most {MOST_FACETS:,} are possible; give it fewer, or "
+                "make it flat"
+            )
+        else:
+            found.facets.append(MirrorFacets(name, corners, *part))
+    return found
+
+
+def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
+    """Return the triangles of a mesh ``(n, 3, 3)`` [m]; one triangle in the plane of a rectangle or disk."""
+    if isinstance(shape, mi.Mesh):
+        vertices = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)
+        return np.asarray(vertices[np.array(shape.faces_buffer(), dtype=np.int64).reshape(-1, 3)])
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=float).reshape(4, 4, -1)[..., 0]
+    middle, across, along = matrix[:3, 3], matrix[:3, 0], matrix[:3, 1]
+    return np.stack([middle, middle + across, middle + along])[None]
+
+
+def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]] | None:
+    """Return normal and offset of each plane that triangles lie in; None where there are more than :data:`MOST_PLANES`."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    keep = area > 0
+    normal, corners, area = normal[keep] / area[keep, None], corners[keep], area[keep]
+    size = max(1.0, float(np.abs(corners).max(initial=0)))
+    left = np.ones(len(normal), dtype=bool)
+    planes: list[tuple[NDArray[np.float64], float]] = []
+    while left.any():
+        if len(planes) == MOST_PLANES:
+            return None
+        largest = int(np.argmax(np.where(left, area, 0)))
+        chosen, offset = normal[largest], float(normal[largest] @ corners[largest].mean(axis=0))
+        flat = np.abs(corners @ chosen - offset).max(axis=1) < SAME_PLANE * size
+        along = np.abs(normal @ chosen) > 1 - 1e-4
+        planes.append((chosen, offset))
+        left &= ~(flat & along)
+        left[largest] = False
+    return planes
