@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import Array, floor, sphere
-from test_moving_scene import SONAR, fixed, separate
+from helpers import Array, floor, separate, sphere
+from test_moving_scene import SONAR, fixed
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.deforming import Deforming
