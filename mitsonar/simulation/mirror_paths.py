@@ -46,9 +46,9 @@ class MirrorPaths:
     def __init__(self, tracer: ChannelTracer) -> None:
         self.scene, self.sonar, self.registry = tracer.scene, tracer.sonar, tracer.registry
         self.facets = tracer.flat.facets
-        most = self.sonar.bounces if tracer.flat.planes else 0
-        lengths = range(0 if self.sonar.direct else 1, most + 1)
-        self.ways = {length: ways for length in lengths if (ways := mirror_ways(tracer.flat.planes, length))}
+        lengths = range(0 if self.sonar.direct else 1, self.sonar.bounces + 1)
+        planes = tracer.flat.reflecting
+        self.ways = {length: ways for length in lengths if (ways := mirror_ways(planes(length), length))}
         self.names = [way.name or "direct" for ways in self.ways.values() for way in ways]
         self.names += [mirror.name for mirror in self.facets]
         self.wavenumber = 2 * math.pi / self.sonar.wavelength_m
@@ -141,7 +141,7 @@ class MirrorPaths:
         if largest > allowed and not self.notes:
             self.notes.append(
                 f"the facets of the mirror {mirror.name} are {largest:.2g} m long where its echo comes from, more than half "
-                f" the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
+                f"the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
             )
 
 
