@@ -94,8 +94,9 @@ class FlatMirrors:
                 found.append(f"the mirror {mirror.name} is no plane with waves: it reflects once and makes no ghosts")
             else:
                 found.append(
-                    f"the mirror {mirror.name} is not flat: ways of several reflections have the coherent part of its mean "
-                    f"plane, with the loss of its waves' rms height, {mean.roughness_m:.2g} m; what waves scatter is left out"
+                    f"the mirror {mirror.name} is not flat: ways of several reflections have the coherent part of its "
+                    f"mean plane, with the loss of its waves' rms height, {mean.roughness_m:.2g} m; "
+                    "what waves scatter is left out"
                 )
         return found
 

@@ -47,8 +47,8 @@ class SeaState(NamedTuple):
 class SeaSurface(Family):
     """A sea surface over a flat seabed: wind waves of Pierson and Moskowitz's or JONSWAP's spectrum, or flat without wind.
 
-    Waves of four steps and more are the mesh. The rms height of shorter ones is the roughness of the mirror part. The surface is
-    the shape `surface`; it faces down and reflects -1. Surfaces of one seed at several times belong to one sea.
+    Waves of four steps and more are the mesh. The rms height of shorter ones is the roughness of the mirror part. The
+    surface is the shape `surface`; it faces down and reflects -1. Surfaces of one seed at several times belong to one sea.
     """
 
     wind_m_s: float = Field(5.0, ge=0, le=40, description="wind 10 m above the sea [m/s]; 0: a flat surface")
@@ -79,8 +79,8 @@ class SeaSurface(Family):
         if 2 * round(steps) ** 2 > MOST_TRIANGLES:
             least = self.size_m / math.isqrt(MOST_TRIANGLES // 2)
             raise ValueError(
-                f"a surface has at most {MOST_TRIANGLES:,} triangles, and {self.size_m:g} m in steps of {self.step_m:g} m would "
-                f"have {2 * round(steps) ** 2:,}: give a step_m of at least {least:.2g} m, or a smaller size_m"
+                f"a surface has at most {MOST_TRIANGLES:,} triangles, and {self.size_m:g} m in steps of {self.step_m:g} m "
+                f"would have {2 * round(steps) ** 2:,}: give a step_m of at least {least:.2g} m, or a smaller size_m"
             )
         try:
             peak = self.waves.peak_wavelength_m
@@ -88,8 +88,8 @@ class SeaSurface(Family):
             raise ValueError(str(error)) from None
         if SHORTEST * self.step_m > peak:
             raise ValueError(
-                f"step_m must be at most a quarter of the peak's wavelength, {peak / SHORTEST:.2g} m at a wind of {self.wind_m_s:g} "
-                f"m/s, or the mesh misses them: got {self.step_m:g} m"
+                f"step_m must be at most a quarter of the peak's wavelength, {peak / SHORTEST:.2g} m at a wind of "
+                f"{self.wind_m_s:g} m/s, or the mesh misses them: got {self.step_m:g} m"
             )
         return self
 
@@ -154,8 +154,8 @@ class SeaSurface(Family):
             "reflection: -1.0\n"
             f"roughness_m: {self.state.roughness_m:.4g}\n"
             "source: >-\n"
-            "  reflection: water against air. roughness_m: the waves that the mesh does not hold. mu (ours): what they take\n"
-            "  from the mirror is scattered by Lambert's law, all of it.\n"
+            "  reflection: water against air. roughness_m: the waves that the mesh does not hold. mu (ours): what they\n"
+            "  take from the mirror is scattered by Lambert's law, all of it.\n"
         )
 
     def build(self, seed: int) -> World:
@@ -164,8 +164,8 @@ class SeaSurface(Family):
         about = f"sea-surface, seed {seed}: flat"
         if self.wind_m_s > 0:
             about = (
-                f"sea-surface, seed {seed}, {self.time_s:g} s: {self.spectrum}, wind {self.wind_m_s:g} m/s, significant wave "
-                f"height {state.significant_height_m:.3g} m, peak at {state.peak_wavelength_m:.3g} m; in the mesh rms "
+                f"sea-surface, seed {seed}, {self.time_s:g} s: {self.spectrum}, wind {self.wind_m_s:g} m/s, significant "
+                f"wave height {state.significant_height_m:.3g} m, peak at {state.peak_wavelength_m:.3g} m; in the mesh rms "
                 f"{state.rms_m:.3g} m; waves below {state.shortest_m:g} m are its roughness, rms {state.roughness_m:.3g} m"
             )
         deep = min(2.0, self.water_m / 2)

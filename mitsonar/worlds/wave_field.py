@@ -1,8 +1,8 @@
 """One realisation of a sea: Gaussian heights on a grid at a time, of a spectrum and a seed.
 
-Waves of the grid's own wave vectors are summed by an FFT. The innermost 9 x 9 of these vectors, among them what is longer than
-the grid, are divided in three in each direction, again and again, until the rest has no energy. So long swells heave and tilt
-a small patch, and nothing repeats within it.
+Waves of the grid's own wave vectors are summed by an FFT. The innermost 9 x 9 of these vectors, among them what is longer
+than the grid, are divided in three in each direction, again and again, until the rest has no energy. So long swells heave
+and tilt a small patch, and nothing repeats within it.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     S(omega) = alpha g^2 omega^-5 exp(-5/4 (omega_p / omega)^4) gamma^r,  r = exp(-(omega - omega_p)^2 / (2 s^2 omega_p^2))
 
 with s = 0.07 below the peak and 0.09 above it. A Pierson-Moskowitz spectrum has gamma = 1 (Pierson and Moskowitz, J.
-Geophys. Res. 69 (1964), 5181-5190; Hasselmann et al., Measurements of wind-wave growth and swell decay during the Joint North
-Sea Wave Project, Deutsche Hydrogr. Z. A8 (12), 1973). Waves obey omega^2 = g k tanh(k d).
+Geophys. Res. 69 (1964), 5181-5190; Hasselmann et al., Measurements of wind-wave growth and swell decay during the Joint
+North Sea Wave Project, Deutsche Hydrogr. Z. A8 (12), 1973). Waves obey omega^2 = g k tanh(k d).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ GRAVITY = 9.81
 """[m/s^2]"""
 
 TO_19_5_M = 1.026
-"""Wind at 19.5 m, which Pierson and Moskowitz had, over wind at 10 m (Stewart, Introduction to Physical Oceanography, 16.4)."""
+"""Wind at 19.5 m, of Pierson and Moskowitz, over wind at 10 m (Stewart, Introduction to Physical Oceanography, 16.4)."""
 
 LOWEST = 0.3
 """Waves of less than this part of the peak's frequency have no energy: exp(-154)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_the_periodogram_falls_with_the_fourth_power() -> None:
     axis = 2 * np.pi * np.fft.fftfreq(count, STEP)
     k = np.hypot(axis[:, None], axis)
     edges = np.geomspace(1.5, 5.0, 9)
-    rings = [(k >= low) & (k < high) for low, high in zip(edges[:-1], edges[1:], strict=True)]
+    rings = [(k >= low) & (k < high) for low, high in itertools.pairwise(edges)]
     level = np.array([power[ring].mean() for ring in rings])
     wanted = np.array([(spectrum.density_of_wavenumber(k[ring]) / (2 * np.pi * k[ring])).mean() for ring in rings])
     assert level == pytest.approx(wanted, rel=0.12)
