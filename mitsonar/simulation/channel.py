@@ -125,6 +125,9 @@ class ChannelSimulator:
         from mitsonar.simulation.channel_tracing import ChannelTracer
         from mitsonar.simulation.mirror_parts import mirror_of
         from mitsonar.simulation.mirror_paths import MirrorPaths
+        from mitsonar.simulation.moving_files import refuse_motion
+
+        refuse_motion(scene, "impulse responses")
 
         parts = mirror_of(scene, mirrors) if mirrors else None
         _check_mirrors(sonar, parts is not None)

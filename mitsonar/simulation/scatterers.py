@@ -25,9 +25,9 @@ from scipy.sparse.csgraph import connected_components
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.plugins.bsdf_reflectance import reflectances_of, reflectivity_at
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
-from mitsonar.plugins.surfaces import reflectances_of, reflectivity_at
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.lattice_points import Patches, SurfacePoints, lattice_points, lattice_size
 

@@ -40,6 +40,8 @@ SLIPS = [
         "give the sonar noise_level_db",
     ),
     ("render flat_floor --mirrors", "--mirrors needs the model coherent"),
+    ("render flat_floor --set bounces=4", "bounces: input should be less than or equal to 3"),
+    ("render flat_floor --model thesis --set bounces=2", "the model thesis knows one reflection"),
     ("render flat_floor --model coherent --noise low", "give the sonar noise_level_db"),
     ("crlb flat_floor --segments stabord", "did you mean starboard?"),
     ("crlb flat_floor --vary hight_m=2", "did you mean height_m?"),
