@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, complaint
+from mitsonar.io.whole_files import write_whole
 from mitsonar.worlds.shapes import GRID_M
 from mitsonar.worlds.wave_field import SHORTEST, Sea, wave_heights
 from mitsonar.worlds.wave_spectrum import WaveSpectrum, jonswap, pierson_moskowitz
@@ -123,6 +125,28 @@ class SeaSurface(Family):
         held, left = self.waves.variance(shortest), self.waves.variance(0.0, shortest)
         height, peak = self.waves.significant_height_m, self.waves.peak_wavelength_m
         return SeaState(height, peak, shortest, math.sqrt(held), math.sqrt(left))
+
+    @classmethod
+    def create(cls, **fields: object) -> Self:
+        """Create a surface with these fields.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits, or numbers that do not fit each other.
+        """
+        try:
+            return cls(**fields)
+        except ValidationError as error:
+            raise MitsonarError(complaint(error, cls, "sea-surface")) from None
+
+    def save(self, path: str | Path, seed: int = 0, time_s: float | None = None) -> None:
+        """Write the surface of a seed as a PLY file, for a scene of one's own.
+
+        Args:
+            path: of the file; one that is there is replaced.
+            seed: of the waves.
+            time_s: its time [s]; default: that of the family.
+        """
+        write_whole(path, self.surface(seed, time_s).ply())
 
     def surface(self, seed: int, time_s: float | None = None) -> Mesh:
         """Build the surface of a seed.
