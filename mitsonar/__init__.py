@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from mitsonar.simulation.scene import load_scene
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
+    from mitsonar.worlds.sea_surface import SeaSurface
     from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
 
 __all__ = [
@@ -76,6 +77,7 @@ __all__ = [
     "Mounted",
     "Pose",
     "RenderedPairs",
+    "SeaSurface",
     "SensorNoise",
     "Simulator",
     "Sonar",
@@ -129,6 +131,7 @@ _MODULES = {
     "Mounted": "simulation.vehicle",
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered_pairs",
+    "SeaSurface": "worlds.sea_surface",
     "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.imaging_sonar",

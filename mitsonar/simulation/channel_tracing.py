@@ -75,9 +75,9 @@ class ChannelTracer:
         self.scene, self.sonar = scene, sonar
         surfaces = Surfaces.of(scene)
         self.flat: FlatMirrors = flat_mirrors(scene, mirrors)
-        self.notes = [*surfaces.notes, *self.flat.notes]
+        self.notes = [*surfaces.notes, *self.flat.notes_on(sonar.bounces)]
         shapes = scene.shapes()
-        self.registry = {plane.shape: registry_index(shapes[plane.shape]) for plane in self.flat.planes}
+        self.registry = {plane.shape: registry_index(shapes[plane.shape]) for plane in self.flat.reflecting(2)}
         self.ways = _scatterer_ways(self.flat, sonar.bounces)
         self.source: _WorldScatterers | _VehicleRays
         if sonar.model == "scatterers":
@@ -160,8 +160,8 @@ def _scatterer_ways(flat: FlatMirrors, bounces: int) -> list[ScattererWay]:
         ScattererWay(out, back)
         for mirrors in range(bounces)
         for there in range(mirrors + 1)
-        for out in mirror_ways(flat.planes, there)
-        for back in mirror_ways(flat.planes, mirrors - there)
+        for out in mirror_ways(flat.reflecting(bounces), there)
+        for back in mirror_ways(flat.reflecting(bounces), mirrors - there)
     ]
 
 

@@ -12,7 +12,7 @@ from mitsonar.simulation.mirror_planes import MirrorPlane
 
 __all__ = ["ROW", "MirrorWay", "mirror_ways", "mirrored_table"]
 
-ROW = 9
+ROW = 10
 """Numbers of a plane in :meth:`MirrorWay.rows`; the registry index of its shape is one more."""
 
 
@@ -44,9 +44,9 @@ class MirrorWay:
         return turn
 
     def rows(self, place: NDArray[np.float64], registry: dict[int, int]) -> NDArray[np.float64]:
-        """Return what tests of the way need ``(planes, 10)``.
+        """Return what tests of the way need ``(planes, 11)``.
 
-        A row holds the image before the plane, normal, offset, reflection, roughness and registry index of the shape.
+        A row holds the image before the plane, normal, offset, reflection, roughness, slab and registry index of the shape.
 
         Args:
             place: of the transducer [m].
@@ -55,7 +55,10 @@ class MirrorWay:
         images = self.images(place)
         return np.array(
             [
-                [*image, *plane.normal, plane.offset, plane.reflection, plane.roughness_m, registry[plane.shape]]
+                [
+                    *(*image, *plane.normal, plane.offset),
+                    *(plane.reflection, plane.roughness_m, plane.slab_m, registry[plane.shape]),
+                ]
                 for image, plane in zip(images[:-1], self.planes, strict=True)
             ]
         ).reshape(-1, ROW + 1)

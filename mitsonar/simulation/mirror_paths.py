@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -46,9 +47,9 @@ class MirrorPaths:
     def __init__(self, tracer: ChannelTracer) -> None:
         self.scene, self.sonar, self.registry = tracer.scene, tracer.sonar, tracer.registry
         self.facets = tracer.flat.facets
-        most = self.sonar.bounces if tracer.flat.planes else 0
-        lengths = range(0 if self.sonar.direct else 1, most + 1)
-        self.ways = {length: ways for length in lengths if (ways := mirror_ways(tracer.flat.planes, length))}
+        lengths = range(0 if self.sonar.direct else 1, self.sonar.bounces + 1)
+        planes = tracer.flat.reflecting
+        self.ways = {length: ways for length in lengths if (ways := mirror_ways(planes(length), length))}
         self.names = [way.name or "direct" for ways in self.ways.values() for way in ways]
         self.names += [mirror.name for mirror in self.facets]
         self.wavenumber = 2 * math.pi / self.sonar.wavelength_m
@@ -110,8 +111,9 @@ class MirrorPaths:
         if length not in self.launches:
             self.launches[length] = _compile_open(length, self.wavenumber)
         inputs = [np.broadcast_to(heard_at, image.shape), image, rows.reshape(len(image), -1)]
-        columns = [mi.Float64(padded(column)) for part in inputs for column in part.T]
-        seen, factor = replayed(self.launches[length], columns, self.scene)
+        table = np.concatenate(inputs, axis=1)
+        columns = mi.UInt32(padded(np.arange(len(image), dtype=np.uint32))), mi.Float64(padded(table.ravel()))
+        seen, factor = replayed(self.launches[length], *columns, self.scene)
         return np.broadcast_to(np.array(seen), len(image)), np.broadcast_to(np.array(factor, dtype=float), len(image))
 
     def _by_facets(self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets) -> EchoValues:
@@ -132,8 +134,9 @@ class MirrorPaths:
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-30)[:, None]
         places = (np.broadcast_to(table[start : start + 3], middle.shape) for start in (0, 3))
         inputs = (middle, normal, *places)
-        columns = [mi.Float(padded(column.astype(np.float32))) for part in inputs for column in part.T]
-        return np.broadcast_to(np.array(replayed(self.shadows, columns, self.scene)), len(middle))
+        number = mi.UInt32(padded(np.arange(len(middle), dtype=np.uint32)))
+        numbers = mi.Float(padded(np.concatenate(inputs, axis=1, dtype=np.float32).ravel()))
+        return np.broadcast_to(np.array(replayed(self.shadows, number, numbers, self.scene)), len(middle))
 
     def _tell(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
         """Note once where facets are too large for the integral."""
@@ -141,7 +144,7 @@ class MirrorPaths:
         if largest > allowed and not self.notes:
             self.notes.append(
                 f"the facets of the mirror {mirror.name} are {largest:.2g} m long where its echo comes from, more than half "
-                f" the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
+                f"the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
             )
 
 
@@ -149,7 +152,8 @@ def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceAr
     """Record the launch that follows ways by ``length`` planes from a receiver to the transmitter."""
 
     @dr.freeze
-    def launch(columns: list[mi.Float64], scene: mi.Scene) -> list[DeviceArray]:
+    def launch(number: mi.UInt32, table: mi.Float64, scene: mi.Scene) -> list[DeviceArray]:
+        columns = _columns(mi.Float64, table, number, 6 + (ROW + 1) * length)
         at = columns[:3]
         point = ScatteringPoints(mi.Point3f(*at), at, mi.Normal3f(0, 0, 0))
         rows = [PlaneRow.of(columns[6 + (ROW + 1) * k : 6 + (ROW + 1) * (k + 1)]) for k in range(length)]
@@ -160,11 +164,20 @@ def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceAr
     return launch
 
 
+def _columns(kind: Any, table: DeviceArray, number: mi.UInt32, count: int) -> list[DeviceArray]:
+    """Return the columns of a table of ``count`` of them.
+
+    One array, since a frozen launch is recorded anew for each alignment of each of its inputs.
+    """
+    return [dr.gather(kind, table, number * count + k) for k in range(count)]
+
+
 def _compile_shadows() -> Callable[..., DeviceArray]:
     """Record the launch that tests which facets two places see."""
 
     @dr.freeze
-    def launch(columns: list[mi.Float], scene: mi.Scene) -> DeviceArray:
+    def launch(number: mi.UInt32, table: mi.Float, scene: mi.Scene) -> DeviceArray:
+        columns = _columns(mi.Float, table, number, 12)
         at, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:6])
         seen = mi.Bool(True)
         for start in (6, 9):

@@ -19,6 +19,9 @@ MOST_PLANES = 16
 MOST_FACETS = 2_000_000
 """Triangles of a curved mirror, at most: 1 ms of processor time a thousand and ping."""
 
+STEEPEST, HIGHEST = 0.5, 0.1
+"""A mesh is a plane with waves where no facet leans by more than 60 deg, and rms heights stay below a part of its size."""
+
 SAME_PLANE = 2e-6
 """Facets are on one plane where normals and offsets (as a part of the mesh's size) differ by less."""
 
@@ -34,6 +37,7 @@ class MirrorPlane:
         offset: [m].
         reflection: coefficient V of pressures, -1 to 1.
         roughness_m: rms height [m].
+        slab_m: how far the shape's points lie off the plane, at most [m]; 0 where it is flat.
     """
 
     name: str
@@ -42,6 +46,7 @@ class MirrorPlane:
     offset: float
     reflection: float
     roughness_m: float
+    slab_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,11 +67,38 @@ class MirrorFacets:
 
 @dataclass(frozen=True)
 class FlatMirrors:
-    """Mirrors of a scene: planes, facets of what is not flat, and notes on shapes that mirror nothing."""
+    """Mirrors of a scene.
+
+    Attributes:
+        planes: of what is flat.
+        facets: of what is not flat.
+        means: mean planes of the latter, for ways of several reflections; their roughness is that of all waves.
+        notes: on shapes that mirror nothing.
+    """
 
     planes: list[MirrorPlane] = field(default_factory=list)
     facets: list[MirrorFacets] = field(default_factory=list)
+    means: list[MirrorPlane] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def reflecting(self, reflections: int) -> list[MirrorPlane]:
+        """Return the planes of ways of several reflections; of ways of one, which the facets have, the flat ones."""
+        return self.planes if reflections < 2 else self.planes + self.means
+
+    def notes_on(self, bounces: int) -> list[str]:
+        """Return what a user should know, given the largest number of reflections."""
+        found = list(self.notes)
+        for mirror in self.facets if bounces > 1 else []:
+            mean = next((plane for plane in self.means if plane.name == mirror.name), None)
+            if mean is None:
+                found.append(f"the mirror {mirror.name} is no plane with waves: it reflects once and makes no ghosts")
+            else:
+                found.append(
+                    f"the mirror {mirror.name} is not flat: ways of several reflections have the coherent part of its "
+                    f"mean plane, with the loss of its waves' rms height, {mean.roughness_m:.2g} m; "
+                    "what waves scatter is left out"
+                )
+        return found
 
 
 def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
@@ -103,6 +135,8 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             )
         else:
             found.facets.append(MirrorFacets(name, corners, *part))
+            mean = _mean_plane(name, place, corners, *part)
+            found.means.extend([] if mean is None else [mean])
     return found
 
 
@@ -114,6 +148,24 @@ def _triangles(shape: mi.Shape) -> NDArray[np.float64]:
     matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=float).reshape(4, 4, -1)[..., 0]
     middle, across, along = matrix[:3, 3], matrix[:3, 0], matrix[:3, 1]
     return np.stack([middle, middle + across, middle + along])[None]
+
+
+def _mean_plane(
+    name: str, place: int, corners: NDArray[np.float64], reflection: float, roughness_m: float
+) -> MirrorPlane | None:
+    """Return the plane through the middle of a mesh of waves; None where heights or slopes are too large for waves."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    weight = np.repeat(np.linalg.norm(normal, axis=1), 3)
+    points = corners.reshape(-1, 3)
+    middle = np.average(points, axis=0, weights=weight)
+    variances, axes = np.linalg.eigh(np.cov(points.T, aweights=weight, bias=True))
+    up = axes[:, 0]
+    steep = np.abs(normal @ up) < STEEPEST * np.linalg.norm(normal, axis=1)
+    height = float(np.sqrt(max(variances[0], 0.0)))
+    if steep.any() or height > HIGHEST * np.sqrt(variances[1]):
+        return None
+    slab = float(np.abs((points - middle) @ up).max())
+    return MirrorPlane(name, place, up, float(up @ middle), reflection, float(np.hypot(height, roughness_m)), slab)
 
 
 def _planes(corners: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], float]] | None:

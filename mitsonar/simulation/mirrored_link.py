@@ -28,6 +28,7 @@ class PlaneRow(NamedTuple):
         offset: of the plane [m].
         reflection: coefficient of pressures.
         roughness_m: rms height [m].
+        slab_m: how far the mirror's points lie off the plane, at most [m].
         registry: index of the shape.
     """
 
@@ -36,11 +37,12 @@ class PlaneRow(NamedTuple):
     offset: DeviceArray
     reflection: DeviceArray
     roughness_m: DeviceArray
+    slab_m: DeviceArray
     registry: DeviceArray
 
     @classmethod
     def of(cls, numbers: list[DeviceArray]) -> PlaneRow:
-        """Take the ten numbers of a row."""
+        """Take the eleven numbers of a row."""
         return cls(numbers[:3], numbers[3:6], *numbers[6:])
 
 
@@ -67,25 +69,28 @@ def unfolded(
         mirrors' reflection coefficients.
     """
     at, normal, far, factor = point.exact, point.normal, image, mi.Float(1)
+    slab: DeviceArray = mi.Float(0)  # of the mirror that a leg leaves; waves in it hide nothing
     for row in reversed(rows):
         above, below = (dot(row.normal, place) - row.offset for place in (at, far))
         size = dr.abs(at[0]) + dr.abs(at[1]) + dr.abs(at[2]) + 1
         # a point on the mirror itself has no way by it
-        active = active & (above * below < 0) & (dr.abs(above) > size * OFF_SURFACE)
+        active = active & (above * below < 0) & (dr.abs(above) > size * OFF_SURFACE + row.slab_m)
+        active = active & (dr.abs(below) > row.slab_m)
         part = above / (above - below)
         foot = [a + (b - a) * part for a, b in zip(at, far, strict=True)]
         way = [b - a for a, b in zip(at, foot, strict=True)]
         u = mi.Vector3f(*(axis / length(way) for axis in way))
-        active = active & _meets(scene, mi.Point3f(*at), normal, u, row, active)
+        active = active & _meets(scene, mi.Point3f(*at) + u * slab, normal, u, row, active)
         normal = mi.Normal3f(*row.normal)
         facing: DeviceArray = mi.Vector3f(*row.normal)
         cosine = dr.abs(dr.dot(facing, u))
         factor = factor * mi.Float(row.reflection) * smooth_share(mi.Float(row.roughness_m), cosine, wavenumber)
         at, far = foot, row.image
+        slab = mi.Float(row.slab_m) / cosine
     last = [a - b for a, b in zip(at, far, strict=True)]
     distance = length(last)
     u = mi.Vector3f(*(axis / distance for axis in last))
-    return active & ~hidden(scene, mi.Point3f(*at), normal, u, mi.Float(distance), active), factor
+    return active & ~hidden(scene, mi.Point3f(*at) - u * slab, normal, u, mi.Float(distance) - slab, active), factor
 
 
 def _meets(
@@ -100,7 +105,8 @@ def _meets(
     size = 1 + dr.abs(met.x) + dr.abs(met.y) + dr.abs(met.z)
     # a mesh may have several planes
     aside = dr.abs(dr.dot(mi.Vector3f(*row.normal), met) - mi.Float(row.offset))
-    return found.is_valid() & (index == mi.UInt32(row.registry)) & (aside < 4 * size * OFF_SURFACE)
+    near = 4 * size * OFF_SURFACE + mi.Float(row.slab_m)
+    return found.is_valid() & (index == mi.UInt32(row.registry)) & (aside < near)
 
 
 class MirroredLink(LinkGeometry):

@@ -28,13 +28,13 @@ def facets(half: float, cells: int) -> NDArray[np.float64]:
     return np.concatenate([np.stack(three, axis=-2).reshape(-1, 3, 3) for three in ((a, b, c), (a, c, d))])
 
 
-def echo(corners: NDArray[np.float64], height: float = 0.0) -> tuple[complex, FacetEchoes]:
+def echo(corners: NDArray[np.float64], height: float = 0.0, carrier: float = CARRIER) -> tuple[complex, FacetEchoes]:
     """Sum of all facets at the carrier, and the echoes."""
     from mitsonar.simulation.facet_integral import facet_echoes
     from mitsonar.simulation.mirror_planes import MirrorFacets
 
-    found = facet_echoes(MirrorFacets("waves", corners, -1.0, height), SENT_FROM, HEARD_AT, STILL, CARRIER, C)
-    return complex((found.amplitude * np.exp(-2j * np.pi * CARRIER * found.delay)).sum()), found
+    found = facet_echoes(MirrorFacets("waves", corners, -1.0, height), SENT_FROM, HEARD_AT, STILL, carrier, C)
+    return complex((found.amplitude * np.exp(-2j * np.pi * carrier * found.delay)).sum()), found
 
 
 def test_the_mean_phase_of_a_triangle_is_that_of_a_fine_sum() -> None:
@@ -80,3 +80,26 @@ def test_the_mean_field_of_random_heights_falls_as_rayleigh_says() -> None:
     loss = np.exp(-2 * (2 * np.pi * CARRIER / C * height * cosine) ** 2)
     assert abs(rough / total) == pytest.approx(loss, rel=0.03)
     assert abs(mean / total) == pytest.approx(loss, abs=4 * height * 4 * np.pi * CARRIER / C / np.sqrt(60) / 4)
+
+
+@pytest.mark.parametrize("step", [0.4, 0.5])
+def test_the_mean_field_of_a_sea_does_not_depend_on_what_its_mesh_holds(step: float) -> None:
+    """Two scales: waves of the mesh by Kirchhoff, shorter ones by the loss; together exp(-2 k^2 h^2 cos^2) of all.
+
+    150 seas of 2 m/s at 8 kHz, within three standard errors of 0.06: a loss of 0.41.
+    """
+    from mitsonar.worlds.sea_surface import SeaSurface
+
+    carrier, seeds = 8e3, 150
+    sea = SeaSurface(wind_m_s=2.0, size_m=16.0, step_m=step, spreading=0.0)
+    meshes = (sea.surface(seed) for seed in range(seeds))
+    flat, _ = echo(facets(8.0, round(16 / step)), carrier=carrier)
+    corners = ((mesh.vertices - (0, 0, sea.water_m))[mesh.faces] for mesh in meshes)
+    fields = np.array([echo(one, sea.state.roughness_m, carrier)[0] for one in corners]) / flat
+    cosine = 14.0 / np.linalg.norm(HEARD_AT * (1, 1, -1) - SENT_FROM)
+    height = sea.state.significant_height_m / 4
+    loss = np.exp(-2 * (2 * np.pi * carrier / C * height * cosine) ** 2)
+    error = fields.std() / np.sqrt(seeds)
+    assert error < 0.07
+    assert abs(fields.mean() - loss) < 3 * error
+    assert loss < 0.45
