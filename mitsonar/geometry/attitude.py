@@ -63,6 +63,7 @@ class Attitude:
         reason: why the given geometry is rejected; empty where it is not.
         even: whether first echoes show ground without relief.
         told_m: height over the ground as it was told [m]; None: it was not.
+        echoes_m: mean height under the steepest rays, by the first echoes [m]; None: they did not tell the height.
     """
 
     height_m: float
@@ -72,16 +73,12 @@ class Attitude:
     reason: str = ""
     even: bool = False
     told_m: float | None = None
+    echoes_m: float | None = None
 
     @property
     def floor_m(self) -> float:
         """Height over the floor, where the fan begins to light it [m]: as told, but there may be a rock straight below."""
         return self.height_m if self.told_m is None else max(self.told_m, self.height_m)
-
-    @property
-    def by_echoes(self) -> bool:
-        """Whether first echoes tell the height."""
-        return self.height_std_m < STD_GIVEN * self.height_m
 
     def ground(self, frames: SonarFrames) -> GroundGeometry:
         """Return the level ground that the cells of the frames show from this height and attitude."""
@@ -132,14 +129,19 @@ def attitude_of(
                 f"{name} needs height and pitch: the frames hold no height, and their window shows no first echoes; give "
                 f"{argument('height_m')}"
             )
-        return Attitude(measured.height_m, STD_MEASURED * measured.height_m, pitch, roll, even=measured.even)
+        return _measured(measured, pitch, roll, None)
     if measured is None:
         return Attitude(given, STD_GIVEN * given, pitch, roll)
     if abs(measured.height_m - given) > AGREEING * given:
         reason = f"first echoes tell a height of {measured.height_m:.2f} m, not {given:.2f} m: height or pitch is wrong"
         return Attitude(given, STD_GIVEN * given, pitch, roll, reason)
-    std = STD_MEASURED * measured.height_m
-    return Attitude(measured.height_m, std, pitch, roll, even=measured.even, told_m=given)
+    return _measured(measured, pitch, roll, given)
+
+
+def _measured(found: _FirstEchoes, pitch: float, roll: float, told_m: float | None) -> Attitude:
+    """Return the attitude whose height first echoes tell."""
+    std = STD_MEASURED * found.height_m
+    return Attitude(found.height_m, std, pitch, roll, even=found.even, told_m=told_m, echoes_m=found.mean_m)
 
 
 def _mean_lean(frames: SonarFrames) -> NDArray[np.float64] | None:
@@ -156,9 +158,10 @@ def _mean(values: NDArray[np.float64] | None) -> float | None:
 
 
 class _FirstEchoes(NamedTuple):
-    """Height from the first echoes [m], and whether the ground is even."""
+    """Height from the first echoes and the mean of theirs [m], and whether the ground is even."""
 
     height_m: float
+    mean_m: float
     even: bool
 
 
@@ -188,4 +191,4 @@ def _height_over_contrast(frames: SonarFrames, pitch: float, roll: float) -> _Fi
     height = float(drop.mean() - TOPS * (lowest - drop.mean()))
     if frames.sonar.vertical_pattern != "box" and high - low < EVEN_SKIRT * height:
         return None
-    return _FirstEchoes(height, bool(high - low < EVEN * height)) if height > 0 else None
+    return _FirstEchoes(height, float(drop.mean()), bool(high - low < EVEN * height)) if height > 0 else None
