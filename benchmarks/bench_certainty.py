@@ -94,7 +94,7 @@ def main() -> None:
         measure_kind(Path(folder), "far29", KINDS["far29"]._replace(scenes=1, pairs=2), "none", ["direct"], asked.seed)
 
 
-HEAD = """| set | noise | method | pairs | refused | RMSE, mm / mm / deg | median | nees, mean (95 %) | nees, median | reasons |
+HEAD = """| set | noise | method | pairs | invalid | RMSE (mm, mm, deg) | median | nees, mean (95 %) | median | reasons |
 |---|---|---|---|---|---|---|---|---|---|"""
 
 
