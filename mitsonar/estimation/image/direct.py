@@ -233,7 +233,9 @@ class Direct:
         apart = 0.0 if task.attitude.echoes_m is None else task.attitude.echoes_m - task.attitude.height_m
         # far motions match the ground between rocks, too: rocks look different from elsewhere
         unsure = replace(task.attitude, height_std_m=float(np.hypot(task.attitude.height_std_m, apart)))
-        model = FAR_MODEL * max(1.0, FAR_CELL / _cell_area(task))
+        # where beams and pulse spread, SPECKLE_MODEL widens covariances already
+        finer = FAR_CELL / _cell_area(task) if task.frames.sonar.beam_pattern == "box" else 1.0
+        model = FAR_MODEL * max(1.0, finer)
         return self._judged(replace(task, attitude=unsure), start, *found, model, {"start": named})
 
     def _judged(
