@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from mitsonar.datasets.response_pairs import ImpulsePairs
     from mitsonar.datasets.store import DataStore
     from mitsonar.datasets.torch_pairs import SonarPairs
+    from mitsonar.environments.sonar_env import SonarEnv
+    from mitsonar.environments.sonar_vector_env import SonarVectorEnv
     from mitsonar.errors import MitsonarError, MitsonarWarning
     from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
     from mitsonar.estimation.estimator import Estimate
@@ -70,8 +72,10 @@ __all__ = [
     "SensorNoise",
     "Simulator",
     "Sonar",
+    "SonarEnv",
     "SonarFrames",
     "SonarPairs",
+    "SonarVectorEnv",
     "Sounder",
     "SounderSimulator",
     "Soundings",
@@ -112,6 +116,8 @@ _MODULES = {
     "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.imaging_sonar",
+    "SonarEnv": "environments.sonar_env",
+    "SonarVectorEnv": "environments.sonar_vector_env",
     "SonarFrames": "records.sonar_frames",
     "SonarPairs": "datasets.torch_pairs",
     "Sounder": "instruments.sounder",

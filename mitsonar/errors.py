@@ -30,6 +30,8 @@ EXTRAS = {
     "trimesh": ("meshes", "worlds and models"),
     "collada": ("meshes", "reading a .dae model"),
     "lxml": ("meshes", "reading a .dae model"),
+    "pxr": ("usd", "reading USD"),
+    "gymnasium": ("rl", "environments"),
     "cv2": ("odometry", "estimating motion and laying mosaics"),
     "tifffile": ("odometry", "writing GeoTIFF"),
     "torch": ("learn", "networks, and reading data sets for them,"),

@@ -117,3 +117,12 @@ def mitsonar(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str])
         return Done(int(end.value.code or 0), *capfd.readouterr())
 
     return run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scenes_of_before_are_gone() -> None:
+    """Free the scenes of other files: each kernel with virtual calls holds the code of all plugins that are alive."""
+    if "drjit" in sys.modules:
+        from mitsonar.simulation.variant import release_memory
+
+        release_memory()

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import trimesh
 import yaml
+from foreign_scenes import make_sdf, make_urdf
 from helpers import HEARD, TINY, TINY_TRAINING, tiny_network, tiny_recipe, tiny_samples
 from mutations import Rng, changed_arrays, changed_bytes, changed_json, changed_text, changed_value, npz
 
@@ -430,6 +431,27 @@ def read_model(folder: Path) -> None:
     mesh_world(folder / (chosen.read_text() if chosen.exists() else "model.ply"), floor=False)
 
 
+# ---------------------------------------------------------------- scenes of other simulators
+
+
+def make_foreign(folder: Path) -> None:
+    make_urdf(folder)
+    make_sdf(folder)
+
+
+def spoil_sdf(rng: Rng, folder: Path) -> None:
+    spoil_file(str(rng.choice(["harbour.sdf", "buoy/buoy.sdf", "buoy/model.config"])), changed_text)(rng, folder)
+
+
+def read_foreign(path: Path) -> None:
+    from mitsonar.worlds.imported_world import imported_world
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        world = imported_world(path, joints={"shoulder": 0.5} if path.suffix == ".urdf" else {"hinge": 0.5})
+    assert all(np.isfinite(mesh.vertices).all() for mesh in world.meshes)
+
+
 # ---------------------------------------------------------------- recordings
 
 
@@ -513,6 +535,8 @@ READERS: dict[str, Reader] = {
     "checkpoint": Reader(make_checkpoint, spoil_checkpoint, read_checkpoint),
     "mesh of a scene": Reader(make_meshes, spoil_mesh, read_meshes),
     "user's model": Reader(make_meshes, spoil_model, read_model),
+    "URDF": Reader(make_foreign, spoil_file("crane.urdf", changed_text), lambda folder: read_foreign(folder / "crane.urdf")),
+    "SDF": Reader(make_foreign, spoil_sdf, lambda folder: read_foreign(folder / "harbour.sdf")),
     "trajectory": Reader(make_tum, spoil_file("path.tum", changed_text), read_tum),
     "echoes": Reader(make_exr, spoil_file("e.exr", changed_bytes), read_exr),
 }

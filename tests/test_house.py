@@ -35,6 +35,7 @@ ROOMS = (
     "mapping",
     "exports",
     "live",
+    "environments",
     "training",
     "cli",
     "__main__",

@@ -56,6 +56,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "mosaic": {**GEOMETRY, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
     "compare": {"height_m": "NAME:height_m=METRES", "pitch_rad": "NAME:pitch_deg=DEGREES"},
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
+    "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},
     "reproduce": {"minutes": "--minutes"},
 }
 """By command: the option for an argument that a message names (:func:`mitsonar.errors.argument`)."""

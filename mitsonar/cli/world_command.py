@@ -48,6 +48,7 @@ class _Families(TyperGroup):
         for name, family in FAMILIES.items():
             app.command(name, help=inspect.cleandoc(family.__doc__ or ""))(_command(name, family))
         app.command("mesh")(mesh)
+        app.command("import")(import_scene)
         return with_plain_brackets(typer.main.get_command(app))
 
     def list_commands(self, ctx: Click) -> list[str]:
@@ -143,6 +144,63 @@ def mesh(
     if not 0.05 <= world.size_m <= 500:
         warn(f"the model is {world.size_m:.3g} m large: --scale is the unit of the file in metres, 0.001 for millimetres")
     _write(world, out)
+
+
+@answered
+def import_scene(
+    file: Annotated[Path, typer.Argument(help="Scene: urdf, sdf, world, usd, usda, usdc or usdz.")],
+    out: Out,
+    joint: Annotated[
+        list[str] | None, typer.Option("--joint", help="NAME=VALUE of a joint [rad, m]; others are at 0 (URDF, SDF).")
+    ] = None,
+    search: Annotated[
+        list[Path] | None,
+        typer.Option("--search", help="Folder that holds models and packages; files elsewhere are refused."),
+    ] = None,
+    collision: Annotated[bool, typer.Option("--collision", help="Collision shapes in place of visual ones.")] = False,
+    reflectivity: Annotated[
+        str, typer.Option(help="Reflectivity from diffuse colours: luminance or red; or a number 0..1.")
+    ] = "luminance",
+    material: Annotated[
+        list[str] | None, typer.Option("--material", help="NAME=MATERIAL of a link, model or prim: hull=steel.")
+    ] = None,
+    own_axes: Annotated[
+        list[str] | None,
+        typer.Option("--own-axes", help="A link, model or prim to write about the origin: it follows --moving NAME=FILE."),
+    ] = None,
+    seabed_z: Annotated[float | None, typer.Option(help="Add a seabed of random cells at this height [m].")] = None,
+) -> None:
+    """Make a scene from one of another simulator: Gazebo (SDF), ROS (URDF), Isaac Sim (USD). Coordinates stay."""
+    from mitsonar.worlds.imported_world import imported_world
+
+    world = imported_world(
+        file,
+        joints=_joint_values(joint or []),
+        search=search or (),
+        collision=collision,
+        reflectivity=reflectivity,
+        materials=_pairs(material or [], "--material", "NAME=MATERIAL"),
+        own_axes=own_axes or (),
+        seabed_z=seabed_z,
+    )
+    _write(world, out)
+    say(f"shapes: {', '.join(mesh.shape_id or mesh.name for mesh in world.meshes[:20])}")
+
+
+def _pairs(pairs: list[str], option: str, form: str) -> dict[str, str]:
+    """Return what an option that is given several times says, by name; a name may hold ``=``, a value may not."""
+    for pair in pairs:
+        if not all(pair.rpartition("=")):
+            raise MitsonarError(f"{option} takes {form}: got {pair!r}")
+    return {name: value for name, _, value in (pair.rpartition("=") for pair in pairs)}
+
+
+def _joint_values(pairs: list[str]) -> dict[str, float]:
+    """Return the values of joints that --joint says."""
+    try:
+        return {name: float(value) for name, value in _pairs(pairs, "--joint", "NAME=VALUE").items()}
+    except ValueError:
+        raise MitsonarError(f"--joint takes NAME=VALUE, a number in rad or m: got {', '.join(pairs)!r}") from None
 
 
 def _write(world: World, out: Path) -> None:

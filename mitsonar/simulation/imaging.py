@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mitsonar.simulation.mirror_parts import Mirroring
     from mitsonar.simulation.tracing import Tracer
 from mitsonar.simulation.labels import labels_above, labels_of
-from mitsonar.simulation.ping_moments import GroupedPings, check_timed, moments_of, sonar_of_one_ping
+from mitsonar.simulation.ping_moments import FirstPing, GroupedPings, check_timed, moments_of, sonar_of_one_ping
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image
 from mitsonar.simulation.tally import Tally
 
@@ -102,14 +102,14 @@ class Simulator:
         self.gain: float | None = None
 
     def pings(
-        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+        self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
         """Levels of consecutive pings in the first view; see :meth:`render_views`."""
         for looks in self.render_views(poses, first=first, labels=labels, time_s=time_s):
             yield looks[0]
 
     def render_views(
-        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+        self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[list[RenderedPings]]:
         """Levels of consecutive pings, in batches, one of each view.
 
@@ -118,51 +118,51 @@ class Simulator:
         Args:
             poses: of the sonar ``(frames, 6)`` x, y, z [m], pitch, roll, heading [rad]; of each group of beams that pings by
                 itself ``(frames, groups, 6)``.
-            first: number of the first ping.
+            first: number of the first ping, or the number of each.
             labels: per-pixel truth as well.
             time_s: of the poses [s]; default: their number / ``frame_rate_hz``. Bodies that move are where they are then.
         """
-        table, time = moments_of(self.sonar, poses, time_s, first)
+        table, time, numbers = moments_of(self.sonar, poses, time_s, first)
         if self.grouped is not None:
-            for pings in self.grouped.pings(table, time, first, labels):
+            for pings in self.grouped.pings(table, time, numbers, labels):
                 yield [pings]
             return
         if self.coherent is not None:
             if labels and self.coherent.sides != (0,):
                 raise MitsonarError("portions have no labels in the model coherent: leave labels out, or use physical")
-            for place, (pose, own) in enumerate(zip(table, time, strict=True)):
-                yield self.coherent.in_views(self._coherent_ping(pose, own, first + place, labels))
+            for pose, own, number in zip(table, time, numbers, strict=True):
+                yield self.coherent.in_views(self._coherent_ping(pose, own, number, labels))
             return
         for start in range(0, len(table), self.pings_per_launch):
             part = slice(start, start + self.pings_per_launch)
-            yield self._launch(table[part], time[part], first + start, labels)
+            yield self._launch(table[part], time[part], numbers[part], labels)
 
     def _coherent_ping(self, pose: NDArray[np.float64], time_s: float, number: int, labels: bool) -> RenderedPings:
         """Render one coherent ping. Labels are those of the expected levels, from the same surfaces."""
         assert self.coherent is not None
         levels, counts, cut = self.coherent.levels(pose, number, time_s)
         if labels:
-            pings = self._launch(pose[None], np.array([time_s]), number, True)[0]
+            pings = self._launch(pose[None], np.array([time_s]), [number], True)[0]
             pings.levels, pings.expected, pings.cut = levels[None], pings.levels, cut
             return pings
-        height_m = self.tracer.height_m(self.tracer.scene_at(time_s), self.tracer.inputs(pose[None], number)[0])
+        height_m = self.tracer.height_m(self.tracer.scene_at(time_s), self.tracer.inputs(pose[None], [number])[0])
         return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
 
     def _launch(
-        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], first: int, labels: bool
+        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
     ) -> list[RenderedPings]:
         from mitsonar.simulation import binning
 
         key = (len(poses), labels)
         if key not in self._launches:
             self._launches[key] = self._compile(*key)
-        inputs = self.tracer.inputs(poses, first)
+        inputs = self.tracer.inputs(poses, numbers)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
         height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
         for view, (image, counters, truth) in zip(self.views, made, strict=True):
-            pings = RenderedPings(first, *binning.fetch(image, counters, len(poses), view), height_m)
+            pings = RenderedPings(numbers[0], *binning.fetch(image, counters, len(poses), view), height_m)
             if labels:
                 pings.labels = labels_of(pings, truth, self.tracer.sonar.rays)
             looks.append(pings if self.former is None else self._formed(pings, self.former))
@@ -379,7 +379,7 @@ class Simulator:
         self._warn_once(pings, image, table)
         noisy = image if noise is None else noise.apply(image, seed=seed, frames=np.array([number]))
         labelled = labels_above(pings, kept, label_floor)
-        timed = TimedPath(Trajectory(table, np.array([now])), *moments_of(self.sonar, table, [now], number)[::-1])
+        timed = TimedPath(Trajectory(table, np.array([now])), *moments_of(self.sonar, table, [now], number)[1::-1])
         return self._frames(noisy, timed, pings.height_m, kept, labelled)
 
     def reset(self) -> None:

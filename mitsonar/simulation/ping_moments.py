@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,28 +15,32 @@ from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.rendered_pings import CutRays, RenderedPings
 
-__all__ = ["GroupedPings", "check_timed", "moments_of", "sonar_of_one_ping"]
+__all__ = ["FirstPing", "GroupedPings", "check_timed", "moments_of", "sonar_of_one_ping"]
+
+
+FirstPing: TypeAlias = int | Sequence[int]
+"""Number of the first of consecutive pings, or of each ping."""
 
 
 class OnePing(Protocol):
     """Renders pings, each at one moment."""
 
     def pings(
-        self, poses: ArrayLike, *, first: int = 0, labels: bool = False, time_s: ArrayLike | None = None
+        self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
     ) -> Iterator[RenderedPings]:
         """Levels of consecutive pings, in batches."""
 
 
 def moments_of(
-    sonar: Sonar, poses: ArrayLike, time_s: ArrayLike | None, first: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return poses and times of pings, both with an axis for groups of beams where there are several.
+    sonar: Sonar, poses: ArrayLike, time_s: ArrayLike | None, first: FirstPing
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[int]]:
+    """Return poses and times of pings, both with an axis for groups of beams where there are several, and their numbers.
 
     Args:
         sonar: the instrument.
         poses: ``(frames, 6)``, which hold for all groups of a frame, or ``(frames, groups, 6)`` [m, rad].
         time_s: ``(frames,)`` or ``(frames, groups)`` [s]; default: the number of the frame / ``frame_rate_hz``.
-        first: number of the first frame.
+        first: number of the first frame, or of each.
 
     Raises:
         MitsonarError: another shape, or numbers that are not finite.
@@ -46,13 +50,20 @@ def moments_of(
     if table.shape not in shapes or not len(table) or not np.isfinite(table).all():
         known = "(frames, 6)" if groups == 1 else f"(frames, 6) or (frames, {groups}, 6)"
         raise MitsonarError(f"poses must be finite numbers {known}: got {table.shape}; give m and rad")
-    time = (first + np.arange(len(table))) / sonar.frame_rate_hz if time_s is None else np.asarray(time_s, dtype=float)
+    numbers = (
+        [first + place for place in range(len(table))]
+        if isinstance(first, int | np.integer)
+        else [int(number) for number in first]
+    )
+    if len(numbers) != len(table) or min(numbers) < 0:
+        raise MitsonarError(f"pings need a number of 0 or more each, {len(table)} of them: got {len(numbers)}")
+    time = np.array(numbers) / sonar.frame_rate_hz if time_s is None else np.asarray(time_s, dtype=float)
     if time.shape not in [shape[:-1] for shape in shapes] or not np.isfinite(time).all():
         raise MitsonarError(f"times must be finite numbers, one for each pose {table.shape[:-1]}: got {time.shape}; give s")
     if groups == 1:
-        return table, time
+        return table, time, numbers
     table = table if table.ndim == 3 else np.repeat(table[:, None], groups, axis=1)
-    return table, time if time.ndim == 2 else np.repeat(time[:, None], groups, axis=1)
+    return table, time if time.ndim == 2 else np.repeat(time[:, None], groups, axis=1), numbers
 
 
 def sonar_of_one_ping(sonar: Sonar) -> Sonar | None:
@@ -91,13 +102,12 @@ class GroupedPings:
         self.inner, self.sonar = inner, sonar
 
     def pings(
-        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], first: int, labels: bool
+        self, poses: NDArray[np.float64], time_s: NDArray[np.float64], numbers: list[int], labels: bool
     ) -> Iterator[RenderedPings]:
         """Levels of frames, one at a time; arguments as :func:`moments_of` returns them."""
         groups = self.sonar.ping_groups
         heads = turned_heads(self.sonar, poses) if scans(self.sonar) else poses
-        for place in range(len(poses)):
-            number = first + place
+        for place, number in enumerate(numbers):
             made = self.inner.pings(heads[place], first=number * groups, labels=labels, time_s=time_s[place])
             yield self._joined(list(made), number)
 

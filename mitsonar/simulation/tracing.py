@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import drjit as dr
@@ -16,7 +17,7 @@ from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 
-__all__ = ["Rays", "Tracer", "height_below", "hidden"]
+__all__ = ["Rays", "Tracer", "free_way", "height_below", "hidden"]
 
 OFF_SURFACE = 1e-5
 """Distance off a surface at which a shadow ray begins, as a part of the coordinates' size: ten times their rounding."""
@@ -89,13 +90,14 @@ class Tracer:
         self.surfaces = surfaces.Surfaces.of(scene).heard_by(sonar)
         self.notes = self.surfaces.notes
 
-    def inputs(self, poses: ArrayLike, first_ping: int) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
+    def inputs(self, poses: ArrayLike, numbers: Sequence[int]) -> tuple[mi.Float, mi.UInt32, LaunchTables]:
         """Return the inputs of a launch: poses as rows of ``to_world``, keys of the jitter, tables of the surfaces.
 
-        Poses are ``(pings, 6)``, or ``(pings, groups, 6)`` where groups of beams ping one after another.
+        ``numbers`` are those of the pings. Poses are ``(pings, 6)``, or ``(pings, groups, 6)`` where groups of beams ping
+        one after another.
         """
         matrices = to_world_matrices(np.reshape(poses, (-1, 6)))[:, :3].astype(np.float32)
-        keys = [self.sensor.key(first_ping + k) for k in range(len(np.atleast_2d(poses)))]
+        keys = [self.sensor.key(number) for number in numbers]
         # copies: memory that NumPy owns is aligned by chance, and a frozen launch is recorded anew for each alignment
         return mi.Float(matrices.ravel().tolist()), mi.UInt32(keys), self.surfaces.arrays()
 
@@ -121,7 +123,7 @@ class Tracer:
         All beams ping at once.
         """
         rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
-        rows, keys, tables = self.inputs(np.tile(np.reshape(pose, (1, 1, 6)), (1, self.sonar.ping_groups, 1)), ping)
+        rows, keys, tables = self.inputs(np.tile(np.reshape(pose, (1, 1, 6)), (1, self.sonar.ping_groups, 1)), [ping])
         scene = self.scene_at([time_s] * self.sonar.ping_groups)
         traced = self.echoes(scene, *self.rays_of(rays, rows, keys), tables)
         values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
@@ -140,6 +142,12 @@ def height_below(scene: mi.Scene, place: mi.Point3f) -> DeviceArray:
     """Return the height of points over what is straight below them [m]; nan where there is nothing."""
     found = scene.ray_intersect_preliminary(mi.Ray3f(place, mi.Vector3f(0, 0, -1)))
     return dr.select(found.is_valid(), found.t, dr.nan)
+
+
+def free_way(scene: DeviceArray, ray: mi.Ray3f) -> DeviceArray:
+    """Return the distance to the nearest surface along rays [m]; infinite where there is none."""
+    found = scene.ray_intersect_preliminary(ray)
+    return dr.select(found.is_valid(), found.t, dr.inf)
 
 
 def hidden(

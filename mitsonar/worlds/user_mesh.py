@@ -2,59 +2,22 @@
 
 from __future__ import annotations
 
-import io
-import struct
-from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
 
 from mitsonar.errors import MitsonarError, argument, meant
-from mitsonar.io.plain_data import parse_json, whole_number
-from mitsonar.worlds.mesh_check import check_counts
-from mitsonar.worlds.world import Floor, Mesh, Standpoint, World
+from mitsonar.worlds.model_pieces import UP, merged, read_pieces, reflectivity_of
+from mitsonar.worlds.world import Floor, Standpoint, World
 
-__all__ = ["FORMATS", "mesh_world"]
-
-FORMATS = (".glb", ".gltf", ".obj", ".stl", ".dae", ".ply")
-UNCOLOURED = 0.5
-"""Reflectivity of a model without colours, as that of BSDFs without reflectance."""
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
-"""Rows of the rotation that turns each axis upwards: even permutations, which do not mirror."""
-
+__all__ = ["mesh_world", "overview", "random_seabed"]
 
 LARGEST_M = 1e6
 """Largest extent of a model [m]."""
 
 FARTHEST_M = 1e9
 """Largest distance of a model from the file's origin [m]."""
-
-MOST_TRIANGLES = 50_000_000
-"""Largest number of triangles of a model, with all copies."""
-
-MOST_PIXELS = 2**26
-"""Largest number of pixels of a model's picture."""
-
-LARGEST_FILE = 2**32
-"""Largest size of a model's file [bytes]."""
-
-
-@dataclass(frozen=True)
-class _Piece:
-    """One geometry of a model: triangles with one reflectivity each, or with uv and a picture."""
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    reflectivity: NDArray[np.float64] | None = None
-    uv: NDArray[np.float64] | None = None
-    picture: bytes | None = None
 
 
 def mesh_world(
@@ -83,21 +46,21 @@ def mesh_world(
     path = Path(path)
     up = up or ("y" if path.suffix.lower() in (".glb", ".gltf") else "z")
     _check_options(up, scale, floor_m)
-    pieces = _pieces(path, _value(reflectivity))
+    pieces = read_pieces(path, reflectivity_of(reflectivity))
     turn = np.array(UP[up], dtype=float) * scale
     corners = np.concatenate([(piece.vertices @ turn.T)[np.unique(piece.faces)] for piece in pieces])
     _check_extent(path, corners, scale)
     low, high = corners.min(axis=0), corners.max(axis=0)
     shift = np.array([*(low + high)[:2] / 2, low[2]])
-    meshes, content = _merge(pieces, turn, shift)
+    meshes, content = merged([piece.moved(turn, shift) for piece in pieces])
     radius = float(np.linalg.norm(high - low)) / 2
     half = 3 * radius if floor_m is None else floor_m / 2
     return World(
         about=f"{path.name}: {sum(len(piece.faces) for piece in pieces)} triangles, "
         f"{' x '.join(f'{edge:.4g}' for edge in high - low)} m, reflectivity {reflectivity}",
         meshes=meshes,
-        stand=_stand(radius, (high - low)[2]),
-        floor=Floor(half, Floor.cells(int(np.clip(round(2 * half / 0.015), 1, 2**20)), (0, 1), 0)) if floor else None,
+        stand=overview(radius, (high - low)[2]),
+        floor=random_seabed(half) if floor else None,
         content=content,
     )
 
@@ -133,203 +96,22 @@ def _check_extent(path: Path, corners: NDArray[np.float64], scale: float) -> Non
         )
 
 
-def _stand(radius: float, height: float) -> Standpoint:
-    """Return a sonar 30 deg above, at the distance at which the model fills a field of view of 29 deg."""
+def random_seabed(half_m: float, z_m: float = 0.0) -> Floor:
+    """Return a square seabed of random cells of 15 mm; ``half_m`` is half its edge [m]."""
+    return Floor(half_m, Floor.cells(int(np.clip(round(2 * half_m / 0.015), 1, 2**20)), (0, 1), 0), z_m)
+
+
+def overview(radius: float, height: float, foot: ArrayLike = (0.0, 0.0, 0.0)) -> Standpoint:
+    """Return a sonar 30 deg above, at the distance at which the model fills a field of view of 29 deg.
+
+    Args:
+        radius: of the model [m].
+        height: of the model [m].
+        foot: the point below its middle, at its lowest height ``(3,)`` [m].
+    """
     away = 1.1 * radius / np.tan(np.radians(14.5))
-    middle = height / 2
+    x, y, z = (float(value) for value in np.asarray(foot))
+    middle = z + height / 2
     sin, cos = np.sin(np.radians(30)), np.cos(np.radians(30))
     window = (max(away - 1.5 * radius, 0.01), away + 2.5 * radius)
-    return Standpoint((0, -away * cos, middle + away * sin), (0, 0, middle), window=window)
-
-
-def _value(reflectivity: str | float) -> str | float:
-    """Return ``red``, ``luminance``, or a number 0..1.
-
-    Raises:
-        MitsonarError: it is none of these.
-    """
-    if reflectivity in ("red", "luminance"):
-        return reflectivity
-    try:
-        number = float(reflectivity)
-    except ValueError:
-        number = np.nan
-    if not 0 <= number <= 1:
-        raise MitsonarError(
-            f"{argument('reflectivity')} must be red, luminance or a number 0..1: got {reflectivity!r}"
-            f"{meant(reflectivity, ('red', 'luminance'))}"
-        )
-    return number
-
-
-def _pieces(path: Path, value: str | float) -> list[_Piece]:
-    """Read the geometries of a file with their reflectivity."""
-    geometries = _geometries(path)
-    try:
-        return [_piece(geometry, value) for geometry in geometries]
-    except Exception as error:  # damaged colours and pictures raise errors of any type
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise MitsonarError(f"cannot read the colours of {path}: {reason}; export the model again") from None
-
-
-def _geometries(path: Path) -> list[trimesh.Trimesh]:
-    """Read the triangles of a file, transformed by its scene graph."""
-    if not path.is_file():
-        raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
-    if path.suffix.lower() not in FORMATS:
-        raise MitsonarError(
-            f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}"
-        )
-    if path.suffix.lower() == ".dae" and find_spec("collada") is None:
-        raise MitsonarError(
-            f"cannot read {path}: COLLADA needs the package pycollada, which is not installed; pip install "
-            "'mitsonar[meshes]', or export the model as glb, obj, stl or ply"
-        )
-    try:
-        _check_file(path)
-        scene = trimesh.load_scene(path, process=False)
-        _check_copies(scene)
-        found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
-        for geometry in found:
-            if np.shape(geometry.vertices)[1:] != (3,) or np.shape(geometry.faces)[1:] != (3,):
-                raise ValueError("a vertex or a triangle has not three numbers")
-            if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
-                raise ValueError("a triangle names a vertex that is not there")
-    except Exception as error:  # readers of damaged files raise errors of any type
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
-    if not found:
-        raise MitsonarError(f"{path} holds no triangles: export a mesh, not points or lines")
-    return found
-
-
-def _check_file(path: Path) -> None:
-    """Check the counts in a file against its size, before a reader allocates memory.
-
-    Raises:
-        ValueError: the file promises more than it has.
-    """
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise ValueError(f"it has {size:,} bytes, more than {LARGEST_FILE:,}")
-    kind = path.suffix.lower()
-    if kind == ".ply":
-        check_counts(path)
-    if kind in (".glb", ".gltf"):
-        _check_gltf(path, size)
-
-
-def _check_gltf(path: Path, size: int) -> None:
-    """Check that the accessors of a glTF file point into its bytes."""
-    content = path.read_bytes()
-    if path.suffix.lower() == ".glb":
-        (length,) = struct.unpack_from("<I", content, 12)
-        content = content[20 : 20 + length]
-    tree = parse_json(content, "its JSON")
-    for accessor in tree.get("accessors", []):
-        view = tree["bufferViews"][accessor["bufferView"]] if "bufferView" in accessor else {"byteLength": 16 * size}
-        count = whole_number(accessor["count"], "count of an accessor", 0, 2**40)
-        if count > whole_number(view["byteLength"], "byteLength", 0, 2**40):
-            raise ValueError(f"an accessor promises {count:,} values in {view['byteLength']:,} bytes")
-    for buffer in tree.get("buffers", []):
-        there = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
-        there += [(path.parent / str(buffer["uri"])).stat().st_size] if not there else []
-        if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > there[0]:
-            raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, {there[0]:,} are there")
-
-
-def _check_copies(scene: trimesh.Scene) -> None:
-    """Check the size of a scene graph, which may copy a geometry many times, and of its pictures."""
-    total = 0
-    for node in scene.graph.nodes_geometry:
-        geometry = scene.geometry[scene.graph[node][1]]
-        total += len(getattr(geometry, "faces", ()))
-        material = getattr(geometry.visual, "material", None)
-        for name in ("baseColorTexture", "image"):
-            picture = getattr(material, name, None)
-            if picture is not None and picture.width * picture.height > MOST_PIXELS:
-                raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MOST_PIXELS:,}")
-    if total > MOST_TRIANGLES:
-        raise ValueError(f"it places {total:,} triangles, more than {MOST_TRIANGLES:,}")
-
-
-def _piece(geometry: trimesh.Trimesh, value: str | float) -> _Piece:
-    """Return a geometry with its reflectivity."""
-    vertices, faces = np.asarray(geometry.vertices, dtype=float), np.asarray(geometry.faces)
-    if not isinstance(value, str):
-        return _Piece(vertices, faces, np.full(len(faces), value))
-    visual: Any = geometry.visual
-    if visual.kind == "texture":
-        material = visual.material
-        picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-        factor = _tint(material, value)
-        if picture is None or visual.uv is None or len(visual.uv) != len(vertices):
-            return _Piece(vertices, faces, np.full(len(faces), factor))
-        # trimesh counts v upwards, Mitsuba's bitmaps from the top row
-        uv = np.asarray(visual.uv, dtype=float) * (1, -1) + (0, 1)
-        return _Piece(vertices, faces, uv=uv, picture=_grey_png(picture, value, factor))
-    if visual.kind is None:
-        return _Piece(vertices, faces, np.full(len(faces), UNCOLOURED))
-    if visual.kind == "vertex":
-        return _Piece(vertices, faces, _one(_colours(visual.vertex_colors), value)[faces].mean(axis=1))
-    return _Piece(vertices, faces, _one(_colours(visual.face_colors), value))
-
-
-def _tint(material: trimesh.visual.material.Material, value: str) -> float:
-    """Return the reflectivity of a material's own colour, 0..1; a picture is multiplied by it."""
-    if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear already, white where it is not given
-        factor = material.baseColorFactor
-        colour = np.ones(3) if factor is None else _colours(factor)[0]
-        return float(colour[0] if value == "red" else colour @ LUMINANCE)
-    if getattr(material, "image", None) is not None:
-        return 1.0
-    return float(_one(_colours(material.main_color), value)[0])
-
-
-def _colours(values: ArrayLike) -> NDArray[np.float64]:
-    """Return RGB in 0..1 ``(n, 3)`` of 8-bit or fractional RGB(A)."""
-    table = np.atleast_2d(np.asarray(values))
-    scale = 255 if np.issubdtype(table.dtype, np.integer) else 1
-    return np.clip(table[:, :3].astype(float) / scale, 0, 1)
-
-
-def _one(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
-    """Reduce stored colours ``(..., 3)`` to one number each: red, or the luminance of their linear light (sRGB)."""
-    if value == "red":
-        return colours[..., 0]
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    return np.asarray(linear @ LUMINANCE, dtype=np.float64)
-
-
-def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
-    """Return the picture's reflectivity as a 16-bit grey PNG."""
-    grey = _one(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
-    pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
-
-
-def _merge(
-    pieces: list[_Piece], turn: NDArray[np.float64], shift: NDArray[np.float64]
-) -> tuple[list[Mesh], dict[str, bytes]]:
-    """Merge all plain pieces into one mesh, and those of each picture into another; also return the pictures as files."""
-    groups: dict[bytes | None, list[tuple[int, _Piece]]] = {}
-    for number, piece in enumerate(pieces, start=1):
-        groups.setdefault(piece.picture, []).append((number, piece))
-    meshes: list[Mesh] = []
-    content: dict[str, bytes] = {}
-    for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # the plain ones first
-        vertices = np.concatenate([piece.vertices @ turn.T - shift for _, piece in members])
-        first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
-        faces = np.concatenate([piece.faces + start for (_, piece), start in zip(members, first, strict=False)])
-        ids = np.concatenate([np.full(len(piece.faces), number) for number, piece in members])
-        if picture is None:
-            values = np.concatenate([piece.reflectivity for _, piece in members if piece.reflectivity is not None])
-            meshes.append(Mesh("model", vertices, faces, values, ids))
-        else:
-            name = f"textured_{len(content)}"
-            uv = np.concatenate([piece.uv for _, piece in members if piece.uv is not None])
-            content[f"textures/{name}.png"] = picture
-            meshes.append(Mesh(name, vertices, faces, None, ids, uv, f"textures/{name}.png"))
-    return meshes, content
+    return Standpoint((x, y - away * cos, middle + away * sin), (x, y, middle), window=window)

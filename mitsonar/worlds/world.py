@@ -117,6 +117,8 @@ class Mesh:
         object_id: of each face ``(faces,)``, from 1; one number for each object.
         uv: of each vertex ``(vertices, 2)``, with a texture.
         texture: picture of the reflectivity, a file within the world's folder.
+        shape_id: id of the shape; default: its name.
+        material: name of an ``acoustic_material``, whose law the surface then has; default: a diffuse surface.
     """
 
     name: str
@@ -126,6 +128,8 @@ class Mesh:
     object_id: NDArray[np.integer] | None = None
     uv: NDArray[np.floating] | None = None
     texture: str | None = None
+    shape_id: str | None = None
+    material: str | None = None
 
     def ply(self) -> bytes:
         """Return the mesh as binary PLY, with the attribute names that Mitsuba reads."""
@@ -161,11 +165,14 @@ class Mesh:
             reflectance = (
                 '<texture type="mesh_attribute" name="reflectance"><string name="name" value="face_reflectivity"/></texture>'
             )
+        kind = "diffuse"
+        if self.material is not None:
+            kind, reflectance = "acoustic_material", f'<string name="material" value={quoteattr(self.material)}/>'
         return f"""
-    <shape type="ply" id="{self.name}">
+    <shape type="ply" id={quoteattr(self.shape_id or self.name)}>
         <string name="filename" value="meshes/{self.name}.ply"/>
         <boolean name="face_normals" value="true"/>
-        <bsdf type="diffuse">
+        <bsdf type="{kind}">
             {reflectance}
         </bsdf>
     </shape>"""

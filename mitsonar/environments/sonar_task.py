@@ -1,0 +1,128 @@
+"""What the vehicles of an environment may do, and what ends an episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.errors import MitsonarError, argument, nearest_names
+
+__all__ = ["OBSERVABLE", "Reward", "SonarTask", "Transition"]
+
+Table: TypeAlias = NDArray[np.float64]
+
+OBSERVABLE = ("image", "altitude", "pose")
+"""What can be observed."""
+
+VELOCITY = ("starboard", "forward", "up", "turn")
+
+
+@dataclass(frozen=True)
+class Transition:
+    """A step of all vehicles, from which rewards follow.
+
+    Attributes:
+        action: clipped to -1..1 ``(n, 4)``: starboard, forward, up, turn to starboard.
+        before: poses before ``(n, 6)`` [m, rad].
+        poses: after ``(n, 6)``.
+        image: of the sonar ``(n, bins, beams)`` uint8.
+        altitude_m: over what is straight below ``(n,)`` [m].
+        clearance_m: to the nearest surface ``(n,)`` [m].
+        collided: whether that is too near ``(n,)``.
+        outside: whether the vehicle has left its bounds ``(n,)``.
+    """
+
+    action: Table
+    before: Table
+    poses: Table
+    image: NDArray[np.uint8]
+    altitude_m: Table
+    clearance_m: Table
+    collided: NDArray[np.bool_]
+    outside: NDArray[np.bool_]
+
+
+Reward: TypeAlias = Callable[[Transition], ArrayLike]
+"""Gives the reward of each vehicle ``(n,)``."""
+
+
+@dataclass(frozen=True)
+class SonarTask:
+    """What vehicles may do. They are level, and move with the velocity of the action.
+
+    Attributes:
+        start: pose of the sonar at the begin of an episode, or two poses between which it is drawn, number by number
+            [m, rad]; default: the pose of the scene's sonar.
+        bounds: lowest and highest x, y, z [m]; who leaves them has ended. Default: none.
+        max_velocity: of the actions -1 and 1: starboard, forward, up [m/s], turn [rad/s].
+        step_s: duration of a step [s]; default: 1 / ``frame_rate_hz``.
+        clearance_m: distance to a surface below which a vehicle has collided [m].
+        max_steps: steps after which an episode is cut off; default: none.
+        observe: of :data:`OBSERVABLE`; the image alone is a box, several are a dictionary.
+        reward: of each step; default: 0.
+        gain: of the image; default: by eight poses of ``start``.
+        noise: of the image; default: none.
+        altimeter_m: an altitude beyond is told as this [m].
+
+    Raises:
+        MitsonarError: a value that is not allowed.
+    """
+
+    start: ArrayLike | None = None
+    bounds: ArrayLike | None = None
+    max_velocity: tuple[float, float, float, float] = (0.5, 1.0, 0.5, 0.5)
+    step_s: float | None = None
+    clearance_m: float = 0.3
+    max_steps: int | None = None
+    observe: tuple[str, ...] = ("image",)
+    reward: Reward | None = None
+    gain: float | None = None
+    noise: NoiseModel | None = None
+    altimeter_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        for name, least in (("step_s", 1e-6), ("gain", 0.0), ("max_steps", 1), ("clearance_m", 0.0), ("altimeter_m", 1e-6)):
+            value = getattr(self, name)
+            if value is not None and not (least <= value < np.inf):
+                raise MitsonarError(f"{argument(name)} must be a finite number of at least {least:g}: got {value!r}")
+        speeds = np.asarray(self.max_velocity, dtype=float)
+        if speeds.shape != (4,) or not (np.isfinite(speeds).all() and (speeds >= 0).all()):
+            raise MitsonarError(f"max_velocity is four numbers of 0 or more, {', '.join(VELOCITY)}: got {self.max_velocity}")
+        unknown = [name for name in self.observe if name not in OBSERVABLE]
+        if unknown or "image" not in self.observe or isinstance(self.observe, str):
+            wrong = str(unknown[0] if unknown else self.observe)
+            raise MitsonarError(f"observe is a tuple of image and others: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}")
+        self.span, self.box  # noqa: B018  # refuse them now
+
+    @property
+    def span(self) -> Table:
+        """Return the two poses between which episodes begin ``(2, 6)``; of nan without a start.
+
+        Raises:
+            MitsonarError: not one or two finite poses.
+        """
+        if self.start is None:
+            return np.full((2, 6), np.nan)
+        table = np.atleast_2d(np.asarray(self.start, dtype=float))
+        if table.shape not in ((1, 6), (2, 6)) or not np.isfinite(table).all():
+            raise MitsonarError(f"start is one pose or two, of x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
+        return np.asarray(np.broadcast_to(table, (2, 6)))
+
+    @property
+    def box(self) -> Table:
+        """Return the lowest and the highest place ``(2, 3)`` [m].
+
+        Raises:
+            MitsonarError: they are not two places, the lower first.
+        """
+        if self.bounds is None:
+            return np.array([[-np.inf] * 3, [np.inf] * 3])
+        box = np.asarray(self.bounds, dtype=float)
+        if box.shape != (2, 3) or not (box[0] < box[1]).all():
+            raise MitsonarError(f"bounds are the lowest and the highest x, y, z [m]: got {box.tolist()}")
+        return box

@@ -1,0 +1,271 @@
+"""Geometries of model files with their reflectivity: glTF, OBJ, STL, COLLADA and PLY."""
+
+from __future__ import annotations
+
+import io
+import struct
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from mitsonar.errors import MitsonarError, argument, meant
+from mitsonar.io.plain_data import parse_json, whole_number
+from mitsonar.worlds.mesh_check import check_counts
+from mitsonar.worlds.world import Mesh
+
+__all__ = [
+    "FORMATS",
+    "MOST_TRIANGLES",
+    "UNCOLOURED",
+    "UP",
+    "Piece",
+    "merged",
+    "one_number",
+    "read_pieces",
+    "reflectivity_of",
+]
+
+FORMATS = (".glb", ".gltf", ".obj", ".stl", ".dae", ".ply")
+UNCOLOURED = 0.5
+"""Reflectivity of a model without colours, as that of BSDFs without reflectance."""
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+UP = {"x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)), "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "z": np.eye(3)}
+"""Rows of the rotation that turns each axis upwards: even permutations, which do not mirror."""
+
+MOST_TRIANGLES = 50_000_000
+"""Largest number of triangles of a model, with all copies."""
+
+MOST_PIXELS = 2**26
+"""Largest number of pixels of a model's picture."""
+
+LARGEST_FILE = 2**32
+"""Largest size of a model's file [bytes]."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One geometry of a model: triangles with one reflectivity each, or with uv and a picture."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    reflectivity: NDArray[np.float64] | None = None
+    uv: NDArray[np.float64] | None = None
+    picture: bytes | None = None
+
+    def moved(self, turn: NDArray[np.float64], shift: NDArray[np.float64]) -> Self:
+        """Return the geometry with vertices ``turn @ v - shift``. Where ``turn`` mirrors, triangles keep their fronts."""
+        faces = self.faces[:, ::-1] if np.linalg.det(turn) < 0 else self.faces
+        return replace(self, vertices=self.vertices @ turn.T - shift, faces=faces)
+
+    def uniform(self, reflectivity: float) -> Self:
+        """Return the geometry with one reflectivity, without picture."""
+        return replace(self, reflectivity=np.full(len(self.faces), reflectivity), uv=None, picture=None)
+
+
+def reflectivity_of(reflectivity: str | float) -> str | float:
+    """Return ``red``, ``luminance``, or a number 0..1.
+
+    Raises:
+        MitsonarError: it is none of these.
+    """
+    if reflectivity in ("red", "luminance"):
+        return reflectivity
+    try:
+        number = float(reflectivity)
+    except ValueError:
+        number = np.nan
+    if not 0 <= number <= 1:
+        raise MitsonarError(
+            f"{argument('reflectivity')} must be red, luminance or a number 0..1: got {reflectivity!r}"
+            f"{meant(reflectivity, ('red', 'luminance'))}"
+        )
+    return number
+
+
+def read_pieces(path: Path, value: str | float) -> list[Piece]:
+    """Read the geometries of a file with their reflectivity."""
+    geometries = _geometries(path)
+    try:
+        return [_piece(geometry, value) for geometry in geometries]
+    except Exception as error:  # damaged colours and pictures raise errors of any type
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MitsonarError(f"cannot read the colours of {path}: {reason}; export the model again") from None
+
+
+def _geometries(path: Path) -> list[trimesh.Trimesh]:
+    """Read the triangles of a file, transformed by its scene graph."""
+    if not path.is_file():
+        raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
+    if path.suffix.lower() not in FORMATS:
+        raise MitsonarError(
+            f"cannot read models of type {path.suffix or 'without ending'}: {path}; known: {', '.join(FORMATS)}"
+        )
+    if path.suffix.lower() == ".dae" and find_spec("collada") is None:
+        raise MitsonarError(
+            f"cannot read {path}: COLLADA needs the package pycollada, which is not installed; pip install "
+            "'mitsonar[meshes]', or export the model as glb, obj, stl or ply"
+        )
+    try:
+        _check_file(path)
+        scene = trimesh.load_scene(path, process=False)
+        _check_copies(scene)
+        found = [geometry for geometry in scene.dump() if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces)]
+        for geometry in found:
+            if np.shape(geometry.vertices)[1:] != (3,) or np.shape(geometry.faces)[1:] != (3,):
+                raise ValueError("a vertex or a triangle has not three numbers")
+            if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
+                raise ValueError("a triangle names a vertex that is not there")
+    except Exception as error:  # readers of damaged files raise errors of any type
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MitsonarError(f"cannot read {path}: {reason}; export the model again") from None
+    if not found:
+        raise MitsonarError(f"{path} holds no triangles: export a mesh, not points or lines")
+    return found
+
+
+def _check_file(path: Path) -> None:
+    """Check the counts in a file against its size, before a reader allocates memory.
+
+    Raises:
+        ValueError: the file promises more than it has.
+    """
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise ValueError(f"it has {size:,} bytes, more than {LARGEST_FILE:,}")
+    kind = path.suffix.lower()
+    if kind == ".ply":
+        check_counts(path)
+    if kind in (".glb", ".gltf"):
+        _check_gltf(path, size)
+
+
+def _check_gltf(path: Path, size: int) -> None:
+    """Check that the accessors of a glTF file point into its bytes."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".glb":
+        (length,) = struct.unpack_from("<I", content, 12)
+        content = content[20 : 20 + length]
+    tree = parse_json(content, "its JSON")
+    for accessor in tree.get("accessors", []):
+        view = tree["bufferViews"][accessor["bufferView"]] if "bufferView" in accessor else {"byteLength": 16 * size}
+        count = whole_number(accessor["count"], "count of an accessor", 0, 2**40)
+        if count > whole_number(view["byteLength"], "byteLength", 0, 2**40):
+            raise ValueError(f"an accessor promises {count:,} values in {view['byteLength']:,} bytes")
+    for buffer in tree.get("buffers", []):
+        there = [size] if "uri" not in buffer or str(buffer["uri"]).startswith("data:") else []
+        there += [(path.parent / str(buffer["uri"])).stat().st_size] if not there else []
+        if whole_number(buffer["byteLength"], "byteLength", 0, 2**40) > there[0]:
+            raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, {there[0]:,} are there")
+
+
+def _check_copies(scene: trimesh.Scene) -> None:
+    """Check the size of a scene graph, which may copy a geometry many times, and of its pictures."""
+    total = 0
+    for node in scene.graph.nodes_geometry:
+        geometry = scene.geometry[scene.graph[node][1]]
+        total += len(getattr(geometry, "faces", ()))
+        material = getattr(geometry.visual, "material", None)
+        for name in ("baseColorTexture", "image"):
+            picture = getattr(material, name, None)
+            if picture is not None and picture.width * picture.height > MOST_PIXELS:
+                raise ValueError(f"a picture has {picture.width:,} x {picture.height:,} pixels, more than {MOST_PIXELS:,}")
+    if total > MOST_TRIANGLES:
+        raise ValueError(f"it places {total:,} triangles, more than {MOST_TRIANGLES:,}")
+
+
+def _piece(geometry: trimesh.Trimesh, value: str | float) -> Piece:
+    """Return a geometry with its reflectivity."""
+    vertices, faces = np.asarray(geometry.vertices, dtype=float), np.asarray(geometry.faces)
+    if not isinstance(value, str):
+        return Piece(vertices, faces, np.full(len(faces), value))
+    visual: Any = geometry.visual
+    if visual.kind == "texture":
+        material = visual.material
+        picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        factor = _tint(material, value)
+        if picture is None or visual.uv is None or len(visual.uv) != len(vertices):
+            return Piece(vertices, faces, np.full(len(faces), factor))
+        # trimesh counts v upwards, Mitsuba's bitmaps from the top row
+        uv = np.asarray(visual.uv, dtype=float) * (1, -1) + (0, 1)
+        return Piece(vertices, faces, uv=uv, picture=_grey_png(picture, value, factor))
+    if visual.kind is None:
+        return Piece(vertices, faces, np.full(len(faces), UNCOLOURED))
+    if visual.kind == "vertex":
+        return Piece(vertices, faces, one_number(_colours(visual.vertex_colors), value)[faces].mean(axis=1))
+    return Piece(vertices, faces, one_number(_colours(visual.face_colors), value))
+
+
+def _tint(material: trimesh.visual.material.Material, value: str) -> float:
+    """Return the reflectivity of a material's own colour, 0..1; a picture is multiplied by it."""
+    if isinstance(material, trimesh.visual.material.PBRMaterial):  # glTF: linear already, white where it is not given
+        factor = material.baseColorFactor
+        colour = np.ones(3) if factor is None else _colours(factor)[0]
+        return float(colour[0] if value == "red" else colour @ LUMINANCE)
+    if getattr(material, "image", None) is not None:
+        return 1.0
+    return float(one_number(_colours(material.main_color), value)[0])
+
+
+def _colours(values: ArrayLike) -> NDArray[np.float64]:
+    """Return RGB in 0..1 ``(n, 3)`` of 8-bit or fractional RGB(A)."""
+    table = np.atleast_2d(np.asarray(values))
+    scale = 255 if np.issubdtype(table.dtype, np.integer) else 1
+    return np.clip(table[:, :3].astype(float) / scale, 0, 1)
+
+
+def one_number(colours: NDArray[np.float64], value: str) -> NDArray[np.float64]:
+    """Reduce stored colours ``(..., 3)`` to one number each: red, or the luminance of their linear light (sRGB)."""
+    if value == "red":
+        return colours[..., 0]
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear @ LUMINANCE, dtype=np.float64)
+
+
+def _grey_png(picture: Image.Image, value: str, factor: float) -> bytes:
+    """Return the picture's reflectivity as a 16-bit grey PNG."""
+    grey = one_number(_colours(np.asarray(picture.convert("RGB")).reshape(-1, 3)), value) * factor
+    pixels = np.rint(grey * 65535).astype(np.uint16).reshape(picture.height, picture.width)
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def merged(
+    pieces: list[Piece], name: str = "model", textured: str = "textured", first_id: int = 1, shape_id: str | None = None
+) -> tuple[list[Mesh], dict[str, bytes]]:
+    """Merge all plain pieces into one mesh, and those of each picture into another; also return the pictures as files.
+
+    Args:
+        pieces: in the axes of the scene [m]; they are numbered as objects, in their order.
+        name: of the mesh of the plain ones.
+        textured: begin of the names of the others.
+        first_id: number of the first piece as an object.
+        shape_id: id of the shapes; default: their names.
+    """
+    groups: dict[bytes | None, list[tuple[int, Piece]]] = {}
+    for number, piece in enumerate(pieces, start=first_id):
+        groups.setdefault(piece.picture, []).append((number, piece))
+    meshes: list[Mesh] = []
+    content: dict[str, bytes] = {}
+    for picture, members in sorted(groups.items(), key=lambda group: group[0] is not None):  # the plain ones first
+        vertices = np.concatenate([piece.vertices for _, piece in members])
+        first = np.cumsum([0, *(len(piece.vertices) for _, piece in members)])
+        faces = np.concatenate([piece.faces + start for (_, piece), start in zip(members, first, strict=False)])
+        ids = np.concatenate([np.full(len(piece.faces), number) for number, piece in members])
+        if picture is None:
+            values = np.concatenate([piece.reflectivity for _, piece in members if piece.reflectivity is not None])
+            meshes.append(Mesh(name, vertices, faces, values, ids, shape_id=shape_id))
+        else:
+            file = f"{textured}_{len(content)}"
+            uv = np.concatenate([piece.uv for _, piece in members if piece.uv is not None])
+            content[f"textures/{file}.png"] = picture
+            own = None if shape_id is None else f"{shape_id}/{file}"
+            meshes.append(Mesh(file, vertices, faces, None, ids, uv, f"textures/{file}.png", shape_id=own))
+    return meshes, content

@@ -1,0 +1,77 @@
+"""Files that a scene names: found within its own folder and the folders that the user allows, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mitsonar.errors import MitsonarError, shortened
+
+__all__ = ["ModelSearch"]
+
+LONGEST = 1024
+"""Letters of a file's name in a scene, at most."""
+
+PACKAGES = ("model://", "package://")
+"""Begin of names whose next word is the name of a folder, of Gazebo and ROS."""
+
+
+class ModelSearch:
+    """Finds the files that a scene names.
+
+    Args:
+        file: of the scene.
+        folders: where models and packages lie as well.
+
+    Attributes:
+        roots: folders within which a file must lie, without links.
+
+    Raises:
+        MitsonarError: one of the folders is not there.
+    """
+
+    def __init__(self, file: Path, folders: Sequence[str | Path] = ()) -> None:
+        missing = [folder for folder in folders if not Path(folder).is_dir()]
+        if missing:
+            raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that holds models or packages")
+        self.roots = [file.resolve().parent, *(Path(folder).resolve() for folder in folders)]
+
+    def find(self, name: str, beside: Path) -> Path:
+        """Return the file or folder that a scene names.
+
+        Args:
+            name: a path, or ``model://``, ``package://`` or ``file://`` and one. ``model://NAME/...`` is the folder NAME
+                within a folder that is searched, or that folder itself.
+            beside: file that names it; a path without a scheme counts from there, then from the folders that are searched.
+
+        Raises:
+            MitsonarError: it is not there, lies outside the folders, or is an address of the net.
+        """
+        name = name.strip()
+        if len(name) > LONGEST or "\0" in name or not name:
+            raise MitsonarError(f"{beside} names the file {shortened(name)}: give a path of 1 to {LONGEST} letters")
+        scheme = next((scheme for scheme in PACKAGES if name.startswith(scheme)), "")
+        if not scheme and "://" in name and not name.startswith("file://"):
+            raise MitsonarError(
+                f"{beside} names {shortened(name)}: nothing is fetched from the net; download it, name it model://..., and "
+                "give the folder by --search"
+            )
+        for candidate in self._candidates(name, scheme, beside):
+            found = candidate.resolve()
+            if any(found.is_relative_to(root) for root in self.roots) and found.exists():
+                return found
+        raise MitsonarError(
+            f"{beside} names {shortened(name)}, which is not within {', '.join(map(str, self.roots))}: give the folder that "
+            "holds it by --search"
+        )
+
+    def _candidates(self, name: str, scheme: str, beside: Path) -> list[Path]:
+        """List where a file may lie."""
+        path = Path(name.removeprefix(scheme) if scheme else name.removeprefix("file://"))
+        if not scheme:
+            return [beside.parent / path, *(root / path for root in self.roots)]
+        package, *rest = [part for part in path.parts if part not in ("/", ".")] or [""]
+        return [
+            *(root / package / Path(*rest) for root in self.roots),
+            *(root / Path(*rest) for root in self.roots if root.name == package),
+        ]

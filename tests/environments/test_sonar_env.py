@@ -1,0 +1,101 @@
+"""Environments of Gymnasium: clean by its checker, and many together see what each sees alone."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from mitsonar.environments.sonar_env import SonarEnv
+from mitsonar.environments.sonar_vector_env import SonarVectorEnv
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.scene import load_scene
+
+SONAR = Sonar(model="physical", beams=16, range_bins=32, range_min=1, range_max=8, quality="draft")
+START = [[-4, -6, 2, 0.4, 0, -0.5], [4, -4, 3, 0.5, 0, 0.5]]
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Simulator:
+    return Simulator(load_scene("objects"), SONAR)
+
+
+def test_the_checker_of_gymnasium_finds_nothing() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        named = {"scene": "objects", "sonar": SONAR, "start": START}
+        check_env(gymnasium.make("mitsonar/Sonar-v0", **named).unwrapped)
+        more = gymnasium.make("mitsonar/Sonar-v0", observe=("image", "altitude", "pose"), render_mode="rgb_array", **named)
+        check_env(more.unwrapped)
+
+
+def test_vehicles_stepped_together_see_what_each_sees_alone(simulator: Simulator) -> None:
+    many, one = SonarVectorEnv(simulator, num_envs=64, start=START), SonarEnv(simulator, start=START)
+    actions = np.random.default_rng(0).uniform(-1, 1, (2, 64, 4))
+    together = [many.reset(seed=5)[0], *(many.step(action)[0] for action in actions)]
+    for place in range(0, 64, 7):
+        alone = [one.reset(seed=5 + place)[0], *(one.step(action[place])[0] for action in actions)]
+        for all_of_them, own in zip(together, alone, strict=True):
+            assert isinstance(all_of_them, np.ndarray)
+            np.testing.assert_array_equal(all_of_them[place], own)
+    assert together[0].max() > 100
+    assert not np.array_equal(together[0][0], together[0][1])
+
+
+def test_a_vehicle_that_sinks_collides_and_begins_anew(simulator: Simulator) -> None:
+    start = [0, -5, 1.0, 0.4, 0, 0]
+    env = SonarVectorEnv(simulator, num_envs=2, start=start, step_s=1.0, clearance_m=0.4)
+    env.reset(seed=0)
+    down, stay = [0, 0, -1, 0], [0, 0, 0, 0]
+    ended = env.step(np.array([down, stay]))[2]
+    assert not ended.any()  # at 0.5 m
+    _, _, ended, cut, told = env.step(np.array([down, stay]))
+    assert ended.tolist() == [True, False]
+    assert not cut.any()
+    assert told["collided"].tolist() == [True, False]
+    _, _, ended, _, told = env.step(np.array([down, stay]))
+    assert not ended.any()
+    np.testing.assert_allclose(told["pose"][0], start)
+    assert told["_collided"].tolist() == [False, True]
+
+
+def test_bounds_steps_and_rewards_count(simulator: Simulator) -> None:
+    env = SonarEnv(
+        simulator,
+        start=[0, -5, 2, 0.4, 0, np.pi / 2],
+        bounds=[[-9, -9, 0], [0.5, 9, 9]],
+        step_s=0.4,
+        max_steps=3,
+        reward=lambda step: step.poses[:, 0] - step.before[:, 0],
+    )
+    env.reset(seed=1)
+    _, reward, ended, cut, told = env.step([0, 1, 0, 0])  # ahead is +x
+    assert reward == pytest.approx(0.4)
+    assert not ended
+    assert not cut
+    _, _, ended, _, told = env.step([0, 1, 0, 0])
+    assert ended
+    assert told["outside"]
+    assert env.step([0, 0, 0, 0])[3]
+
+
+def test_masked_resets_and_wrong_arguments(simulator: Simulator) -> None:
+    env = SonarVectorEnv(simulator, num_envs=2, start=START, max_steps=1, autoreset_mode="Disabled")
+    env.reset(seed=0)
+    cut = env.step(np.zeros((2, 4)))[3]
+    assert cut.all()
+    with pytest.raises(MitsonarError, match="2 episodes have ended"):
+        env.step(np.zeros((2, 4)))
+    env.reset(options={"reset_mask": np.array([True, True])})
+    with pytest.raises(MitsonarError, match="four finite numbers"):
+        env.step(np.full((2, 4), np.nan))
+    for wrong in ({"start": [1, 2]}, {"bounds": [[1, 1, 1], [0, 0, 0]]}, {"observe": ("pose",)}, {"max_steps": 0}):
+        with pytest.raises(MitsonarError):
+            SonarEnv(simulator, **wrong)
+    with pytest.raises(MitsonarError, match="num_envs"):
+        SonarVectorEnv(simulator, num_envs=0)
