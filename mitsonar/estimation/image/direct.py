@@ -230,13 +230,10 @@ class Direct:
         found = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
         if found is None:
             return replace(rejected("nothing in the frames to match"), about={"start": named})
-        apart = 0.0 if task.attitude.echoes_m is None else task.attitude.echoes_m - task.attitude.height_m
         # far motions match the ground between rocks, too: rocks look different from elsewhere
-        unsure = replace(task.attitude, height_std_m=float(np.hypot(task.attitude.height_std_m, apart)))
-        # where beams and pulse spread, SPECKLE_MODEL widens covariances already
-        finer = FAR_CELL / _cell_area(task) if task.frames.sonar.beam_pattern == "box" else 1.0
-        model = FAR_MODEL * max(1.0, finer)
-        return self._judged(replace(task, attitude=unsure), start, *found, model, {"start": named})
+        std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m or 0.0))
+        unsure = replace(task, attitude=replace(task.attitude, height_std_m=std))
+        return self._judged(unsure, start, *found, _far_model(task.frames, task.attitude.height_m), {"start": named})
 
     def _judged(
         self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, model: float, about: dict[str, object]
@@ -250,16 +247,18 @@ class Direct:
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
         if fit.excess != UNMEASURED:
             about["stands_out"] = stands_out(fit.independent, fit.excess)
-        if task.attitude.echoes_m is not None and self.relief_m is None:
+        if task.attitude.tops_m is not None and self.relief_m is None:
             about["height_std_m"] = task.attitude.height_std_m
         return Estimate(motion, covariance, not reason, reason, about)
 
 
-def _cell_area(task: _Task) -> float:
-    """Return the area of a cell in the middle of the window, as part of the squared height."""
-    range_m, bearing_rad = task.frames.range_m, task.frames.bearing_rad
-    bin_m, beam_rad = float(np.median(np.diff(range_m))), float(np.median(np.diff(bearing_rad)))
-    return bin_m * beam_rad * float(range_m[[0, -1]].mean()) / task.attitude.height_m**2
+def _far_model(frames: SonarFrames, height_m: float) -> float:
+    """Return :data:`FAR_MODEL`, times the number of cells that share the area of one of its own."""
+    if frames.sonar.beam_pattern != "box":
+        return FAR_MODEL  # where beams and pulse spread, SPECKLE_MODEL counts cells that are alike
+    bin_m, beam_rad = (float(np.median(np.diff(axis))) for axis in (frames.range_m, frames.bearing_rad))
+    area = bin_m * beam_rad * float(frames.range_m[[0, -1]].mean()) / height_m**2
+    return FAR_MODEL * max(1.0, FAR_CELL / area)
 
 
 def is_far(motion: Motion, height_m: float) -> bool:
