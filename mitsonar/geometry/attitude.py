@@ -52,7 +52,7 @@ class Attitude:
         reason: why the given geometry is rejected; empty where it is not.
         even: whether first echoes show ground without relief.
         told_m: height over the ground as it was told [m]; None: it was not.
-        tops_m: height of the contrast above the mean of the first echoes [m]; None: they did not tell the height.
+        first: what first echoes tell; None: they did not tell the height.
     """
 
     height_m: float
@@ -62,12 +62,17 @@ class Attitude:
     reason: str = ""
     even: bool = False
     told_m: float | None = None
-    tops_m: float | None = None
+    first: FirstEchoes | None = None
 
     @property
     def floor_m(self) -> float:
         """Height over the floor, where the fan begins to light it [m]: as told, but there may be a rock straight below."""
         return self.height_m if self.told_m is None else max(self.told_m, self.height_m)
+
+    @property
+    def tops_m(self) -> float:
+        """Height of the contrast above the mean of the first echoes [m]; 0 where they did not tell the height."""
+        return 0.0 if self.first is None else self.first.tops_m
 
     def ground(self, frames: SonarFrames) -> GroundGeometry:
         """Return the level ground that the cells of the frames show from this height and attitude."""
@@ -132,14 +137,14 @@ def _over_level(first: FirstEchoes | None, told_m: float | None, pitch: float, r
             return replace(told, reason=reason)
     assert first is not None
     std = STD_MEASURED * first.height_m
-    return Attitude(first.height_m, std, pitch, roll, even=first.even, told_m=told_m, tops_m=first.tops_m)
+    return Attitude(first.height_m, std, pitch, roll, even=first.even, told_m=told_m, first=first)
 
 
 def _over_rising(level: Attitude, found: EchoHeights) -> Attitude:
     """Return the attitude over the mean of both ends of the light, where they show that the ground rises."""
     if found.last_m is None or found.ends_m is None:
         return level
-    first_m = level.height_m + (level.tops_m or 0.0)
+    first_m = level.height_m + level.tops_m
     apart = first_m - found.last_m
     if apart <= (RISING_EVEN if level.even else RISING) * first_m:
         return level

@@ -21,7 +21,8 @@ def test_level_ground_has_the_height_of_the_first_echoes() -> None:
     found = attitude_of(frames, "a test", None, None)
     assert found.height_m == pytest.approx(HEIGHT_M, abs=TOLERANCE_M)
     assert found.height_std_m == pytest.approx(STD_MEASURED * found.height_m)
-    assert found.tops_m is not None
+    assert found.first is not None
+    assert found.height_m == found.first.height_m
     assert abs(found.tops_m) < TOLERANCE_M
     assert found.even
     assert not found.reason
@@ -32,12 +33,14 @@ def test_rising_ground_has_the_mean_height_of_both_ends() -> None:
     frames, near, far = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, 10.0)
     found = attitude_of(replace(frames, height_m=None), "a test", None, None)
     apart = near.mean() - far.mean()
+    assert found.first is not None
+    assert found.first.height_m == pytest.approx(near.mean(), abs=TOLERANCE_M)
     assert found.height_m == pytest.approx((near.mean() + far.mean()) / 2, abs=TOLERANCE_M)
     assert found.height_std_m == pytest.approx(np.hypot(STD_MEASURED * found.height_m, apart / np.sqrt(12)), rel=0.12)
     # whoever gives the relief means level ground
     given = attitude_of(frames, "a test", HEIGHT_M, None, relief_m=0.1)
     assert given.height_m == pytest.approx(HEIGHT_M - 0.1)
-    assert given.tops_m is None
+    assert given.first is None
 
 
 def test_a_window_without_first_echoes_shows_rising_ground_by_its_last_ones() -> None:
@@ -46,11 +49,11 @@ def test_a_window_without_first_echoes_shows_rising_ground_by_its_last_ones() ->
     level = attitude_of(lit_plane(window, HEIGHT_M, PITCH_RAD)[0], "a test", None, None)
     assert level.height_m == HEIGHT_M
     assert level.height_std_m == pytest.approx(STD_GIVEN * HEIGHT_M)
-    assert level.tops_m is None
+    assert level.first is None
     window = SONAR.replace(range_min=3.3)
     frames, _, far = lit_plane(window, HEIGHT_M, PITCH_RAD, 10.0)
     rising = attitude_of(frames, "a test", None, None)
-    assert rising.tops_m is None
+    assert rising.first is None
     assert rising.height_m == pytest.approx(far.mean(), abs=0.1)
     assert rising.height_std_m > STD_GIVEN * HEIGHT_M
 
@@ -74,7 +77,7 @@ def test_ground_that_falls_is_taken_for_level() -> None:
     """Its light ends beyond most windows: only the first echoes count."""
     frames, near, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, -5.0)
     found = attitude_of(frames, "a test", None, None)
-    assert found.height_m == pytest.approx(near.mean() - (found.tops_m or 0.0), abs=TOLERANCE_M)
+    assert found.height_m == pytest.approx(near.mean() - found.tops_m, abs=TOLERANCE_M)
     assert found.height_std_m == pytest.approx(STD_MEASURED * found.height_m)
 
 

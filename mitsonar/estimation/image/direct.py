@@ -34,7 +34,7 @@ from mitsonar.estimation.image.direct_registration import Fit, Held, is_resolved
 from mitsonar.estimation.image.direct_relief import registered_over_relief
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.prior_gate import prior_rejection
-from mitsonar.geometry.attitude import Attitude, attitude_of
+from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
@@ -231,7 +231,7 @@ class Direct:
         if found is None:
             return replace(rejected("nothing in the frames to match"), about={"start": named})
         # far motions match the ground between rocks, too: rocks look different from elsewhere
-        std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m or 0.0))
+        std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m))
         unsure = replace(task, attitude=replace(task.attitude, height_std_m=std))
         return self._judged(unsure, start, *found, _far_model(task.frames, task.attitude.height_m), {"start": named})
 
@@ -247,8 +247,9 @@ class Direct:
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
         if fit.excess != UNMEASURED:
             about["stands_out"] = stands_out(fit.independent, fit.excess)
-        if task.attitude.tops_m is not None and self.relief_m is None:
-            about["height_std_m"] = task.attitude.height_std_m
+        if task.attitude.first is not None:
+            told_m = task.attitude.first.height_m  # over ground that rises the motion has another one
+            about |= {"height_m": told_m, "height_std_m": STD_MEASURED * told_m}
         return Estimate(motion, covariance, not reason, reason, about)
 
 

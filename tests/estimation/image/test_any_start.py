@@ -16,6 +16,7 @@ from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_ce
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import attitude_of
+from mitsonar.geometry.echo_heights import FirstEchoes
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.motion_prior import MotionPrior
@@ -185,8 +186,8 @@ def test_sums_over_blocks_and_values_on_cells() -> None:
 def test_far_covariances_know_the_relief_of_the_first_echoes(far: SonarFrames, monkeypatch: pytest.MonkeyPatch) -> None:
     """Contrast 0.1 m above the first echoes adds 0.1 m to the height's standard deviation: variances add, motions stay."""
     covariances, motion = [], []
-    for tops_m in (None, 0.05, 0.1):
-        told = replace(attitude_of(far, "direct", None, None), tops_m=tops_m)
+    for tops_m in (0.0, 0.05, 0.1):
+        told = replace(attitude_of(far, "direct", None, None), first=FirstEchoes(2.2, tops_m, False))
         monkeypatch.setattr(direct, "attitude_of", lambda *_, told=told: told)
         found = Direct().estimate(far, expected(FAR, mm=10, deg=0.3))
         assert found.covariance is not None
