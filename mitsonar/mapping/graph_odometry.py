@@ -124,7 +124,11 @@ def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:
         motions: sideways, forward [m], yaw [rad].
         canvas: the ground that frames show; None: not known how far ahead of the sonar.
     """
-    return ErrorCorrelation().of(motions, DEFAULT_REACH_M if canvas is None else canvas.reach_m)
+    if canvas is None:
+        return ErrorCorrelation().of(motions, DEFAULT_REACH_M)
+    # without relief errors are noise, which no two pairs share
+    law = ErrorCorrelation(share=0.0) if canvas.view.attitude.even else ErrorCorrelation()
+    return law.of(motions, canvas.reach_m)
 
 
 def graph_path(
