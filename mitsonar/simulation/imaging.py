@@ -103,8 +103,8 @@ class Simulator:
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        deforms = self.motion is not None and bool(self.motion.deformed)  # a launch has one shape of each body
-        self.pings_per_launch = 1 if deforms else max(1, rays_per_launch // max(traced.rays, cells))
+        # a launch has one shape of each body
+        self.pings_per_launch = 1 if self.tracer.deforms else max(1, rays_per_launch // max(traced.rays, cells))
         self.bounces = bounce_sums(scene, one, traced, mirrors)
         formed = None if self.former is None else one
         self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
