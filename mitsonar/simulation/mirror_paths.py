@@ -141,7 +141,7 @@ class MirrorPaths:
         if largest > allowed and not self.notes:
             self.notes.append(
                 f"the facets of the mirror {mirror.name} are {largest:.2g} m long where its echo comes from, more than half "
-                f" the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
+                f"the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
             )
 
 
