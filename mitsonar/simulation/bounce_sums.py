@@ -59,7 +59,8 @@ class BounceSums:
             )
         self.wavenumber = 2 * math.pi * (sonar.frequency_hz or 0.0) / sonar.sound_speed
         self.nearest = max(traced.range_min, traced.bin_m)
-        spread = max(1.0, traced.range_max / self.nearest) ** 2
+        # the last surface may be near and the path long: R^g / nearest^2 against the R^(g - 2) of one reflection
+        spread = max(1.0, traced.range_max / self.nearest) ** min(traced.gain_exponent, 2)
         self.tracer.bits = fraction_bits(traced, traced.rays, MOST_OF_A_RAY * spread)
         self.tables_of_mirrors: LaunchTables | None = None
         if found is not None:

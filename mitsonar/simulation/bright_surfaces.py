@@ -27,7 +27,7 @@ def bright_notes(scene: mi.Scene, surfaces: Surfaces) -> list[str]:
         shape = scene.shapes()[number]
         assert isinstance(shape, mi.Mesh)
         if (rows[first : first + shape.face_count()] > largest).any():
-            found.append(shape.id())
+            found.append(shape.id() or f"shape number {number}")  # Mitsuba merges meshes into one without a name
     if not found:
         return []
     names = ", ".join(sorted(found)[:3]) + (" ..." if len(found) > 3 else "")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -41,12 +40,13 @@ class ImageLaunch:
     formed: Sonar | None
     bounces: BounceSums | None
 
-    def compiled(self, pings: int, labels: bool) -> Callable[..., Any]:
-        """Compile the launch.
+    def compiled(self, pings: int, labels: bool) -> tuple[Callable[..., Any], DeviceArray]:
+        """Compile the launch; also return its first input, the numbers of the rays.
 
-        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes scene, rows
-        of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns heights, and of each view
-        the levels, counters, truth for labels, and the levels of one reflection where labels go by these.
+        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes these
+        numbers, scene, rows of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns
+        heights, and of each view the levels, counters, truth for labels, and the levels of one reflection where labels go by
+        these.
         """
         tracer, bounces = self.tracer, self.bounces
 
@@ -82,7 +82,7 @@ class ImageLaunch:
                     made.append((*joined, truth, first[0] if labels else None))
             return tracer.height_m(scene, rows), made
 
-        return partial(launch, Rays.numbered(tracer.sonar, pings))
+        return launch, Rays.numbered(tracer.sonar, pings)
 
     def _looks(self, scene: Any, rays: Rays, fan: Fan, echoes: Echoes, tables: Sequence[DeviceArray]) -> list[ViewEchoes]:
         """Return the echoes of each view."""

@@ -8,12 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import MitsonarError
 from mitsonar.simulation.mirror_planes import MirrorPlane
 
 __all__ = ["ROW", "MirrorWay", "mirror_ways", "mirrored_table"]
 
 ROW = 10
 """Numbers of a plane in :meth:`MirrorWay.rows`; the registry index of its shape is one more."""
+
+
+MOST_WAYS = 20_000
+"""Ways of one number of planes, at most: some 1 ms each, ping and receiver."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,17 @@ class MirrorWay:
 
 
 def mirror_ways(planes: Sequence[MirrorPlane], length: int) -> list[MirrorWay]:
-    """Return all sequences of ``length`` planes in which none follows itself."""
+    """Return all sequences of ``length`` planes in which none follows itself.
+
+    Raises:
+        MitsonarError: more than :data:`MOST_WAYS`.
+    """
+    count = len(planes) * (len(planes) - 1) ** (length - 1) if length else 1
+    if count > MOST_WAYS:
+        raise MitsonarError(
+            f"sound may meet the {len(planes)} planes of the mirrors in {count:,} orders of {length}: at most {MOST_WAYS:,} "
+            "are traced; give fewer mirrors, or fewer bounces"
+        )
     ways: list[tuple[MirrorPlane, ...]] = [()]
     for _ in range(length):
         ways = [(*way, plane) for way in ways for plane in planes if not way or way[-1] is not plane]

@@ -103,12 +103,12 @@ class Simulator:
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        deforms = self.motion is not None and bool(self.motion.deformed)  # a launch has one shape of each body
-        self.pings_per_launch = 1 if deforms else max(1, rays_per_launch // max(traced.rays, cells))
+        # a launch has one shape of each body
+        self.pings_per_launch = 1 if self.tracer.deforms else max(1, rays_per_launch // max(traced.rays, cells))
         self.bounces = bounce_sums(scene, one, traced, mirrors)
         formed = None if self.former is None else one
         self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
-        self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
+        self._launches: dict[tuple[int, bool], tuple[Callable[..., Any], Any]] = {}
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
 
@@ -171,7 +171,8 @@ class Simulator:
         inputs = self.tracer.inputs(poses, numbers)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
         mirrors = None if self.bounces is None else self.bounces.tables_of_mirrors
-        height, made = replayed(self._launches[key], scene, *inputs, tables, mirrors)
+        launch, rays = self._launches[key]
+        height, made = replayed(launch, rays, scene, *inputs, tables, mirrors)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
         for view, (image, counters, truth, single) in zip(self.views, made, strict=True):

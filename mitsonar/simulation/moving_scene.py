@@ -144,7 +144,7 @@ class SceneMotion:
         deformed: those that deform.
 
     Raises:
-        MitsonarError: a shape that the scene does not have, or that cannot deform.
+        MitsonarError: a shape that the scene does not have, or that cannot deform; a scene with instances.
     """
 
     def __init__(self, scene: mi.Scene, bodies: MovingBodies) -> None:
@@ -154,6 +154,11 @@ class SceneMotion:
         for name in bodies.shapes:
             if name not in names:
                 raise MitsonarError(f"moving: the scene has no shape {name}: {nearest_names(name, names)}")
+        instances = [shape.id() for shape in self.shapes if shape.class_name() == "Instance"]
+        if instances:
+            raise MitsonarError(
+                f"moving: bodies move in scenes without instances: got {', '.join(instances[:3])}; give these as meshes"
+            )
         moved = dict.fromkeys(bodies.shapes)
         self.numbers = {name: names.index(name) for name in moved}
         self.copies = [bodies.shapes.count(name) for name in moved]

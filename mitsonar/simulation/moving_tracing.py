@@ -85,7 +85,7 @@ class MovingTracer(Tracer):
 
     def __init__(self, motion: SceneMotion, sonar: Sonar) -> None:
         super().__init__(motion.scene, sonar)
-        self.motion = motion
+        self.motion, self.deforms = motion, bool(motion.deformed)
         self.surfaces = MovingSurfaces.of_motion(motion, sonar)
 
     def scene_at(self, time_s: ArrayLike) -> MovingScene:

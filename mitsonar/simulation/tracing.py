@@ -80,7 +80,10 @@ class Tracer:
 
     Attributes:
         notes: what a user should know about the scene's BSDFs and materials.
+        deforms: whether a body deforms, so that a launch is of one moment.
     """
+
+    deforms = False
 
     def __init__(self, scene: mi.Scene, sonar: Sonar) -> None:
         self.scene = scene

@@ -90,8 +90,18 @@ class VehicleSimulator:
         return sensors_in(self.scene, Pose(*vehicle.poses[0])) if self._sensors is None else self._sensors
 
     def bodies(self, vehicle: Trajectory) -> MovingBodies:
-        """Return the bodies that move while the vehicle flies a path."""
-        return MovingBodies.of(self.moving, vehicle=vehicle)
+        """Return the bodies that move while the vehicle flies a path.
+
+        Raises:
+            MitsonarError: a body moves and a sensor's records are of still scenes.
+        """
+        found = MovingBodies.of(self.moving, vehicle=vehicle)
+        listens = [name for name, one in self.sensors(vehicle).items() if isinstance(one.instrument, ChannelSonar)]
+        if len(found) and listens:
+            raise MitsonarError(
+                f"impulse responses are of still scenes: {found.shapes[0]} moves and {listens[0]} listens; leave one out"
+            )
+        return found
 
     def render(self, vehicle: Trajectory, *, labels: bool = False) -> dict[str, Record]:
         """Render all sensors into memory: frames, soundings, responses, pictures by the names of the sensors.

@@ -77,6 +77,20 @@ def test_ghosts_lie_where_image_sources_say(depth: float, place: tuple[float, fl
             assert seen[inside].sum() == pytest.approx(wanted[range_m], rel=0.05)
 
 
+def test_a_far_ghost_does_not_depend_on_where_the_window_begins() -> None:
+    """Without a gain a level at 60 m is some 1e-6 of the largest that a surface at 0.1 m could give."""
+    ball_far = sphere((0.0, 60.0, -4.0), 1.0, diffuse(MU))
+    loaded = scene(top=plate((0, 0, 0), np.array([0.0, 0, -1]), half=500.0, bsdf=diffuse(0.0)), ball=ball_far)
+    far = SONAR.replace(gain_exponent=0, elevation_fov_deg=30.0, range_max=80.0, rays_per_beam=200)
+    found = []
+    for begin, bins in ((0.1, 799), (40.0, 400)):
+        two = far.replace(range_min=begin, range_bins=bins, bounces=2)
+        whole = profile(loaded, two, 4.0, {"top": (-1.0, 0.0)}, 2)
+        found.append(whole.sum() - profile(loaded, two.replace(bounces=1), 4.0, {}, 2).sum())
+    assert found[0] > 0
+    assert found[0] == pytest.approx(found[1], rel=1e-3)
+
+
 def test_a_rough_surface_loses_by_its_height() -> None:
     """A path by one mirror loses exp(-4 k^2 h^2 cos^2) of its energy, by the same mirror twice that of its square."""
     at, depth = np.array([0.0, 5.0, -1.3]), 1.0
@@ -174,5 +188,7 @@ def test_bright_surfaces_are_told() -> None:
     loaded = scene(ground=floor(diffuse(0.5)))
     notes = Simulator(loaded, SONAR.replace(bounces=2)).notes
     assert any("above 1/pi" in note and "ground" in note for note in notes)
+    merged = scene(ground=floor(diffuse(0.5)), wall=plate((0, 9, 0), (0, -1, 0), half=1.0, bsdf=diffuse(0.5)))
+    assert any("by way of shape number 0 are" in note for note in Simulator(merged, SONAR.replace(bounces=2)).notes)
     assert not any("above 1/pi" in note for note in Simulator(loaded, SONAR).notes)
     assert not any("above 1/pi" in n for n in Simulator(scene(ground=floor(diffuse(0.3))), SONAR.replace(bounces=2)).notes)

@@ -40,6 +40,16 @@ def first_range(image: Array, range_m: Array) -> float:
     return float(range_m[np.nonzero(middle > 0.02 * middle.max())[0][0]])
 
 
+def test_clearances_are_of_the_shape_at_the_time_of_each_vehicle(balls: list[Path]) -> None:
+    from mitsonar.simulation.clearance import Clearance
+
+    growing = Deforming(fixed(Pose(0, AWAY_M, 0)), load_meshes(balls, 1.0, loop=False))
+    scene = separate(ball={"type": "ply", "filename": str(balls[0])})
+    clearance = Clearance(Simulator(scene, SONAR, moving={"ball": growing}).tracer)
+    places, time_s = np.zeros((3, 3)), np.array([0.0, 1.0, 2.0])
+    np.testing.assert_allclose(clearance.of(places, places, time_s), AWAY_M - 0.5 - 0.5 * time_s, atol=0.01)
+
+
 @pytest.mark.parametrize(
     ("changes", "tolerance"),
     [({}, 0.02), ({"model": "coherent", "frequency_hz": 1.8e6, "bearing": "cone", "azimuth_fov_deg": 4.0}, 0.03)],

@@ -250,6 +250,14 @@ def test_a_mesh_of_planes_is_a_tank() -> None:
     assert paths.amplitude[order] * lengths == pytest.approx([wanted[length] for length in sorted(wanted)], rel=1e-5)
 
 
+def test_more_orders_of_planes_than_can_be_traced_are_refused() -> None:
+    plates = {f"p{k}": plate((0, 0, 30.0 + k), (0, 0, -1), half=1.0) for k in range(40)}
+    parts = dict.fromkeys(plates, (0.5, 0.0))
+    with pytest.raises(MitsonarError, match=r"the 40 planes of the mirrors in 60,840 orders of 3: at most 20,000"):
+        ChannelSimulator(unmerged(**plates), instrument(bounces=3), mirrors=parts)
+    assert len(ChannelSimulator(unmerged(**plates), instrument(bounces=1), mirrors=parts).ways) == 42
+
+
 def test_mirrors_that_do_not_fit_are_refused() -> None:
     with pytest.raises(MitsonarError, match="bounces 3 need mirrors, and the scene has none: give reflection"):
         ChannelSimulator(guide(), instrument(points_per_m2=1e-3))

@@ -13,6 +13,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.scene import load_scene
 
 if TYPE_CHECKING:
     pass
@@ -132,6 +133,11 @@ def test_steps_are_the_frames_of_a_run() -> None:
 def test_mistakes_are_told(moving: Any, said: str) -> None:
     with pytest.raises(MitsonarError, match=said):
         Simulator(separate(floor=floor(), wall=plate((0, 0, 0), (0, -1, 0))), SONAR, moving=moving)
+
+
+def test_scenes_with_instances_are_refused() -> None:
+    with pytest.raises(MitsonarError, match=r"without instances: got cannon, barrel, boat; give these as meshes"):
+        Simulator(load_scene("objects"), SONAR, moving={"sand": fixed(Pose(0, 0, 0))})
 
 
 def test_mirrors_are_refused() -> None:

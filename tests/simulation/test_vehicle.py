@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.vehicle_run import run_vehicle
 from mitsonar.motion.pose import Pose, mount_between, mounted
@@ -18,7 +20,7 @@ from mitsonar.records.soundings import Soundings
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.moving_files import load_motions, motions_of
 from mitsonar.simulation.scene import load_scene
-from mitsonar.simulation.vehicle import VehicleSimulator, load_vehicle, sensors_in
+from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle, sensors_in
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 
@@ -72,6 +74,13 @@ def test_each_sensor_sees_what_it_would_alone(tank: Path) -> None:
     assert seen.body_names == ("fish", "skid")
     with pytest.raises(MitsonarError, match="500 m from the path"):
         sensors_in(scene, Pose(500, 0, 2))
+
+
+def test_hydrophones_and_bodies_that_move_are_refused(tank: Path) -> None:
+    tank.write_text(re.sub("<texture.*?</texture>", "", SCENE))  # only what is given says that it moves
+    sensors = {"ear": Mounted(ChannelSonar())}
+    with pytest.raises(MitsonarError, match=r"still scenes: fish moves and ear listens; leave one out"):
+        VehicleSimulator(load_scene(tank), sensors, moving={"fish": FISH}).render(PATH)
 
 
 def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
