@@ -137,7 +137,7 @@ def limit(scene: mi.Scene, sonar: mitsonar.Sonar, poses: np.ndarray) -> Callable
     from mitsonar.simulation.tracing import Rays, Tracer
 
     tracer = Tracer(scene, sonar)
-    rows, keys, _ = tracer.inputs(poses, 0)
+    rows, keys, _ = tracer.inputs(poses, range(len(poses)))
 
     index = Rays.numbered(sonar, len(poses))
 

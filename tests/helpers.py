@@ -80,6 +80,15 @@ def scene(**shapes: MitsubaDict) -> mi.Scene:
     return loaded
 
 
+def separate(**shapes: MitsubaDict) -> mi.Scene:
+    """A scene of these shapes, of which none are merged."""
+    import mitsuba as mi
+
+    loaded = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    assert isinstance(loaded, mi.Scene)
+    return loaded
+
+
 def place_of(scene: mi.Scene, name: str) -> int:
     """The index of a shape in the scene, as in ``shape_id``."""
     return [shape.id() for shape in scene.shapes()].index(name)

@@ -94,7 +94,7 @@ class SonarFleet:
 
     def renew(self, which: NDArray[np.bool_], generators: Sequence[np.random.Generator]) -> None:
         """Begin new episodes of the vehicles ``which`` ``(count,)``."""
-        for number in np.flatnonzero(which):
+        for number in map(int, np.flatnonzero(which)):
             part = generators[number].random(6)
             self.poses[number] = self._span[0] + part * (self._span[1] - self._span[0])
             self._first[number] = generators[number].integers(FIRST_PINGS)
@@ -132,11 +132,11 @@ class SonarFleet:
         Raises:
             MitsonarError: an action of another shape, or that is not finite.
         """
-        action = np.asarray(action, dtype=float)
-        if action.shape != (len(self.poses), 4) or not np.isfinite(action).all():
-            raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {action.shape}")
-        action, before = np.clip(action, -1, 1), self.poses.copy()
-        self.poses = steered(before, action * self.task.max_velocity, self.step_s)
+        given = np.asarray(action, dtype=float)
+        if given.shape != (len(self.poses), 4) or not np.isfinite(given).all():
+            raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {given.shape}")
+        taken, before = np.clip(given, -1, 1), self.poses.copy()
+        self.poses = steered(before, taken * np.asarray(self.task.max_velocity), self.step_s)
         self.steps += 1
         self.renew(renewed, generators)
         before[renewed] = self.poses[renewed]
@@ -145,7 +145,7 @@ class SonarFleet:
         low, high = self.task.box
         outside = ((self.poses[:, :3] < low) | (self.poses[:, :3] > high)).any(axis=1)
         collided = clearance_m < self.task.clearance_m
-        return Transition(action, before, self.poses.copy(), image, altitude_m, clearance_m, collided, outside)
+        return Transition(taken, before, self.poses.copy(), image, altitude_m, clearance_m, collided, outside)
 
     def rewards(self, step: Transition) -> Table:
         """Return the rewards of a step ``(count,)``.

@@ -176,7 +176,8 @@ class _Reader:
 
     def _pieces(self, file: Path, part: Element, scope: Scope, link: str) -> list[Piece]:
         """Return the geometry of a visual or collision in the axes of its link."""
-        kind = next(iter(part.find("geometry") if part.find("geometry") is not None else ()), None)
+        geometry = part.find("geometry")
+        kind = None if geometry is None else next(iter(geometry), None)
         if kind is None or kind.tag == "empty":
             return []
         if kind.tag in NOT_READ or kind.find("submesh") is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -28,7 +29,7 @@ def simulator() -> Simulator:
 def test_the_checker_of_gymnasium_finds_nothing() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        named = {"scene": "objects", "sonar": SONAR, "start": START}
+        named: dict[str, Any] = {"scene": "objects", "sonar": SONAR, "start": START}
         check_env(gymnasium.make("mitsonar/Sonar-v0", **named).unwrapped)
         more = gymnasium.make("mitsonar/Sonar-v0", observe=("image", "altitude", "pose"), render_mode="rgb_array", **named)
         check_env(more.unwrapped)
@@ -42,9 +43,12 @@ def test_vehicles_stepped_together_see_what_each_sees_alone(simulator: Simulator
         alone = [one.reset(seed=5 + place)[0], *(one.step(action[place])[0] for action in actions)]
         for all_of_them, own in zip(together, alone, strict=True):
             assert isinstance(all_of_them, np.ndarray)
+            assert isinstance(own, np.ndarray)
             np.testing.assert_array_equal(all_of_them[place], own)
-    assert together[0].max() > 100
-    assert not np.array_equal(together[0][0], together[0][1])
+    first = together[0]
+    assert isinstance(first, np.ndarray)
+    assert first.max() > 100
+    assert not np.array_equal(first[0], first[1])
 
 
 def test_a_vehicle_that_sinks_collides_and_begins_anew(simulator: Simulator) -> None:

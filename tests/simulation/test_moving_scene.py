@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from helpers import MitsubaDict, box, diffuse, floor, plate, sphere
+from helpers import box, diffuse, floor, plate, separate, sphere
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -15,22 +15,13 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:
-    import mitsuba as mi
+    pass
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 
 SONAR = Sonar.create(range_min=2, range_max=9, beams=12, azimuth_fov_deg=14, range_bins=256, quality="draft")
 COHERENT = SONAR.replace(model="coherent", frequency_hz=1.8e6, bearing="cone", azimuth_fov_deg=3.6, scatterers_per_cell=6)
 HERE = Pose(0, 0, 1.0, 0.1)
-
-
-def separate(**shapes: MitsubaDict) -> mi.Scene:
-    """A scene whose meshes stay apart."""
-    import mitsuba as mi
-
-    loaded = mi.load_dict({"type": "scene", **shapes}, optimize=False)
-    assert isinstance(loaded, mi.Scene)
-    return loaded
 
 
 def fixed(pose: Pose) -> Trajectory:

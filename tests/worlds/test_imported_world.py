@@ -22,13 +22,13 @@ from mitsonar.worlds.world import World
 def middle_of(world: World, name: str) -> np.ndarray:
     """The middle of the box around a shape [m]."""
     (mesh,) = [mesh for mesh in world.meshes if mesh.shape_id == name]
-    return (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+    return np.asarray((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2)
 
 
 def edges_of(world: World, name: str) -> np.ndarray:
     """The edges of the box around a shape [m]."""
     (mesh,) = [mesh for mesh in world.meshes if mesh.shape_id == name]
-    return np.ptp(mesh.vertices, axis=0)
+    return np.asarray(np.ptp(mesh.vertices, axis=0))
 
 
 # ---------------------------------------------------------------- URDF
@@ -52,8 +52,8 @@ def test_a_scaled_mesh_a_colour_and_a_mimic_are_read(tmp_path: Path) -> None:
     world = imported_world(tmp_path / "crane.urdf", reflectivity="red", joints={"shoulder": 1.0})
     meshes = {mesh.shape_id: mesh for mesh in world.meshes}
     assert set(meshes) == {"base", "arm", "hand", "twin"}
-    assert (meshes["base"].reflectivity == 1).all()  # orange has red 1
-    assert (meshes["arm"].reflectivity == 0.5).all()  # no colour
+    assert np.all(meshes["base"].reflectivity == 1)  # orange has red 1
+    assert np.all(meshes["arm"].reflectivity == 0.5)  # no colour
     ball = meshes["hand"].vertices - meshes["hand"].vertices.mean(axis=0)
     out = np.array([np.cos(1.5), np.sin(1.5), 0])
     assert np.ptp(ball @ out) == pytest.approx(2.0, rel=1e-6)  # twice as long along its own x

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -120,8 +121,13 @@ def make_both(folder: Path) -> None:
     """)
 
 
+def imported_below(folder: Path, name: str) -> object:
+    """Import one of the files of a folder."""
+    return imported_world(folder / name)
+
+
 USD = {
-    f"USD, {name}": Reader(make_both, spoil_file(name, how), lambda folder, name=name: imported_world(folder / name))
+    f"USD, {name}": Reader(make_both, spoil_file(name, how), partial(imported_below, name=name))
     for name, how in (("stage.usda", changed_text), ("crate.usdc", changed_bytes))
 }
 
