@@ -153,7 +153,7 @@ def test_errors_over_relief_are_alike_and_those_over_even_ground_are_not() -> No
     assert found.correlated is not None
     assert found.correlated.share == 0.9
     even, _, _ = lit_plane(Sonar(range_min=2.0, range_max=7.0), 2.5, np.radians(35))
-    canvas = Canvas.of(even.select([0]))
+    canvas = Canvas.of(even.select(np.array([0])))
     assert canvas is not None
     apart = replace(found, correlated=errors_along(found.series.motions, canvas))
     assert apart.correlated is not None
