@@ -133,7 +133,7 @@ def test_images_have_ghosts_where_the_flat_surface_says_and_waves_take_a_part(tm
         ball = {"type": "sphere", "center": [0, 4.4, 9.2], "radius": 0.05, "bsdf": diffuse(0.3)}
         scene = mi.load_dict({"type": "scene", "surface": surface, "ball": ball}, optimize=False)
         (ping,) = Simulator(scene, sonar, mirrors={"surface": (-1.0, 0.0)}).pings(np.array([0, 0, 9.2, 0, 0, 0]))
-        return np.asarray(ping.levels[0], dtype=float).sum(axis=1)
+        return np.asarray(np.asarray(ping.levels[0], dtype=float).sum(axis=1))
 
     flat = levels(0.0, 0)
     for part, range_m in zip(near, ranges_m, strict=True):

@@ -28,7 +28,7 @@ from mitsonar.worlds.world import Mesh, stream, whole
 P = 1e-5
 """Smallest p-value. Seeds are fixed, so a right distribution fails never or always; one seed in 100,000 fails."""
 
-SMALL = {
+SMALL: dict[str, dict[str, Any]] = {
     "rocky-field": {"size_m": 6, "a_side": (3, 5)},
     "ship-hull": {"size_m": 6, "groups_a_side": (1, 2), "anodes_a_side": (2, 3)},
     "pattern": {},
