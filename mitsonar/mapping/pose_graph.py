@@ -90,6 +90,14 @@ class CorrelatedErrors(NamedTuple):
     onward: Array
     slope_std: Array
 
+    def by_slopes(self, motions: ArrayLike) -> Array:
+        """Return the derivative of errors by the nine slopes over motions ``(n, 3)``, in their stds ``(n, 3, 9)``."""
+        moved = np.asarray(motions, dtype=float)
+        table = np.zeros((len(moved), 3, 3, 3))
+        for axis in range(3):
+            table[:, axis, axis] = moved * self.slope_std[axis]
+        return table.reshape(-1, 3, 9)
+
 
 @dataclass(frozen=True)
 class PoseGraph:

@@ -150,7 +150,8 @@ def test_the_table_names_options_that_there_are() -> None:
 
     tree: Any = typer.main.get_command(application())
     for name, options in OPTIONS.items():
-        command = tree.commands["world"].get_command(None, "mesh") if name == "mesh" else tree.commands[name]
+        world = {"mesh": "mesh", "import_scene": "import"}.get(name)
+        command = tree.commands[name] if world is None else tree.commands["world"].get_command(None, world)
         there = {option for parameter in command.params for option in parameter.opts}
         assert {option for option in options.values() if option.startswith("--")} <= there, name
 
