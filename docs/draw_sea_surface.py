@@ -47,6 +47,7 @@ def main() -> None:
     print_winds()
     print_steps()
     print_costs(quick)
+    print_ghosts(1 if quick else 12)
     with tempfile.TemporaryDirectory() as folder:
         draw(Path(folder if quick else Path(__file__).parent / "gallery") / "sea_surface.png", Path(folder), quick)
 
@@ -83,6 +84,40 @@ def print_costs(quick: bool) -> None:
         begun = time.process_time()
         sea.surface(SEED)
         print(f"{cells} x {cells} squares: {time.process_time() - begun:.2f} s")
+
+
+def print_ghosts(seas: int) -> None:
+    """Print the energy of a ball's ghosts in images over that by a flat surface, mean and standard deviation."""
+    keys = {"elevation_fov_deg": 60, "range_min": 3.5, "range_max": 7, "range_bins": 700}
+    sonar = mitsonar.Sonar.create(model="physical", bounces=3, frequency_hz=9e5, **keys)
+    straight, image = 4.35, math.hypot(4.4, 1.6) - 0.05
+    near = [np.abs(sonar.range_m - range_m) < 0.03 for range_m in ((straight + image) / 2, image)]
+    flat = np.ones(2)
+    for wind in (0.0, 0.5, 1.0, 2.0, 4.0):
+        sea = SeaSurface(wind_m_s=wind, size_m=12.0, step_m=0.05)
+        sums = np.array([[level[part].sum() for part in near] for level in ball_levels(sea, sonar, seas if wind else 1)])
+        flat = sums[0] if wind == 0 else flat
+        mean, spread = (sums / flat).mean(axis=0), (sums / flat).std(axis=0)
+        print(f"| {wind:g} m/s | {' | '.join(f'{a:.2f} +- {b:.2f}' for a, b in zip(mean, spread, strict=True))} |")
+
+
+def ball_levels(sea: SeaSurface, sonar: mitsonar.Sonar, seas: int) -> list[NDArray[np.float64]]:
+    """Return levels over range of a ball 0.8 m below each of some seas ``(ranges,)``."""
+    import mitsuba as mi
+
+    dark, bright = ({"type": "diffuse", "reflectance": value} for value in (0.0, 0.3))
+    ball = {"type": "sphere", "center": [0, 4.4, 9.2], "radius": 0.05, "bsdf": bright}
+    found = []
+    for seed in range(seas):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "surface.ply"
+            sea.save(path, seed)
+            surface = {"type": "ply", "filename": str(path), "face_normals": True, "bsdf": dark}
+            scene = mi.load_dict({"type": "scene", "surface": surface, "ball": ball}, optimize=False)
+        assert isinstance(scene, mi.Scene)
+        (ping,) = mitsonar.Simulator(scene, sonar, mirrors={"surface": (-1.0, 0.0)}).pings(np.array([0, 0, 9.2, 0, 0, 0]))
+        found.append(np.asarray(ping.levels[0], dtype=float).sum(axis=1))
+    return found
 
 
 def below(sea: SeaSurface, folder: Path) -> mi.Scene:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.worlds.families import create_family
@@ -109,3 +110,36 @@ def test_what_does_not_fit_is_refused_in_a_sentence(options: dict[str, Any], sai
     with pytest.raises(MitsonarError, match=said) as refusal:
         create_family("sea-surface", **{**SMALL, **options})
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.usefixtures("variant")
+def test_images_have_ghosts_where_the_flat_surface_says_and_waves_take_a_part(tmp_path: Path) -> None:
+    """A ball of 5 cm, 0.8 m below: one way by the surface half the way round, both ways the image's range; within 5 mm."""
+    import mitsuba as mi
+    from helpers import diffuse
+
+    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.simulation.imaging import Simulator
+
+    straight, image = 4.4 - 0.05, math.hypot(4.4, 1.6) - 0.05
+    ranges_m = straight, (straight + image) / 2, image
+    keys = {"elevation_fov_deg": 60, "range_min": 3.5, "range_max": 7, "range_bins": 700}
+    sonar = Sonar.create(model="physical", bounces=3, frequency_hz=9e5, **keys)
+    near = [np.abs(sonar.range_m - range_m) < 0.03 for range_m in ranges_m]
+
+    def levels(wind: float, seed: int) -> NDArray[np.float64]:
+        SeaSurface(wind_m_s=wind, size_m=12.0, step_m=0.05).save(tmp_path / "sea.ply", seed)
+        surface = {"type": "ply", "filename": str(tmp_path / "sea.ply"), "face_normals": True, "bsdf": diffuse(0.0)}
+        ball = {"type": "sphere", "center": [0, 4.4, 9.2], "radius": 0.05, "bsdf": diffuse(0.3)}
+        scene = mi.load_dict({"type": "scene", "surface": surface, "ball": ball}, optimize=False)
+        (ping,) = Simulator(scene, sonar, mirrors={"surface": (-1.0, 0.0)}).pings(np.array([0, 0, 9.2, 0, 0, 0]))
+        return np.asarray(np.asarray(ping.levels[0], dtype=float).sum(axis=1))
+
+    flat = levels(0.0, 0)
+    for part, range_m in zip(near, ranges_m, strict=True):
+        first = np.flatnonzero(flat[part] > 0.2 * flat[part].max())[0]
+        assert sonar.range_m[part][first] == pytest.approx(range_m, abs=0.005)
+    waves = np.mean([levels(2.0, seed) for seed in range(4)], axis=0)
+    left = [waves[part].sum() / flat[part].sum() for part in near]
+    assert left[0] == pytest.approx(1, abs=1e-3)
+    assert 0.2 < left[1] < 0.9
