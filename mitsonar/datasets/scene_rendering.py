@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
-from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
+from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import mounted
@@ -26,7 +26,7 @@ from mitsonar.simulation.variant import release_memory
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_small_worlds"]
+__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_worlds"]
 
 FRAMES_A_SCENE = 10_000_000
 """A ping's number is its scene's number times this, plus its position in the scene: jitter does not depend on the size of
@@ -43,12 +43,13 @@ class SceneRenderer:
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self.recipe, self.scene = recipe, scene
-        self.simulator = Simulator(loaded_world(recipe, scene), instrument_in(recipe, scene), views=recipe.views)
+        world, sonar = loaded_world(recipe, scene), instrument_in(recipe, scene)
+        self.simulator = Simulator(world, sonar, views=recipe.views, mirrors=recipe.mirrors)
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
         """Compute the gain of the data set and its inverse; see :func:`calibrate`."""
-        refuse_small_worlds(recipe)
+        refuse_worlds(recipe)
         gain = calibrate(recipe)
         return {"gain": gain, "level_scale": 1 / gain}
 
@@ -126,15 +127,25 @@ def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
         return loaded
 
 
-def refuse_small_worlds(recipe: Recipe) -> None:
-    """Refuse scenes of the user's own that are smaller than the recipe says, before anything is rendered.
+def refuse_worlds(recipe: Recipe) -> None:
+    """Refuse scenes of the user's own that are smaller than the recipe says, and worlds without the mirrors that it names.
+
+    Nothing is rendered yet. Of each group of scenes one world is looked at.
 
     Raises:
-        MitsonarError: one is smaller than its ``size_m``, or cannot be loaded.
+        MitsonarError: one is smaller than its ``size_m``, lacks a mirror, or cannot be loaded.
     """
-    own = {repr(recipe.family(group)): group for group in range(len(recipe.scenes)) if not recipe.family(group).seeded}
-    for group in own.values():
-        loaded_world(recipe, Scene(0, group, 0, 1))
+    from mitsonar.simulation.mirror_parts import mirror_of
+
+    families = [recipe.family(group) for group in range(len(recipe.scenes))]
+    looked_at = {repr(family): group for group, family in enumerate(families) if recipe.mirrors or not family.seeded}
+    for group in looked_at.values():
+        world = loaded_world(recipe, Scene(0, group, world_seed(recipe.seed, 0), 1))
+        if mirror_of(world, recipe.mirrors) is None and recipe.mirrors:
+            raise MitsonarError(
+                f"mirrors: no shape of the worlds of scenes.{group} reflects: got {recipe.mirrors}; give [reflection, rms "
+                "height in m] by the ids of shapes, or shapes of materials that have both"
+            )
     release_memory()
 
 

@@ -325,14 +325,9 @@ def coherent_imager(
     """Return what renders pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: receivers elsewhere, cones, or portions with mirrors; mirrors in other models.
+        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
     """
     if sonar.model != "coherent":
-        if mirrors and sonar.bounces == 1:
-            raise MitsonarError(
-                f"the model {sonar.model} has no mirrors: give the sonar model coherent"
-                + (", or bounces 2" if sonar.model == "physical" else "")
-            )
         return None
     return CoherentImager(scene, sonar, mirrors, views, motion)
 

@@ -51,6 +51,7 @@ class Simulator:
 
     Attributes:
         gain: of the closed loop that :meth:`step` renders; None before its first ping.
+        mirrors: as given.
 
     Raises:
         MitsonarError: no sonar given and none in the scene.
@@ -85,7 +86,7 @@ class Simulator:
                     "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300)"
                 )
             sonar = found[0]
-        self.sonar = sonar
+        self.sonar, self.mirrors = sonar, mirrors
         self.motion = motion_in(scene, moving)
         check_timed(sonar, self.motion, views, mirrors)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
