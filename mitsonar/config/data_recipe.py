@@ -37,8 +37,8 @@ __all__ = [
 
 _Made = TypeVar("_Made", bound=RecipePart)
 
-ADDED = ("recorded", "mirrors")
-"""Keys that are not written where they are null."""
+ADDED = ("recorded", "mirrors", "bodies")
+"""Keys that are not written where they are null or empty."""
 
 
 class Recipe(RecipePart):
@@ -77,11 +77,14 @@ class Recipe(RecipePart):
     mirrors: MirrorKeys = Field(
         None, description="shapes that reflect as mirrors: [reflection, rms height in m] by their ids, or materials"
     )
+    bodies: list[str] = Field(
+        default_factory=list, max_length=10_000, description="bodies that move, whose poses and velocities are stored"
+    )
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
         """Leave out what later versions added where it is not used: stores and checkpoints keep their digests."""
-        return {key: value for key, value in handler(self).items() if key not in ADDED or value is not None}
+        return {key: value for key, value in handler(self).items() if key not in ADDED or value}
 
     @model_validator(mode="before")
     @classmethod
@@ -130,10 +133,11 @@ class Recipe(RecipePart):
             )
         if self.recorded is None:
             return
-        other = self.world or self.channel is not None or self.receivers or self.segments or self.mirrors
+        other = self.world or self.channel is not None or self.receivers or self.segments or self.mirrors or self.bodies
         if other or self.store != "images":
             raise MitsonarError(
-                "recorded frames are images of one sonar: leave out world, channel, receivers, segments, mirrors and store"
+                "recorded frames are images of one sonar: leave out world, channel, receivers, segments, mirrors, bodies "
+                "and store"
             )
         if len(self.scenes) != len(self.recorded.sources) or any(group.count != 1 for group in self.scenes):
             raise MitsonarError("each source of recorded frames is one scene")
@@ -155,6 +159,8 @@ class Recipe(RecipePart):
             raise MitsonarError("labels are pixels: store images or both with them")
         if any(view.sonar.ping_groups > 1 for view in self.views):
             raise MitsonarError("a ping of a data set has one pose: leave out ping_groups, or set it to 1")
+        if len(set(self.bodies)) < len(self.bodies):
+            raise MitsonarError(f"bodies are named once each: got {shortened(self.bodies)}")
         if self.recorded is None:
             check_image_mirrors(self.instrument, self.views, bool(self.mirrors))
 
@@ -173,6 +179,7 @@ class Recipe(RecipePart):
             "store": "images",
             "pixel": "uint8",
             "gain": None,
+            "bodies": [],
         }
         other = [name for name, value in plain.items() if getattr(self, name) != value]
         other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []

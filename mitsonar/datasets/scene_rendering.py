@@ -14,7 +14,7 @@ from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
@@ -25,6 +25,8 @@ from mitsonar.simulation.variant import release_memory
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
+    from mitsonar.simulation.moving_scene import SceneMotion
 
 __all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_worlds"]
 
@@ -45,6 +47,7 @@ class SceneRenderer:
         self.recipe, self.scene = recipe, scene
         world, sonar = loaded_world(recipe, scene), instrument_in(recipe, scene)
         self.simulator = Simulator(world, sonar, views=recipe.views, mirrors=recipe.mirrors)
+        self.bodies = body_places(recipe, self.simulator.motion)
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
@@ -58,7 +61,7 @@ class SceneRenderer:
 
         Bodies that the scene's file moves are where they are at frame / ``frame_rate_hz``.
         """
-        time_s = (first + np.arange(len(poses))) / self.simulator.sonar.frame_rate_hz
+        time_s = self._time_s(first, len(poses))
         number = self.scene.number * FRAMES_A_SCENE + first
         return self.simulator.render_views(poses, first=number, labels=labels, time_s=time_s)
 
@@ -74,7 +77,17 @@ class SceneRenderer:
         for batch in self.render_views(poses, first, labels=bool(self.recipe.labels)):
             start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
             self._fill({name: array[start : start + len(batch[0])] for name, array in values.items()}, batch, gain)
+        if self.bodies:
+            states = self.simulator.bodies(self._time_s(first, len(poses)))
+            assert states.poses is not None
+            assert states.velocities is not None
+            values["body_pose"][:] = states.poses[:, self.bodies]
+            values["body_velocity"][:] = states.velocities[:, self.bodies]
         return values
+
+    def _time_s(self, first: int, frames: int) -> NDArray[np.float64]:
+        """Return the times of frames of the scene, of which its moving bodies are functions ``(frames,)`` [s]."""
+        return np.asarray((first + np.arange(frames)) / self.simulator.sonar.frame_rate_hz, dtype=np.float64)
 
     def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
         """Render frames at the poses of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
@@ -112,6 +125,20 @@ def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
     return sonar.replace(seed=int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0]))
 
 
+def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:
+    """Return the places of the recipe's bodies among those that move in a scene.
+
+    Raises:
+        MitsonarError: a body that does not move there.
+    """
+    known = () if motion is None else motion.bodies.names
+    for name in recipe.bodies:
+        if name not in known:
+            there = nearest_names(name, known) if known else "nothing moves there"
+            raise MitsonarError(f"bodies: no body {shortened(name)} moves in the scene: {there}")
+    return [known.index(name) for name in recipe.bodies]
+
+
 def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
     """Build a scene's world in a temporary folder, and load it.
 
@@ -133,14 +160,17 @@ def refuse_worlds(recipe: Recipe) -> None:
     Nothing is rendered yet. Of each group of scenes one world is looked at.
 
     Raises:
-        MitsonarError: one is smaller than its ``size_m``, lacks a mirror, or cannot be loaded.
+        MitsonarError: one is smaller than its ``size_m``, lacks a mirror or a body that moves, or cannot be loaded.
     """
     from mitsonar.simulation.mirror_parts import mirror_of
+    from mitsonar.simulation.moving_scene import motion_in
 
     families = [recipe.family(group) for group in range(len(recipe.scenes))]
-    looked_at = {repr(family): group for group, family in enumerate(families) if recipe.mirrors or not family.seeded}
+    every = bool(recipe.mirrors or recipe.bodies)
+    looked_at = {repr(family): group for group, family in enumerate(families) if every or not family.seeded}
     for group in looked_at.values():
         world = loaded_world(recipe, Scene(0, group, world_seed(recipe.seed, 0), 1))
+        body_places(recipe, motion_in(world, None) if recipe.bodies else None)
         if mirror_of(world, recipe.mirrors) is None and recipe.mirrors:
             raise MitsonarError(
                 f"mirrors: no shape of the worlds of scenes.{group} reflects: got {recipe.mirrors}; give [reflection, rms "
