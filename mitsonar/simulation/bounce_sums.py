@@ -22,6 +22,7 @@ from mitsonar.simulation.bounce_walk import Arrival, Vertex, Walk, at_most_one
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of, smooth_share
+from mitsonar.simulation.moving_tracing import MovingSurfaces
 from mitsonar.simulation.reflections import overlap
 from mitsonar.simulation.view_echoes import ViewEchoes, WholeTracer, fraction_bits
 
@@ -120,9 +121,9 @@ class BounceSums:
         )
         origin = mi.Point3f(*(line.w for line in lines))
         table, width = None if mirrors is None else mirrors["parts"], (echoes.far_m - echoes.near_m) * 0.25
-        walk = Walk(
-            scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, fan.below, fan.above, fan.aside, width
-        )
+        moment: DeviceArray = mi.Float(rays.moment) if isinstance(surfaces, MovingSurfaces) else None
+        cell = fan.below, fan.above, fan.aside, width
+        walk = Walk(scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, *cell, moment)
         sums: mi.UInt64 | None = None
         for arrival in walk.arrivals(begin, rays.ray, keys):
             for heard in self._heard(arrival, echoes, fan, lines, rays):

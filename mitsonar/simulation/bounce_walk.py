@@ -118,6 +118,7 @@ class Walk:
     above: DeviceArray
     aside: DeviceArray
     width: DeviceArray
+    moment: DeviceArray = None
 
     def arrivals(self, begin: Vertex, ray: DeviceArray, key: DeviceArray) -> Iterator[Arrival]:
         """Yield the arrivals of two reflections, then those of three.
@@ -142,7 +143,10 @@ class Walk:
         gain = now.gain * dr.select(mirror, dr.square(now.reflection), now.reflectivity * dr.pi)
         begin = going_on(now.place, d, now.n)
         active = now.valid & (gain > 0)
-        hit = self.surfaces.hit(self.scene, mi.Ray3f(now.place + d * begin, d), active)
+        onward = mi.Ray3f(now.place + d * begin, d)
+        if self.moment is not None:
+            onward.time = self.moment
+        hit = self.surfaces.hit(self.scene, onward, active)
         reflection: DeviceArray = mi.Float(0)
         if self.mirrors is not None:
             part, roughness_m = parts_at(self.mirrors, hit)
@@ -171,7 +175,7 @@ class Walk:
         u = way / distance
         toward = dr.dot(now.n, u)
         lit = now.valid & (now.reflectivity > 0) & (toward * dr.dot(now.n, now.d) > 0)
-        lit &= ~hidden(self.scene, mi.Point3f(now.place), now.n, u, distance, lit)
+        lit &= ~hidden(self.scene, mi.Point3f(now.place), now.n, u, distance, lit, self.moment)
         half = (now.length + distance) * 0.5
         low, high = self._edges(now, u, half)
         cosine = dr.abs(toward)

@@ -31,6 +31,8 @@ from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.hashed_points import HashedPoints, Point
 from mitsonar.simulation.mirror_parts import parts_at, smooth_share, without_mirror_part
+from mitsonar.simulation.moving_scene import scene_at
+from mitsonar.simulation.moving_tracing import MovingSurfaces
 from mitsonar.simulation.reflections import going_on, mirrored_lines, overlap
 from mitsonar.simulation.tracing import hidden
 from mitsonar.simulation.variant import replayed
@@ -49,11 +51,13 @@ class MirroredRays:
         rays: as they are seen from the image of the sonar.
         hit: where they end now, ``t`` from that image [m].
         gain: amplitude that the mirrors have left.
+        body: number of the body that they meet; 0: what stands still.
     """
 
     rays: FanRays
     hit: Hit
     gain: DeviceArray
+    body: DeviceArray
 
 
 class GhostTracer:
@@ -71,29 +75,30 @@ class GhostTracer:
         self.bits = tracer.bits - int(math.log2(PATHS))
         self.launch = self._compile()
 
-    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64]) -> None:
-        """Add the ghosts of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` [m, rad]."""
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
+        """Add the ghosts of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` and a time [s]."""
         direct = self.direct
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
-        inputs = direct.index, direct.scene, rows, direct.surfaces.arrays(), direct.patches, direct.mirrors
+        scene = scene_at(direct.scene, direct.motion, time_s)
+        bodies = None if direct.motion is None else mi.Float64(direct.motion.body_lines(time_s).ravel().tolist())
+        inputs = direct.index, scene, rows, direct.surfaces.arrays(), direct.patches, direct.mirrors, bodies
         real, imag = replayed(self.launch, *inputs)
         field.real += np.array(real, copy=False).reshape(field.shape)
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 
     def _compile(self) -> Callable[..., Any]:
         @dr.freeze
-        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any, bodies: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.direct.fan, self.sonar, index, lines)
             surfaces = replace(self.direct.surfaces, **tables)
             hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
-            now = MirroredRays(rays, hit, mi.Float(1))
+            now = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
             for number in range(2, self.sonar.bounces + 1):
                 now = mirrored_on(scene, surfaces, now, mirrors, self.wavenumber)
-                self._sum(
-                    scene, rays, now, mirrors, patches, (sums[0], sums[1]), retro=number == 2 and self.sonar.bounces > 2
-                )
+                retro = number == 2 and self.sonar.bounces > 2
+                self._sum(scene, rays, now, mirrors, patches, (sums[0], sums[1]), retro=retro, bodies=bodies)
             dr.eval(sums)
             return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
 
@@ -109,6 +114,7 @@ class GhostTracer:
         sums: tuple[mi.UInt64, mi.UInt64],
         *,
         retro: bool,
+        bodies: mi.Float64 | None,
     ) -> None:
         """Sum the points that rays behind mirrors look through."""
         hit = without_mirror_part(mirrors, now.hit, now.rays.d, self.wavenumber)
@@ -121,6 +127,13 @@ class GhostTracer:
         straight &= self._within((hit.t + distance) * 0.5, now)
         straight &= ~hidden(scene, mi.Point3f(place), hit.n, u, distance, straight)
         back = matt & self._within(hit.t, now) if retro else mi.Bool(False)
+        if bodies is not None:  # all that follows is in the axes of the body that is hit
+            assert isinstance(self.direct.surfaces, MovingSurfaces)
+            turn = [[dr.gather(mi.Float64, bodies, now.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
+            rays, now = in_body(turn, rays), replace(now, rays=in_body(turn, now.rays))
+            normal = [mi.Float(row[0]) * hit.n.x + mi.Float(row[1]) * hit.n.y + mi.Float(row[2]) * hit.n.z for row in turn]
+            lattice = self.direct.surfaces.own_lattice(scene, hit, now.body)
+            hit, place = replace(hit, n=mi.Normal3f(*normal), shape_id=lattice), now.rays.origin + now.rays.d * hit.t
         points = HashedPoints(
             replace(hit, valid=straight | back),
             place,
@@ -220,7 +233,25 @@ def mirrored_on(
     place: DeviceArray = rays.origin + rays.d * hit.t
     beyond = rays.from_lines(mirrored_lines(rays.lines, hit.n, place))
     begin = going_on(place, beyond.d, hit.n)
-    found = surfaces.hit(scene, mi.Ray3f(mi.Point3f(place + beyond.d * begin), beyond.d), active)
+    onward, body = mi.Ray3f(mi.Point3f(place + beyond.d * begin), beyond.d), mi.UInt32(0)
+    if isinstance(surfaces, MovingSurfaces):
+        found, body = surfaces.hit_and_body(scene, onward, active)
+    else:
+        found = surfaces.hit(scene, onward, active)
     length = dr.norm(place - beyond.origin) + begin + found.t
     gain = now.gain * reflection * smooth_share(roughness_m, dr.dot(hit.n, rays.d), wavenumber)
-    return MirroredRays(beyond, replace(found, t=length, valid=found.valid & active), gain)
+    return MirroredRays(beyond, replace(found, t=length, valid=found.valid & active), gain, body)
+
+
+def in_body(turn: list[list[DeviceArray]], rays: FanRays) -> FanRays:
+    """Return rays in the axes of bodies.
+
+    Args:
+        turn: three rows of what turns the world's axes to those of each ray's body, in double precision.
+        rays: in the world.
+    """
+    lines = rays.lines
+    carried = [[sum(row[k] * lines[k][column] for k in range(3)) for column in range(4)] for row in turn]
+    for row, line in zip(turn, carried, strict=True):
+        line[3] += row[3]
+    return rays.from_lines(carried)

@@ -54,7 +54,7 @@ class Simulator:
         mirrors: as given.
 
     Raises:
-        MitsonarError: no sonar given and none in the scene.
+        MitsonarError: no sonar given and none in the scene; mirrors that move.
     """
 
     def __init__(
@@ -74,6 +74,7 @@ class Simulator:
         from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.expected_former import expected_former
         from mitsonar.simulation.image_launch import ImageLaunch
+        from mitsonar.simulation.mirror_parts import refuse_moving_mirrors
         from mitsonar.simulation.moving_scene import motion_in
         from mitsonar.simulation.moving_tracing import tracer_of
         from mitsonar.simulation.scene import sonar_in
@@ -89,6 +90,8 @@ class Simulator:
         self.sonar, self.mirrors = sonar, mirrors
         self.motion = motion_in(scene, moving)
         check_timed(sonar, self.motion, views, mirrors)
+        if self.motion is not None:
+            refuse_moving_mirrors(scene, mirrors, self.motion.bodies.shapes)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
             bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}

@@ -83,13 +83,9 @@ def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirr
     """Refuse what has no bodies that move, and no groups of beams.
 
     Raises:
-        MitsonarError: receivers elsewhere or portions; bodies that move, with mirrors or several reflections; mirrors in
-            a model without them.
+        MitsonarError: receivers elsewhere or portions; mirrors in a model without them.
     """
     what = "bodies that move" if moving else "ping groups" if sonar.ping_groups > 1 else ""
-    if moving and (mirrors or sonar.bounces > 1):
-        other = "mirrors" if mirrors else "bounces"
-        raise MitsonarError(f"{other} are of still scenes: leave {other} or bodies that move out")
     check_image_mirrors(sonar, views, bool(mirrors))
     if what and any(not isinstance(view, Whole) for view in views or ()):
         raise MitsonarError(f"receivers elsewhere and portions have no {what}: render the whole view")

@@ -134,11 +134,6 @@ def test_mistakes_are_told(moving: Any, said: str) -> None:
         Simulator(separate(floor=floor(), wall=plate((0, 0, 0), (0, -1, 0))), SONAR, moving=moving)
 
 
-def test_mirrors_are_refused() -> None:
-    with pytest.raises(MitsonarError, match="mirrors are of still scenes"):
-        Simulator(separate(wall=floor()), COHERENT, moving={"wall": along(5)}, mirrors={"wall": (0.5, 0.0)})
-
-
 def test_poses_of_bodies_are_kept(tmp_path: Any) -> None:
     from mitsonar.records.sonar_frames import SonarFrames
 
