@@ -24,6 +24,7 @@ from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of, smooth_share
 from mitsonar.simulation.moving_tracing import MovingSurfaces
 from mitsonar.simulation.reflections import overlap
+from mitsonar.simulation.second_mirrors import SecondMirrors
 from mitsonar.simulation.view_echoes import ViewEchoes, WholeTracer, fraction_bits
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ class BounceSums:
         self.nearest = max(traced.range_min, traced.bin_m)
         spread = max(1.0, traced.range_max / self.nearest) ** 2
         self.tracer.bits = fraction_bits(traced, traced.rays, MOST_OF_A_RAY * spread)
+        self.second = SecondMirrors.of(scene, found, self.wavenumber) if sonar.bounces > 2 else None
         self.tables_of_mirrors: LaunchTables | None = None
         if found is not None:
             lawless = [float(shape.bsdf() is None or material_of(shape) is None) for shape in scene.shapes()]
@@ -123,7 +125,7 @@ class BounceSums:
         table, width = None if mirrors is None else mirrors["parts"], (echoes.far_m - echoes.near_m) * 0.25
         moment: DeviceArray = mi.Float(rays.moment) if isinstance(surfaces, MovingSurfaces) else None
         cell = fan.below, fan.above, fan.aside, width
-        walk = Walk(scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, *cell, moment)
+        walk = Walk(scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, *cell, moment, self.second)
         sums: mi.UInt64 | None = None
         for arrival in walk.arrivals(begin, rays.ray, keys):
             for heard in self._heard(arrival, echoes, fan, lines, rays):

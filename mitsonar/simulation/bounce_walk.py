@@ -24,6 +24,7 @@ from mitsonar.simulation.bistatic import half_path_rate
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.mirror_parts import parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.reflections import going_on, lambert_direction, reflected
+from mitsonar.simulation.second_mirrors import SecondMirrors
 from mitsonar.simulation.tracing import hidden
 
 __all__ = ["Arrival", "Vertex", "Walk", "at_most_one"]
@@ -119,6 +120,7 @@ class Walk:
     aside: DeviceArray
     width: DeviceArray
     moment: DeviceArray = None
+    second: SecondMirrors | None = None
 
     def arrivals(self, begin: Vertex, ray: DeviceArray, key: DeviceArray) -> Iterator[Arrival]:
         """Yield the arrivals of two reflections, then those of three.
@@ -133,6 +135,7 @@ class Walk:
             now = self._next(now, ray, key + (DRAWS + number))
             if number == 2 and self.bounces > 2 and self.mirrors is not None:
                 yield self._back_again(now)
+                yield from self._by_others(begin, now)
             yield self._straight(now)
 
     def _next(self, now: Vertex, ray: DeviceArray, key: DeviceArray) -> Vertex:
@@ -209,6 +212,30 @@ class Walk:
             pure=now.pure,
             same=True,
         )
+
+    def _by_others(self, first: Vertex, now: Vertex) -> Iterator[Arrival]:
+        """Yield what left by one mirror and arrives by another. The reverse is that of the ray to the other mirror."""
+        if self.second is None:
+            return
+        met = now.valid & now.pure & (now.reflectivity > 0)
+        point, mirror = (now.place, now.n), (first.place, first.n)
+        for way in self.second.ways(self.scene, self.origin, point, mirror, met, self.moment):
+            half = (now.length + way.distance) * 0.5
+            toward = dr.dot(now.n, way.u)
+            cosine = dr.abs(toward)
+            low, high = self._edges(now, way.u, half)
+            yield Arrival(
+                active=met & way.is_open & (toward * dr.dot(now.n, now.d) > 0),
+                reflectivity=now.reflectivity * now.gain * dr.square(way.factor),
+                cosine=dr.select(cosine < 1, cosine, 1),
+                distance=way.distance,
+                range_m=half,
+                low_m=low,
+                high_m=high,
+                toward=reflected(way.u, mi.Vector3f(way.mirror.normal)),
+                reverse=mi.Bool(False),
+                pure=mi.Bool(True),
+            )
 
     def _edges(self, now: Vertex, u: DeviceArray, half: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Return half the path by way of a cell's lower and upper edge, on the tangent plane; ``u`` from the other end."""

@@ -88,7 +88,7 @@ class CoherentImager:
         self.tracer = self.tracers[self.sides[0]]
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts, motion=motion)
         several = parts is not None and sonar.bounces > 1
-        self.ghosts = GhostTracer(self.tracer) if several else None
+        self.ghosts = GhostTracer(self.tracer, parts) if several else None
         self.diffuse = DiffuseField(self.tracer) if sonar.bounces > 1 else None
         cornered = parts if several else None
         self.corners = None if cornered is None else CornerTracer(scene, sonar, self.former, cornered, motion=motion)

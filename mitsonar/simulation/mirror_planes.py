@@ -19,6 +19,9 @@ MOST_PLANES = 16
 MOST_FACETS = 2_000_000
 """Triangles of a curved mirror, at most: 1 ms of processor time a thousand and ping."""
 
+FLAT = ("Rectangle", "Disk")
+"""Mitsuba's shapes that are flat."""
+
 SAME_PLANE = 2e-6
 """Facets are on one plane where normals and offsets (as a part of the mesh's size) differ by less."""
 
@@ -87,7 +90,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             continue
         name = shape.id()
         kind = shape.class_name()
-        if not isinstance(shape, mi.Mesh) and kind not in ("Rectangle", "Disk"):
+        if not isinstance(shape, mi.Mesh) and kind not in FLAT:
             found.notes.append(
                 f"shape {name} ({kind.lower()}) is curved and mirrors nothing in impulse responses: give it as a mesh"
             )
@@ -103,6 +106,18 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             )
         else:
             found.facets.append(MirrorFacets(name, corners, *part))
+    return found
+
+
+def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]:
+    """Return the planes of a scene's flat mirrors; mirrors that are not flat have none."""
+    found = []
+    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+        assert mirrors is not None
+        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        if part[0] != 0 and (isinstance(shape, mi.Mesh) or shape.class_name() in FLAT):
+            planes = _planes(_triangles(shape)) or []
+            found += [MirrorPlane(shape.id(), place, normal, offset, *part) for normal, offset in planes]
     return found
 
 

@@ -118,6 +118,7 @@ def test_a_moving_point_has_the_ghosts_of_image_sources() -> None:
             assert np.angle(ratio) == pytest.approx(0, abs=0.03), time
 
 
+@pytest.mark.thorough
 def test_bodies_hide_mirrors_and_leave_those_beside_them_as_they_are() -> None:
     """A corner of two mirrors glints: with a body elsewhere as without it, and not at all behind the body."""
     shapes = {
