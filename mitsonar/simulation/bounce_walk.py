@@ -8,7 +8,7 @@ integral over all directions. Each further surface P of reflectivity C that the 
 
 with the angle and the range of P from the sonar: the source lights P straight, and the ray's cell dOmega hears it. The range
 is half of the path. A path and its reverse have one length. What begins at a mirror is not drawn from its other end, so the
-caller adds the reverse. Rays to P by one mirror and back by the same are a third kind, of three reflections.
+caller adds the reverse. Rays to P by one mirror and back by the same or another one are further kinds, of three.
 """
 
 from __future__ import annotations
@@ -107,6 +107,8 @@ class Walk:
         origin: of the sonar [m].
         below, above, aside: elevations of the edges and bearing of the middle of each ray's cell, relative to the ray [rad].
         width: half-length of the path's range interval by way of rough surfaces [m].
+        moment: number of the moment of each ray in a scene that moves; None: a still scene.
+        second: planes for ways back by another mirror; None: there are no such ways.
     """
 
     scene: mi.Scene

@@ -7,9 +7,9 @@ R + R', there and back the other way round, of amplitude
 
     V exp(-2 k^2 h^2 cos^2) zeta sqrt(C cos cos' dA) / (R R')
 
-By the same mirror both ways it gives one of length 2 R', of three reflections. Points, weights and grid are those of one
-reflection, so ghosts carry the speckle of what they are ghosts of. Whether the sonar sees a point straight is tested once a
-ray, at the point that the ray meets.
+By the same mirror both ways it gives one of length 2 R', of three reflections, and by another mirror back one of R' + R''.
+Points, weights and grid are those of one reflection, so ghosts carry the speckle of what they are ghosts of. Whether the
+sonar sees a point straight is tested once a ray, at the point that the ray meets.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class GhostTracer:
 
     def _sum(
         self,
-        scene: mi.Scene,
+        scene: DeviceArray,
         rays: FanRays,
         now: MirroredRays,
         mirrors: mi.Float,
@@ -263,7 +263,7 @@ def _any_of(ways: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray
 
 
 def mirrored_on(
-    scene: mi.Scene, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
+    scene: DeviceArray, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
 ) -> MirroredRays:
     """Follow rays that meet mirrors to the next surface; others end.
 

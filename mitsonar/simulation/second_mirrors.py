@@ -112,10 +112,12 @@ class SecondMirrors:
             way: DeviceArray = mi.Vector3d(*exact) - image
             distance = dr.norm(way)
             row = PlaneRow(
-                list(sonar),
-                [mi.Float64(value) for value in plane.normal.tolist()],
-                *(mi.Float64(value) for value in (plane.offset, plane.reflection, plane.roughness_m)),
-                mi.UInt32(mirror.registry),
+                image=list(sonar),
+                normal=[mi.Float64(value) for value in plane.normal.tolist()],
+                offset=mi.Float64(plane.offset),
+                reflection=mi.Float64(plane.reflection),
+                roughness_m=mi.Float64(plane.roughness_m),
+                registry=mi.UInt32(mirror.registry),
             )
             other = active & ~_on(plane, *first)
             is_open, factor = unfolded(scene, scattering, list(image), [row], self.wavenumber, other, moment)
