@@ -91,6 +91,19 @@ def test_bytes_do_not_change_with_machine_or_version(name: str, wanted: str) -> 
     assert hashlib.sha256(content).hexdigest()[:16] == wanted
 
 
+@pytest.mark.parametrize("name", sorted(FAMILIES))
+def test_a_sea_surface_is_one_shape_more(name: str, tmp_path: Path) -> None:
+    """All else stays; it lies flat at its height, and reaches beyond the world."""
+    plain, covered = (create_family(name, **SMALL[name], **more).build(7) for more in ({}, {"surface_m": 4.5}))
+    content = covered.xml().replace(covered.surface.xml() if covered.surface else "", "")
+    assert content.split() == plain.xml().split()
+    loaded = load_scene(covered.write(tmp_path / "world"))
+    surface = loaded.shapes()[place_of(loaded, "surface")]
+    low, high = (np.array(end, dtype=float).ravel() for end in (surface.bbox().min, surface.bbox().max))
+    np.testing.assert_allclose((low[2], high[2]), 4.5, rtol=1e-6)
+    assert high[0] > create_family(name, **SMALL[name]).half_m + 20
+
+
 def test_a_folder_that_holds_something_is_kept(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("years of work")
     with pytest.raises(MitsonarError, match="kept as it is"):
