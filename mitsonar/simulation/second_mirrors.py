@@ -117,6 +117,7 @@ class SecondMirrors:
                 offset=mi.Float64(plane.offset),
                 reflection=mi.Float64(plane.reflection),
                 roughness_m=mi.Float64(plane.roughness_m),
+                slab_m=mi.Float64(0),
                 registry=mi.UInt32(mirror.registry),
             )
             other = active & ~_on(plane, *first)
