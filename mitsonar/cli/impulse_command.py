@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, Frame, scene_parameters
+from mitsonar.cli.flown_path import SIX, Frame
+from mitsonar.cli.render_command import scene_parameters
 from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
