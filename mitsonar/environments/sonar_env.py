@@ -55,7 +55,7 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
-        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask(**task))
+        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create(**task))
         self.render_mode = render_mode
         self.action_space, self.observation_space = action_space(), observation_space(self.fleet)
         self._image: NDArray[np.uint8] | None = None
@@ -74,7 +74,13 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         Returns:
             Observation, reward, whether the vehicle collided or left its bounds, whether the episode is cut off, and what
             else is known.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            MitsonarError: an action of another shape, or that is not finite.
         """
+        if self._image is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
         fleet = self.fleet
         moved = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
         self._image = moved.image[0]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias
+from dataclasses import dataclass, fields
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,9 @@ OBSERVABLE = ("image", "altitude", "pose")
 """What can be observed."""
 
 VELOCITY = ("starboard", "forward", "up", "turn")
+
+FULL_TURNS = np.array([np.pi, np.pi, 4 * np.pi])
+"""Largest pitch, roll and heading of a start [rad]; a heading may be drawn across 360 deg."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Transition:
 
 
 Reward: TypeAlias = Callable[[Transition], ArrayLike]
-"""Gives the reward of each vehicle ``(n,)``."""
+"""Gives the reward of each vehicle ``(n,)``, or one number for all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class SonarTask:
         clearance_m: distance to a surface below which a vehicle has collided [m].
         max_steps: steps after which an episode is cut off; default: none.
         observe: of :data:`OBSERVABLE`; the image alone is a box, several are a dictionary.
-        reward: of each step; default: 0.
+        reward: of each step, by its :class:`Transition`; default: 0.
         gain: of the image; default: by eight poses of ``start``.
         noise: of the image; default: none.
         altimeter_m: an altitude beyond is told as this [m].
@@ -85,6 +88,19 @@ class SonarTask:
     noise: NoiseModel | None = None
     altimeter_m: float = 100.0
 
+    @classmethod
+    def create(cls, **given: Any) -> Self:
+        """Create a task from its fields.
+
+        Raises:
+            MitsonarError: an unknown field, a value that is not allowed.
+        """
+        known = [field.name for field in fields(cls)]
+        wrong = next((name for name in given if name not in known), None)
+        if wrong is not None:
+            raise MitsonarError(f"unknown field {wrong[:80]} of an environment: {nearest_names(wrong, known)}")
+        return cls(**given)
+
     def __post_init__(self) -> None:
         for name, least in (("step_s", 1e-6), ("gain", 0.0), ("max_steps", 1), ("clearance_m", 0.0), ("altimeter_m", 1e-6)):
             value = getattr(self, name)
@@ -97,7 +113,24 @@ class SonarTask:
         if unknown or "image" not in self.observe or isinstance(self.observe, str):
             wrong = str(unknown[0] if unknown else self.observe)
             raise MitsonarError(f"observe is a tuple of image and others: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}")
-        self.span, self.box  # noqa: B018  # refuse them now
+        self.refuse_outside(self.span)
+
+    def refuse_outside(self, span: Table) -> None:
+        """Refuse poses where episodes begin ``(2, 6)`` that lie outside the bounds, or whose angles are no radians.
+
+        Raises:
+            MitsonarError: one does, or is.
+        """
+        low, high = self.box
+        for pose in span[np.isfinite(span).all(axis=1)]:
+            shown = ", ".join(f"{value:g}" for value in pose)
+            if (pose[:3] < low).any() or (pose[:3] > high).any():
+                raise MitsonarError(
+                    f"start lies outside bounds, where every episode ends at its first step: got {shown}, and bounds "
+                    f"{low.tolist()}, {high.tolist()}; move one of them"
+                )
+            if (np.abs(pose[3:]) > FULL_TURNS).any():
+                raise MitsonarError(f"start is x, y, z [m], pitch, roll, heading in rad: got {shown}; are these degrees?")
 
     @property
     def span(self) -> Table:

@@ -140,7 +140,7 @@ def refuse_unread_motions(state: mi.parser.ParserState) -> None:
     for node in state.nodes if paths else ():
         if node.type == mi.ObjectType.Scene:  # there a texture only waits to be referred to
             continue
-        for name in node.props.keys():
+        for name in list(node.props):
             kind, held = node.props.type(name), node.props[name]
             inside = kind == kinds.ResolvedReference and held.index() in paths
             named = kind == kinds.Reference and held.id() in ids
@@ -148,8 +148,8 @@ def refuse_unread_motions(state: mi.parser.ParserState) -> None:
                 shown = "without a name" if name.startswith("_arg_") else f'with name="{name[:80]}"'
                 where = f"{node.props.plugin_name()} {node.props.id()}".strip()
                 raise MitsonarError(
-                    f'the texture trajectory in {where} stands there {shown}: nothing would move; write name="{MOTION}", in a '
-                    "shape"
+                    f"the texture trajectory in {where} stands there {shown}: nothing would move; write "
+                    f'name="{MOTION}", in a shape'
                 )
 
 
