@@ -285,6 +285,12 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     for printed in (listed.stdout, one.stdout):  # rays and errors of each quality
         assert re.search(errors, printed, re.MULTILINE)
     refused(mitsonar("presets", "gemini"), "gemini-720is")
+    instruments = ("ping2", "a50", "deltat-837", "sonar-3d-15", "starfish-450f")
+    assert all(re.search(rf"^{name} +\w", listed.stdout, re.MULTILINE) for name in instruments)
+    ping = mitsonar("presets", "ping2")
+    assert re.search(r"mounts +\{'down'.* ours: straight down", ping.stdout)
+    assert re.search(r"range_max +30 +ours, inside the instrument's 100 m", ping.stdout)
+    assert "starfish-450f: Blueprint" in mitsonar("presets", "sidescan").stdout
     assert "sunken_ship" in mitsonar("scenes").stdout
     doctor = mitsonar("doctor")
     assert doctor.returncode == 0, doctor.stderr
