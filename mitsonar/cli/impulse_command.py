@@ -87,10 +87,11 @@ def impulse(
         f"{spread.doppler_hz:.3g} Hz"
     )
     still, twice = iteration_error(flown, speeds, sonar)
-    say(
-        f"motion during the travel of sound changes the phase by up to {still:.3g} turns at {sonar.range_max:g} m, which is "
-        f"counted exactly (two iterations, as in Almanza-Medina, would leave {twice:.2g})"
-    )
+    if still > 0:
+        say(
+            f"motion during the travel of sound changes the phase by up to {still:.3g} turns at {sonar.range_max:g} m, "
+            f"which is counted exactly (two iterations, as in Almanza-Medina, would leave {twice:.2g})"
+        )
     say(f"figures: {folder / 'response.png'}, {folder / 'waterfall.png'}")
 
 
