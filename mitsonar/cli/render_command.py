@@ -36,7 +36,7 @@ def render(
     trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM or CSV file, or `shipped`.")] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
-    model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
+    model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
     quality: Annotated[
         str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
     ] = None,
