@@ -30,6 +30,12 @@ GROUPS = {
     "Bodies that move": ("Deforming", "load_meshes", "load_motions", "range_rates", "particle_mesh", "net_mesh"),
     "Sea surface": ("SeaSurface",),
     "Several sensors": ("VehicleSimulator", "Mounted", "load_vehicle"),
+    "Environments": (
+        "SonarEnv",
+        "SonarVectorEnv",
+        "environments.sonar_task.SonarTask",
+        "environments.sonar_task.Transition",
+    ),
     "Records": ("SonarFrames", "ImpulseResponses", "Echogram", "Soundings", "load_frames", "open_recording", "write_mcap"),
     "Estimation and mapping": (
         "create_estimator",
@@ -56,7 +62,8 @@ GROUPS = {
     ),
     "Errors": ("MitsonarError", "MitsonarWarning"),
 }
-"""Public names by subject. Names that mitsonar does not have are left out; those of no group come last."""
+"""Public names by subject, and names of modules with dots. Names that mitsonar does not have are left out; those of no group
+come last."""
 
 
 def python_page() -> str:
@@ -65,11 +72,12 @@ def python_page() -> str:
     groups = {**GROUPS, "Others": tuple(name for name in mitsonar.__all__ if name not in known)}
     parts = [
         "# Python",
-        "These names are in `mitsonar` itself. They are loaded when they are first used: `import mitsonar` loads no "
-        "Mitsuba and no torch. Errors that a user can cause are `MitsonarError`, with one sentence.",
+        "These names are in `mitsonar` itself, those with dots in its modules. They are loaded when they are first used: "
+        "`import mitsonar` loads no Mitsuba and no torch. Errors that a user can cause are `MitsonarError`, with one "
+        "sentence.",
     ]
     for title, names in groups.items():
-        public = [name for name in names if name in mitsonar.__all__]
+        public = [name for name in names if name in mitsonar.__all__ or "." in name]
         if public:
             parts += [f"## {title}", *(f"::: mitsonar.{name}" for name in public)]
     return "\n\n".join(parts) + "\n"

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, TypedDict
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render_command import NOISE, SIX, Frame, instrument_for, path_for, scene_parameters
+from mitsonar.cli.flown_path import SIX, Frame, path_for
+from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:

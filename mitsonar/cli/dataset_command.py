@@ -11,9 +11,9 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
+from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.frames_command import Least, Out, Picture, Polygons, To, Without, exported
 from mitsonar.cli.odometry_command import Geometry
-from mitsonar.cli.render_command import Frame
 from mitsonar.errors import MitsonarError
 
 __all__ = ["datasets"]

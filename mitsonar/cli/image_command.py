@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import NOISE, Frame
+from mitsonar.cli.flown_path import Frame
+from mitsonar.cli.render_command import NOISE
 from mitsonar.errors import MitsonarError
 
 __all__ = ["image"]

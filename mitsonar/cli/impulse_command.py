@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, Frame, scene_parameters
+from mitsonar.cli.flown_path import SIX, Frame
+from mitsonar.cli.render_command import scene_parameters
 from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
@@ -91,10 +92,11 @@ def impulse(
         f"{spread.doppler_hz:.3g} Hz"
     )
     still, twice = iteration_error(flown, speeds, sonar)
-    say(
-        f"motion during the travel of sound changes the phase by up to {still:.3g} turns at {sonar.range_max:g} m, which is "
-        f"counted exactly (two iterations, as in Almanza-Medina, would leave {twice:.2g})"
-    )
+    if still > 0:
+        say(
+            f"motion during the travel of sound changes the phase by up to {still:.3g} turns at {sonar.range_max:g} m, "
+            f"which is counted exactly (two iterations, as in Almanza-Medina, would leave {twice:.2g})"
+        )
     say(f"figures: {folder / 'response.png'}, {folder / 'waterfall.png'}")
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.odometry_command import Frames, Geometry
-from mitsonar.cli.render_command import NOISE, Frame
+from mitsonar.cli.render_command import NOISE
 from mitsonar.errors import MitsonarError, meant
 from mitsonar.io.run_directory import refuse_to_replace
 

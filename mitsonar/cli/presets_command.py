@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mitsonar.cli.console import answered, say
+from mitsonar.errors import MitsonarError, nearest_names, shortened
+
+if TYPE_CHECKING:
+    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.named_sonars import NamedSonar
 
 __all__ = ["presets", "scenes"]
 
@@ -16,23 +21,11 @@ __all__ = ["presets", "scenes"]
 def presets(
     name: Annotated[str | None, typer.Argument(help="One preset: every number with its source.")] = None,
 ) -> None:
-    """Print the sonars that can be named, or one of them with the document behind each number."""
-    from mitsonar.acoustics.sonar_losses import absorption_line
-    from mitsonar.instruments.imaging_sonar import RAYS
+    """Print the sonars and instruments that can be named, or one of them with the document behind each number."""
     from mitsonar.instruments.named_sonars import named_sonars, preset
 
     if name is not None:
-        sonar, sources = preset(name), named_sonars()[name].sources
-        say(f"{name}: {named_sonars()[name].about}")
-        for key, value in sonar.model_dump(exclude={"name"}).items():
-            shown = f"{value:g}" if isinstance(value, float) else "-" if value is None else str(value)
-            source = sources.get(key, "from quality" if key in RAYS else "default")
-            say(f"  {key:18} {shown:10} {source}")
-        if line := absorption_line(sonar):
-            say(f"  {line}")
-        for line in _accuracy([name]):
-            say(line)
-        return
+        return _one(name)
     say(f"{'preset':22} {'az x el (deg)':14} {'beams':>5} {'width':>6}  {'window (m)':12} {'bins':>5}  instrument")
     for key, (title, *_) in named_sonars().items():
         sonar = preset(key)
@@ -40,9 +33,60 @@ def presets(
         field = f"{sonar.azimuth_fov_deg:g} x {sonar.elevation_fov_deg:g}"
         window = f"{sonar.range_min:g}..{sonar.range_max:g}"
         say(f"{key:22} {field:14} {sonar.beams:5} {width:>6}  {window:12} {sonar.range_bins:5}  {title}")
-    for line in _accuracy(list(named_sonars())):
+    for line in [*_instruments(), *_accuracy(list(named_sonars()))]:
         say(line)
     say("`mitsonar presets NAME` prints where each number comes from; docs/guides/sonars.md tells how to write your own.")
+
+
+def _one(name: str) -> None:
+    """Print a preset: each number with its source.
+
+    Raises:
+        MitsonarError: neither a sonar nor an instrument, with the nearest names.
+    """
+    from mitsonar.instruments.named_sonars import named_sonars, preset
+    from mitsonar.instruments.named_sounders import OF_KIND, load_sounder, named_sounders
+
+    sonars, sounders = named_sonars(), named_sounders()
+    found = OF_KIND.get(name, name)
+    if found not in sonars and found not in sounders:
+        raise MitsonarError(f"unknown preset {shortened(name)}: {nearest_names(name, [*sonars, *sounders])}")
+    if found in sonars:
+        _print_keys(found, sonars[found], preset(found))
+        for line in _accuracy([found]):
+            say(line)
+    else:
+        sounder = load_sounder(found)
+        _print_keys(found, sounders[found], sounder.fan, sounder.model_dump(exclude={"name", "fan"}))
+
+
+def _print_keys(name: str, known: NamedSonar, sonar: Sonar, own: dict[str, object] | None = None) -> None:
+    """Print every key with its source: those of an instrument first, then those of its sonar."""
+    from mitsonar.acoustics.sonar_losses import absorption_line
+    from mitsonar.instruments.imaging_sonar import RAYS
+
+    say(f"{name}: {known.about}")
+    for key, value in {**(own or {}), **sonar.model_dump(exclude={"name"})}.items():
+        shown = f"{value:g}" if isinstance(value, float) else "-" if value is None else str(value)
+        say(f"  {key:18} {shown:10} {known.sources.get(key, 'from quality' if key in RAYS else 'default')}")
+    if line := absorption_line(sonar):
+        say(f"  {line}")
+
+
+def _instruments() -> list[str]:
+    """Return a line for each instrument of `mitsonar sound`."""
+    from mitsonar.instruments.named_sounders import load_sounder, named_sounders
+
+    lines = [
+        "",
+        f"{'instrument of `sound`':22} {'kind':14} {'fans':>5} {'beams':>6}  {'window (m)':12} {'bins':>5}  instrument",
+    ]
+    for key, known in named_sounders().items():
+        one = load_sounder(key)
+        fan, window = one.fan, f"{one.fan.range_min:g}..{one.fan.range_max:g}"
+        count = f"{len(one.channels):5} {fan.beams:6}"
+        lines.append(f"{key:22} {one.kind:14} {count}  {window:12} {fan.range_bins:5}  {known.about}")
+    return lines
 
 
 def _accuracy(names: list[str]) -> list[str]:

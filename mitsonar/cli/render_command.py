@@ -8,40 +8,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, warn_of_speed
+from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.motion.pose import Pose
-    from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.moving_files import Said
 
-__all__ = ["NOISE", "SIX", "Frame", "instrument_for", "path_for", "render", "scene_parameters", "sonar_changes"]
+__all__ = ["NOISE", "instrument_for", "moving_said", "render", "scene_parameters", "sonar_changes"]
 
-SIX = "x,y,z,pitch,roll,heading in m and deg"
 NOISE = (
     "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
     "pixels are empty"
 )
-
-Frame = Annotated[
-    str,
-    typer.Option(help="Convention of pose files, read and written: mitsonar, ros-enu or ned (not of --from)."),
-]
 
 
 @answered
 def render(
     scene: Annotated[str, typer.Argument(help="Mitsuba XML file, or the name of a shipped scene (`mitsonar scenes`).")],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/SCENE).")] = None,
-    frames: Annotated[int | None, typer.Option(help="Number of frames.")] = None,
+    frames: Annotated[int | None, typer.Option(help=FRAMES)] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
+    speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
     trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM or CSV file, or `shipped`.")] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
-    model: Annotated[str | None, typer.Option(help="physical or thesis.")] = None,
+    model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
     quality: Annotated[
         str | None, typer.Option(help="draft, standard or fine: rays by the error wanted (`mitsonar presets`).")
     ] = None,
@@ -105,13 +100,15 @@ def render(
         file = vehicle_file(vehicle, all_sensors, sonar)
         changes |= {name: value for name, value in (("model", model), ("seed", seed)) if value is not None}
         begin = first_pose(loaded) if file is None else None
-        flown = path_for(Sonar(), begin, scene, frames, start, end, trajectory, frame)
+        flown = path_for(Sonar(), begin, scene, frames, start, end, trajectory, frame, speed)
+        warn_of_speed(flown, end, speed)
         said = moving_said(loaded, moving or [], named, [] if file is None else file.said)
         options = VehicleOptions(changes, overwrite, resume)
         return render_vehicle(loaded, file, flown, folder, outputs, said, origin, options)
     instrument, attitude = instrument_for(loaded, sonar, model, seed, changes)
     refuse_noise(outputs.noise, instrument)
-    path = path_for(instrument, attitude, scene, frames, start, end, trajectory, frame)
+    path = path_for(instrument, attitude, scene, frames, start, end, trajectory, frame, speed)
+    warn_of_speed(path, end, speed)
     if mirrors and instrument.model != "coherent" and instrument.bounces == 1:
         raise MitsonarError(
             f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one"
@@ -124,6 +121,7 @@ def render(
     origin |= {"mirrors": True} if mirrors else {}
     origin |= {"moving": digests_of(said)} if said else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
+    origin["path"] |= {} if speed is None else {"speed": speed}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
     for sentence in report.warnings:
@@ -199,50 +197,3 @@ def instrument_for(
             f"{change['quality']}; leave it out, or give --set rays_per_beam=N"
         )
     return sonar, found[1] if found else None
-
-
-def path_for(
-    sonar: Sonar,
-    attitude: Pose | None,
-    scene: str,
-    frames: int | None,
-    start: str | None,
-    end: str | None,
-    file: Path | None,
-    frame: str,
-) -> Trajectory:
-    """Return the poses that the options say."""
-    from mitsonar.instruments.ping_groups import frame_period_s
-    from mitsonar.motion.pose import Pose
-    from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.simulation.scene import shipped_trajectory
-
-    if frames is not None and frames < 1:
-        raise MitsonarError(f"--frames must be at least 1: got {frames}")
-    if file is not None:
-        if start or end:
-            raise MitsonarError("--trajectory and --from/--to contradict each other: give one")
-        shipped = str(file) == "shipped"
-        if not shipped and not file.exists():
-            raise MitsonarError(
-                f"there is no trajectory {file}: give a TUM or CSV file, or `shipped`{meant(file, ['shipped'])}"
-            )
-        flown = Trajectory.load_tum(shipped_trajectory(scene)) if shipped else Trajectory.load(file, frame)
-        return flown if frames is None else flown.resample(frames)
-    first = numbers(start, 6, "--from")
-    last = numbers(end, 6, "--to")
-    begin = Pose.from_degrees(first) if first else attitude
-    if begin is None:
-        raise MitsonarError(f"the scene gives no pose: give one with --from ({SIX}), or --trajectory FILE.tum")
-    if last is None:
-        return Trajectory.between(begin, begin, _ends(sonar, frames or 1), 1 / frame_period_s(sonar))
-    if frames is None or frames < 2:
-        raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
-    return Trajectory.between(begin, Pose.from_degrees(last), _ends(sonar, frames), 1 / frame_period_s(sonar))
-
-
-def _ends(sonar: Sonar, frames: int) -> int:
-    """Return the poses of a path that has so many frames; those of a head that turns are the sweeps between poses."""
-    from mitsonar.instruments.ping_groups import scans
-
-    return frames + 1 if scans(sonar) and frames > 1 else frames

@@ -13,15 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitsonar.cli.console import answered, say
-from mitsonar.cli.render_command import (
-    NOISE,
-    SIX,
-    Frame,
-    instrument_for,
-    path_for,
-    scene_parameters,
-    sonar_changes,
-)
+from mitsonar.cli.flown_path import SIX, Frame, path_for
+from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters, sonar_changes
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, Frame, moving_said, path_for, scene_parameters, sonar_changes
+from mitsonar.cli.flown_path import SIX, SPEED, Frame, path_for, warn_of_speed
+from mitsonar.cli.render_command import moving_said, scene_parameters, sonar_changes
 
 __all__ = ["sound"]
 
@@ -21,9 +22,12 @@ def sound(
         typer.Option(help="sidescan, altimeter, profiler, dvl, range-image, a preset (`mitsonar presets`) or a YAML file."),
     ],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="Folder to make (default: out/INSTRUMENT).")] = None,
-    frames: Annotated[int | None, typer.Option(help="Number of pings.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of pings; with --trajectory evenly spaced in time over all of it.")
+    ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
+    speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
     trajectory: Annotated[Path | None, typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`.")] = None,
     frame: Frame = "mitsonar",
     model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
@@ -57,7 +61,8 @@ def sound(
     sounder = sounder.replace(**changes) if changes else sounder
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
-    flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame)
+    flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame, speed)
+    warn_of_speed(flown, end, speed)
     said = moving_said(loaded, moving or [], named)
     bodies = MovingBodies.of(read_said(said), named, flown)
     simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)

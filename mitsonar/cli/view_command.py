@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
-from mitsonar.cli.render_command import Frame, scene_parameters
+from mitsonar.cli.flown_path import Frame
+from mitsonar.cli.render_command import scene_parameters
 from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:

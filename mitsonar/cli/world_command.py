@@ -192,13 +192,19 @@ def _pairs(pairs: list[str], option: str, form: str) -> dict[str, str]:
     for pair in pairs:
         if not all(pair.rpartition("=")):
             raise MitsonarError(f"{option} takes {form}: got {pair!r}")
-    return {name: value for name, _, value in (pair.rpartition("=") for pair in pairs)}
+    parts = [pair.rpartition("=") for pair in pairs]
+    found = {name: value for name, _, value in parts}
+    if len(found) < len(parts):
+        twice = next(name for name in found if sum(name == one for one, _, _ in parts) > 1)
+        raise MitsonarError(f"{option} gives {twice[:80]} twice: give it once")
+    return found
 
 
 def _joint_values(pairs: list[str]) -> dict[str, float]:
     """Return the values of joints that --joint says."""
+    given = _pairs(pairs, "--joint", "NAME=VALUE")
     try:
-        return {name: float(value) for name, value in _pairs(pairs, "--joint", "NAME=VALUE").items()}
+        return {name: float(value) for name, value in given.items()}
     except ValueError:
         raise MitsonarError(f"--joint takes NAME=VALUE, a number in rad or m: got {', '.join(pairs)!r}") from None
 

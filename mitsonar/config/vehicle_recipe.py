@@ -68,7 +68,7 @@ def load_vehicle_recipe(file: str | Path) -> VehicleRecipe:
     """
     fields = read_yaml(file, "vehicle file")
     if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
-        raise MitsonarError(f"{file} must hold the keys sensors and moving{SEE}")
+        raise MitsonarError(f"{file} must hold the key sensors, and moving where bodies move{SEE}")
     table: dict[str, Any] = dict(fields)
     if table.get("moving"):
         table["moving"] = motions_from(table["moving"], f"moving of {file}")

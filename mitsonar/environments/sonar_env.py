@@ -74,7 +74,13 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         Returns:
             Observation, reward, whether the vehicle collided or left its bounds, whether the episode is cut off, and what
             else is known.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            MitsonarError: an action of another shape, or that is not finite.
         """
+        if self._image is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
         fleet = self.fleet
         moved = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
         self._image = moved.image[0]

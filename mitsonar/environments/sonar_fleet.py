@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import refuse_noise
 from mitsonar.environments.sonar_task import SonarTask, Table, Transition
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.motion.moving_bodies import Moving
@@ -50,7 +51,10 @@ class SonarFleet:
         steps: of each since the begin of its episode ``(count,)``.
 
     Raises:
-        MitsonarError: no vehicle, no start, or a source that is no scene.
+        MitsonarError: no vehicle, a source that is no scene, no start, or one where every episode ends.
+
+    Warns:
+        MitsonarWarning: the start seems to lie below the seabed.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class SonarFleet:
 
         self.clearance = Clearance(self.simulator.tracer)
         self._span = self._start_of(task)
+        self._check_start()
         self.gain = self._gain() if task.gain is None else task.gain
         self.poses = np.repeat(self._span[:1], count, axis=0)
         self.steps = np.zeros(count, dtype=np.int64)
@@ -87,7 +92,27 @@ class SonarFleet:
         found = sonar_in(self.simulator.tracer.scene)
         if found is None:
             raise MitsonarError("the scene has no sonar whose pose episodes could begin at: give start, a pose or two")
-        return np.repeat(np.asarray(found[1], dtype=float)[None], 2, axis=0)
+        span = np.repeat(np.asarray(found[1], dtype=float)[None], 2, axis=0)
+        task.refuse_outside(span)
+        return span
+
+    def _check_start(self) -> None:
+        """Refuse a start at whose ends the vehicle collides; warn where it seems to lie below the seabed."""
+        places = self._span[:, :3]
+        clearance_m = self.clearance.of(places, places, np.zeros(2))
+        if (clearance_m < self.task.clearance_m).all():
+            raise MitsonarError(
+                f"start is {clearance_m.max():.3g} m from a surface, nearer than clearance_m {self.task.clearance_m:g}: "
+                "every episode would end at its first step; move it, or lower clearance_m"
+            )
+        below, above = (self.clearance.straight(places, way) for way in ((0, 0, -1), (0, 0, 1)))
+        if (np.isinf(below) & np.isfinite(above)).all():
+            warnings.warn(
+                f"below start there is nothing, and a surface {above.min():.3g} m above it: a vehicle under the seabed sees "
+                "it from below; nothing is wrong where that is a hull or ice",
+                MitsonarWarning,
+                stacklevel=4,
+            )
 
     def _gain(self) -> float:
         """Return the constant gain by eight poses between those of the start, always the same."""
@@ -136,7 +161,7 @@ class SonarFleet:
         """
         given = np.asarray(action, dtype=float)
         if given.shape != (len(self.poses), 4) or not np.isfinite(given).all():
-            raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {given.shape}")
+            raise MitsonarError(f"an action is four finite numbers for each of {len(self.poses)}: got {_wrong(given)}")
         taken, before = np.clip(given, -1, 1), self.poses.copy()
         self.poses = steered(before, taken * np.asarray(self.task.max_velocity), self.step_s)
         self.steps += 1
@@ -153,11 +178,18 @@ class SonarFleet:
         """Return the rewards of a step ``(count,)``.
 
         Raises:
-            MitsonarError: the reward function gives other than one finite number for each vehicle.
+            MitsonarError: the reward function gives other than one finite number for each vehicle, or for all.
         """
         if self.task.reward is None:
             return np.zeros(len(self.poses))
         found = np.asarray(self.task.reward(step), dtype=float)
-        if found.shape != (len(self.poses),) or not np.isfinite(found).all():
-            raise MitsonarError(f"reward must give {len(self.poses)} finite numbers: got {found.shape}")
-        return found
+        if found.shape not in ((len(self.poses),), ()) or not np.isfinite(found).all():
+            raise MitsonarError(f"reward must give {len(self.poses)} finite numbers, or one for all: got {_wrong(found)}")
+        return np.array(np.broadcast_to(found, len(self.poses)))
+
+
+def _wrong(given: Table) -> str:
+    """Return what is wrong with numbers: one that is not finite, with its place, else their shape."""
+    bad = np.argwhere(~np.isfinite(given))
+    place = bad[0].tolist() if len(bad) else []
+    return f"{given[tuple(place)]} at {place}" if len(bad) else f"the shape {given.shape}"

@@ -21,6 +21,9 @@ OBSERVABLE = ("image", "altitude", "pose")
 
 VELOCITY = ("starboard", "forward", "up", "turn")
 
+FULL_TURNS = np.array([np.pi, np.pi, 4 * np.pi])
+"""Largest pitch, roll and heading of a start [rad]; a heading may be drawn across 360 deg."""
+
 
 @dataclass(frozen=True)
 class Transition:
@@ -48,7 +51,7 @@ class Transition:
 
 
 Reward: TypeAlias = Callable[[Transition], ArrayLike]
-"""Gives the reward of each vehicle ``(n,)``."""
+"""Gives the reward of each vehicle ``(n,)``, or one number for all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class SonarTask:
         clearance_m: distance to a surface below which a vehicle has collided [m].
         max_steps: steps after which an episode is cut off; default: none.
         observe: of :data:`OBSERVABLE`; the image alone is a box, several are a dictionary.
-        reward: of each step; default: 0.
+        reward: of each step, by its :class:`Transition`; default: 0.
         gain: of the image; default: by eight poses of ``start``.
         noise: of the image; default: none.
         altimeter_m: an altitude beyond is told as this [m].
@@ -103,7 +106,24 @@ class SonarTask:
         if unknown or "image" not in self.observe:
             wrong = str(unknown[0] if unknown else self.observe)
             raise MitsonarError(f"observe is a tuple of image and others: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}")
-        self.span, self.box  # noqa: B018  # refuse them now
+        self.refuse_outside(self.span)
+
+    def refuse_outside(self, span: Table) -> None:
+        """Refuse poses where episodes begin ``(2, 6)`` that lie outside the bounds, or whose angles are no radians.
+
+        Raises:
+            MitsonarError: one does, or is.
+        """
+        low, high = self.box
+        for pose in span[np.isfinite(span).all(axis=1)]:
+            shown = ", ".join(f"{value:g}" for value in pose)
+            if (pose[:3] < low).any() or (pose[:3] > high).any():
+                raise MitsonarError(
+                    f"start lies outside bounds, where every episode ends at its first step: got {shown}, and bounds "
+                    f"{low.tolist()}, {high.tolist()}; move one of them"
+                )
+            if (np.abs(pose[3:]) > FULL_TURNS).any():
+                raise MitsonarError(f"start is x, y, z [m], pitch, roll, heading in rad: got {shown}; are these degrees?")
 
     @classmethod
     def create(cls, given: dict[str, Any]) -> Self:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -115,8 +116,11 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
             Observations, rewards, which collided or left their bounds, which are cut off, and what else is known.
 
         Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
             MitsonarError: an episode has ended and resets are yours to do.
         """
+        if self._image is None:
+            raise ResetNeeded("call reset() before step()")
         fleet, renewed = self.fleet, self._ended.copy()
         if renewed.any() and self._mode is AutoresetMode.DISABLED:
             raise MitsonarError(f"{renewed.sum()} episodes have ended: reset them with options={{'reset_mask': ...}}")

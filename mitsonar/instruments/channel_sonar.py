@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import shortened
+from mitsonar.errors import MitsonarError, shortened
 from mitsonar.instruments.imaging_sonar import FieldValue, Instrument
 
 __all__ = [
@@ -267,6 +267,22 @@ class ChannelSonar(Instrument):
     def offsets(self) -> NDArray[np.float64]:
         """Return the positions of the receivers in the vehicle's axes ``(receivers, 3)`` [m]."""
         return np.array([receiver.position for receiver in self.receivers], dtype=float)
+
+    def receiver_number(self, receiver: int | str) -> int:
+        """Return the number of a receiver, of its name or itself.
+
+        Raises:
+            MitsonarError: no such receiver.
+        """
+        names = [one.name for one in self.receivers]
+        if isinstance(receiver, str) and receiver in names:
+            return names.index(receiver)
+        whole = isinstance(receiver, int | np.integer) and not isinstance(receiver, bool)
+        if not whole or not 0 <= int(receiver) < len(names):
+            raise MitsonarError(
+                f"receiver must be a name of {', '.join(names)}, or a number 0..{len(names) - 1}: got {shortened(receiver)}"
+            )
+        return int(receiver)
 
     def raised_cosine(self, frequency_hz: NDArray[np.floating]) -> NDArray[np.float64]:
         """Compute the raised cosine X_R at baseband frequencies [Hz] (Almanza-Medina, eq. 5.16, corrected).

@@ -24,9 +24,11 @@ __all__ = [
     "GroupOrder",
     "TimedPath",
     "check_groups",
+    "first_sweeps",
     "frame_period_s",
     "group_of_beams",
     "one_beam",
+    "overlap_notes",
     "ping_interval_s",
     "scanned",
     "scans",
@@ -163,6 +165,49 @@ def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
     poses = longer.at(time.ravel()).reshape(*time.shape, 6)
     frames = path if due is path.time_s else Trajectory(longer.at(due), due)
     return TimedPath(frames, time, poses)
+
+
+def first_sweeps(sonar: Sonar, path: Trajectory, count: int) -> Trajectory:
+    """Return the part of a path along which a head that turns makes its first ``count`` sweeps.
+
+    Raises:
+        MitsonarError: the path is shorter; a single pose counts as one sweep.
+    """
+    sweep, lasts = frame_period_s(sonar), float(path.time_s[-1] - path.time_s[0])
+    if lasts < count * sweep * (1 - 1e-9) and (len(path) > 1 or count > 1):
+        raise MitsonarError(
+            f"a sweep lasts {sweep:.4g} s and the path {lasts:.4g} s, room for {int(lasts / sweep + 1e-9)}: got {count}; "
+            "--frames counts the sweeps of a head that turns: give fewer, or a longer path"
+        )
+    if len(path) == 1:
+        return path
+    end = path.time_s[0] + count * sweep
+    inside = path.time_s < end
+    return Trajectory(np.concatenate([path.poses[inside], path.at([end])]), np.concatenate([path.time_s[inside], [end]]))
+
+
+def overlap_notes(sonar: Sonar, time_s: NDArray[np.float64]) -> list[str]:
+    """Return what to tell where the pings of a frame last longer than the time to the next frame: no instrument pings so.
+
+    Args:
+        sonar: whose frames follow each other.
+        time_s: of the frames ``(frames,)`` [s].
+    """
+    lasts = sonar.ping_groups * ping_interval_s(sonar)
+    apart = np.diff(time_s).min(initial=np.inf)
+    if sonar.ping_groups == 1 or scans(sonar) or lasts <= apart * (1 + 1e-6):
+        return []
+    return [
+        f"the {sonar.ping_groups} pings of a frame last {lasts:.3g} s and the next frame is due {apart:.3g} s later: they "
+        f"overlap, which no instrument does; a frame_rate_hz of {_down(1 / lasts)} would do (of poses in a file, that many "
+        "a second), or a shorter range_max"
+    ]
+
+
+def _down(value: float) -> str:
+    """Return a number to three digits, rounded down."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{math.floor(value / step) * step:.3g}"
 
 
 def turned_heads(sonar: Sonar, poses: NDArray[np.float64]) -> NDArray[np.float64]:

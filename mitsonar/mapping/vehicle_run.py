@@ -20,7 +20,7 @@ from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.impulse_run import run_impulse
 from mitsonar.simulation.render_run import Outputs, run
 from mitsonar.simulation.sounding import SounderSimulator
-from mitsonar.simulation.vehicle import Mounted, VehicleSimulator
+from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, refuse_path
 
 __all__ = ["VEHICLE_RUN", "VehicleReport", "run_vehicle"]
 
@@ -60,9 +60,11 @@ def run_vehicle(
         progress: called with the number of new pings.
 
     Raises:
-        MitsonarError: the folder exists; the run to resume was another one; the folder cannot be written.
+        MitsonarError: a sensor cannot follow the path; the folder exists; the run to resume was another one; the folder
+            cannot be written.
     """
     sensors, bodies = simulator.sensors(vehicle), simulator.bodies(vehicle)
+    refuse_path(sensors, vehicle, outputs.noise)
     asked = {**origin, "sensors": {name: _told(one) for name, one in sensors.items()}, "frame": outputs.frame}
     asked["poses_sha256"] = digest(vehicle.poses.tobytes(), vehicle.time_s.tobytes())
     made = RunDirectory.begin(folder, VEHICLE_RUN, asked, resume=resume, overwrite=overwrite)

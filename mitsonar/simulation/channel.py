@@ -38,6 +38,10 @@ LACKING = (
 )
 """What to do where the instrument needs mirrors."""
 
+NO_MIRRORS = (
+    "the scene has no mirrors: no shape has an acoustic_material with reflection and roughness_m; all is as without mirrors"
+)
+
 PINGS_AT_A_TIME = 16
 """Pings whose echoes wait in memory for their transforms: 50 bytes an echo and receiver."""
 
@@ -138,6 +142,7 @@ class ChannelSimulator:
 
         parts = mirror_of(scene, mirrors) if mirrors else None
         check_channel_mirrors(sonar, parts is not None, LACKING)
+        self._without_mirrors = mirrors == "materials" and parts is None
         self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer, parts)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
         self.ways = tuple([way.name for way in self.tracer.ways] + self.without_scatterer.names)
@@ -146,7 +151,8 @@ class ChannelSimulator:
     @property
     def notes(self) -> list[str]:
         """Return what a user should know about the scene's BSDFs and mirrors."""
-        return [*self.tracer.notes, *self.without_scatterer.notes]
+        notes = [*self.tracer.notes, *self.without_scatterer.notes]
+        return [*notes, NO_MIRRORS] if self._without_mirrors else notes
 
     def responses(
         self, flown: Trajectory, velocity: ArrayLike | None = None, progress: Callable[[int], None] = lambda pings: None
@@ -230,13 +236,13 @@ class ChannelSimulator:
                 here = slice(begin, begin + PINGS_AT_A_TIME)
                 yield self._channels(table[here], speeds[here], first + begin, threads)
 
-    def paths(self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int = 0) -> Paths:
+    def paths(self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int | str = 0) -> Paths:
         """Trace the echoes of one ping at one receiver.
 
         Args:
             pose: of the transmitter: x, y, z [m], pitch, roll, heading [rad].
             velocity: as of :meth:`pings`.
-            receiver: its index.
+            receiver: its name or number.
 
         Raises:
             MitsonarError: no such receiver, or a pose or velocity that is not valid.
@@ -244,8 +250,7 @@ class ChannelSimulator:
         table = np.asarray(pose, dtype=float).reshape(1, -1)
         if table.shape != (1, 6) or not np.isfinite(table).all():
             raise MitsonarError(f"a pose is six numbers x, y, z [m], pitch, roll, heading [rad]: got {table.size}")
-        if not 0 <= receiver < len(self.sonar.receivers):
-            raise MitsonarError(f"receiver must be 0..{len(self.sonar.receivers) - 1}, its number: got {receiver!r}")
+        receiver = self.sonar.receiver_number(receiver)
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
         parts = [
             *(self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, way=way) for way in self.tracer.ways),

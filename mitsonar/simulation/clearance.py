@@ -63,6 +63,12 @@ class Clearance:
         distance[:, -1] -= gone
         return np.asarray(distance.min(axis=1))
 
+    def straight(self, places: NDArray[np.float64], way: tuple[float, float, float]) -> NDArray[np.float64]:
+        """Return the distance from each place ``(n, 3)`` to the surface in one direction ``(n,)`` [m], at time 0; or inf."""
+        begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
+        found = free_way(self.tracer.scene_at(np.zeros(len(places))), mi.Ray3f(begin, mi.Vector3f(*way)))
+        return np.array(found, dtype=float)
+
     @staticmethod
     def _traced(scene: DeviceArray, number: mi.Float, begin: mi.Float, ways: mi.Float) -> DeviceArray:
         """Trace the rays of all vehicles; a ray carries the number of its vehicle as its time."""

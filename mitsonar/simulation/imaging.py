@@ -14,7 +14,7 @@ from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.ping_groups import TimedPath, timed_path
+from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
 from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
@@ -234,7 +234,7 @@ class Simulator:
 
         Warns:
             MitsonarWarning: nothing hit, returns outside the window, saturated pixels, too few rays a bin, BSDFs
-                without a diffuse reflectance.
+                without a diffuse reflectance, frames whose pings overlap.
         """
         refuse_noise(noise, self.sonar)
         if not isinstance(trajectory, Trajectory):
@@ -255,7 +255,8 @@ class Simulator:
             heights.append(pings.height_m)
             truth.append(labels_above(pings, gain, label_floor))
         labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
-        for sentence in [*self.notes, *tally.warnings(self, timed.frames.poses)]:
+        notes = [*self.notes, *overlap_notes(self.sonar, timed.frames.time_s)]
+        for sentence in [*notes, *tally.warnings(self, timed.frames.poses)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
         return self._frames(np.concatenate(images), timed, np.concatenate(heights), gain, labelled)
 

@@ -221,14 +221,14 @@ def _own_spread(path: Paths) -> Spread:
 
 def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
     """Return the warnings of a run, one sentence each."""
-    sentences = []
+    arms = {one.name: math.dist(one.position, (0, 0, 0)) for one in made.sonar.receivers}
+    far = [name for name, away in arms.items() if away > FAR_ARM_M]
+    several = f"receivers {', '.join(far)} are up to" if len(far) > 1 else f"receiver {', '.join(far)} is"
+    sentences = [f"{several} {max(arms.values()):g} m from the transmitter: positions are in metres"] if far else []
     assert made.echoes is not None
     assert made.dropped is not None
     for number, receiver in enumerate(made.sonar.receivers):
         silent = int((made.echoes[:, number] == 0).sum())
-        away = math.dist(receiver.position, (0, 0, 0))
-        if away > FAR_ARM_M:
-            sentences.append(f"receiver {receiver.name} is {away:g} m from the transmitter: positions are in metres")
         if silent:
             view = receiver.field
             up = " (above 90: upwards)" if view.tilt_deg > 90 else ""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.backscatter import Material
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.device_arrays import DeviceArray
@@ -65,12 +65,14 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
     """
     if isinstance(mirrors, str):
         mirrors = _of_materials(scene, mirrors)
+    if not isinstance(mirrors, Mapping | None):
+        raise MitsonarError(f"mirrors are parts by the ids of the shapes, or `materials`: got {shortened(mirrors)}")
     names = [shape.id() for shape in scene.shapes()]
     found = Mirrors(np.zeros(len(names)), np.zeros(len(names)))
     for name, part in (mirrors or {}).items():
         if name not in names:
             raise MitsonarError(f"mirrors: the scene has no shape {name}: {nearest_names(name, names)}")
-        reflection, roughness_m = (part.reflection or 0.0, part.roughness_m or 0.0) if isinstance(part, Material) else part
+        reflection, roughness_m = _numbers_of(name, part)
         if not (-1 <= reflection <= 1 and 0 <= roughness_m <= ROUGHEST_M):
             raise MitsonarError(
                 f"mirrors: the reflection of {name} lies in -1..1 and its rms height in 0..{ROUGHEST_M:g} m: "
@@ -79,6 +81,19 @@ def mirror_of(scene: mi.Scene, mirrors: Mirroring) -> Mirrors | None:
         for place in (place for place, own in enumerate(names) if own == name):
             found.reflection[place], found.roughness_m[place] = reflection, roughness_m
     return found if found.reflection.any() else None
+
+
+def _numbers_of(name: str, part: MirrorPart) -> tuple[float, float]:
+    """Return reflection and rms height [m] of a mirror part; without either 0."""
+    if isinstance(part, Material):
+        return part.reflection or 0.0, part.roughness_m or 0.0
+    try:
+        reflection, roughness_m = (float(number) for number in part)
+    except (TypeError, ValueError):
+        raise MitsonarError(
+            f"mirrors: {name} takes a pair, reflection and rms height in m, such as (-1.0, 0.0): got {shortened(part)}"
+        ) from None
+    return reflection, roughness_m
 
 
 def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     *("Said", "digests_of", "load_meshes", "load_motions", "motions_of", "read_said"),
-    *("refuse_motion", "said_by", "said_in"),
+    *("refuse_motion", "refuse_unread_motions", "said_by", "said_in"),
 ]
 
 STAYS = Trajectory(np.zeros((1, 6)), np.zeros(1))
@@ -119,6 +119,38 @@ def refuse_motion(scene: mi.Scene, what: str) -> None:
     said = said_by(scene)
     if said:
         raise MitsonarError(f"{what} are of still scenes: {said[0].name} has a trajectory; take the texture motion out")
+
+
+def refuse_unread_motions(state: mi.parser.ParserState) -> None:
+    """Refuse a texture ``trajectory`` that no shape holds under the name ``motion``: Mitsuba leaves it out without a word.
+
+    Args:
+        state: of the parsed scene, not instantiated yet.
+
+    Raises:
+        MitsonarError: there is one.
+    """
+    import mitsuba as mi
+
+    from mitsonar.plugins.trajectory_texture import MOTION
+
+    kinds = mi.Properties.Type
+    paths = [number for number, node in enumerate(state.nodes) if node.props.plugin_name() == "trajectory"]
+    ids = {state.nodes[number].props.id() for number in paths} - {""}
+    for node in state.nodes if paths else ():
+        if node.type == mi.ObjectType.Scene:  # there a texture only waits to be referred to
+            continue
+        for name in list(node.props):
+            kind, held = node.props.type(name), node.props[name]
+            inside = kind == kinds.ResolvedReference and held.index() in paths
+            named = kind == kinds.Reference and held.id() in ids
+            if (inside or named) and (name != MOTION or node.type != mi.ObjectType.Shape):
+                shown = "without a name" if name.startswith("_arg_") else f'with name="{name[:80]}"'
+                where = f"{node.props.plugin_name()} {node.props.id()}".strip()
+                raise MitsonarError(
+                    f"the texture trajectory in {where} stands there {shown}: nothing would move; write "
+                    f'name="{MOTION}", in a shape'
+                )
 
 
 def load_meshes(files: Sequence[Path], rate_hz: float, *, loop: bool = True) -> MeshSequence:

@@ -16,7 +16,7 @@ from PIL import Image
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.ping_groups import TimedPath, timed_path
+from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
@@ -160,7 +160,8 @@ def run(
         progress(made.count("frames_done", len(trajectory)))
         store = _make_frames(source, timed, made, outputs, progress)
         tally = progress_of(made, source.sonar, len(trajectory)).tally
-        made.note(warnings=[*source.notes, *tally.warnings(source, trajectory.poses)])
+        notes = [*source.notes, *overlap_notes(source.sonar, trajectory.time_s)]
+        made.note(warnings=[*notes, *tally.warnings(source, trajectory.poses)])
         if len(trajectory) <= LONGEST_NPZ:
             store.pack(made.path / "frames.npz")
     if not made.finished:

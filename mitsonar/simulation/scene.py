@@ -13,6 +13,7 @@ from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
+from mitsonar.simulation.moving_files import refuse_unread_motions
 from mitsonar.simulation.variant import ensure_variant
 from mitsonar.worlds.mesh_check import check_meshes_of
 from mitsonar.worlds.scene_text import check_nesting
@@ -72,7 +73,8 @@ def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
     """Load a Mitsuba scene; ``parameters`` replace its ``$name`` values, as in ``mi.load_file``.
 
     Raises:
-        MitsonarError: missing file, malformed XML, a damaged mesh, a plugin that refuses its properties.
+        MitsonarError: missing file, malformed XML, a damaged mesh, a plugin that refuses its properties, a trajectory that
+            no shape reads.
     """
     path = find_scene(name_or_file)
     variant = ensure_variant()
@@ -82,7 +84,9 @@ def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
         texts = {key: str(value) for key, value in parameters.items()}
         check_nesting(path, texts)
         parser = mi.parser
-        check_meshes_of(parser.parse_file(parser.ParserConfig(variant), str(path), **texts), path.parent)
+        state = parser.parse_file(parser.ParserConfig(variant), str(path), **texts)
+        check_meshes_of(state, path.parent)
+        refuse_unread_motions(state)
         # merged meshes would lose their ids; in parallel, one load in some 150 failed on a good file, and none is faster
         scene = mi.load_file(str(path), optimize=False, parallel=False, **texts)
     except MitsonarError as error:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.config.vehicle_recipe import SensorKeys, check_sensor_name, load_vehicle_recipe
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar, sonar_from
 from mitsonar.instruments.named_sounders import load_sounder
+from mitsonar.instruments.ping_groups import timed_path
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.motion.moving_bodies import Moving, MovingBodies
 from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world
@@ -34,7 +36,7 @@ from mitsonar.simulation.variant import ensure_variant
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["Mounted", "Record", "VehicleFile", "VehicleSimulator", "load_vehicle", "sensors_in"]
+__all__ = ["Mounted", "Record", "VehicleFile", "VehicleSimulator", "load_vehicle", "refuse_path", "sensors_in"]
 
 Instrument: TypeAlias = Union[Sonar, Sounder, ChannelSonar, "mi.Sensor"]
 """What is mounted; a sensor of Mitsuba is a camera."""
@@ -110,8 +112,9 @@ class VehicleSimulator:
             vehicle: poses and times; each sensor pings at each of these, a head that turns sweeps as often as it can.
             labels: per-pixel truth of imaging sonars as well.
         """
-        bodies = self.bodies(vehicle)
-        return {name: self._record(one, vehicle, bodies, labels) for name, one in self.sensors(vehicle).items()}
+        bodies, sensors = self.bodies(vehicle), self.sensors(vehicle)
+        refuse_path(sensors, vehicle)
+        return {name: self._record(one, vehicle, bodies, labels) for name, one in sensors.items()}
 
     def _record(self, one: Mounted, vehicle: Trajectory, bodies: MovingBodies, labels: bool) -> Record:
         path, instrument = one.path(vehicle), one.instrument
@@ -125,6 +128,27 @@ class VehicleSimulator:
         from mitsonar.simulation.camera import CameraSimulator
 
         return np.stack(list(CameraSimulator(self.scene, instrument, moving=bodies).pictures(path.poses, path.time_s)))
+
+
+def refuse_path(sensors: Mapping[str, Mounted], vehicle: Trajectory, noise: NoiseModel | None = None) -> None:
+    """Refuse what one of the sensors cannot do, before any of them is rendered.
+
+    Args:
+        sensors: by name.
+        vehicle: path of the vehicle.
+        noise: of imaging sonars.
+
+    Raises:
+        MitsonarError: a path that is too short for a sweep, or noise for a sonar with its own; it names the sensor.
+    """
+    for name, one in sensors.items():
+        if not isinstance(one.instrument, Sonar):
+            continue
+        try:
+            timed_path(one.instrument, vehicle)
+            refuse_noise(noise, one.instrument)
+        except MitsonarError as error:
+            raise MitsonarError(f"sensor {name}: {error}") from None
 
 
 def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:

@@ -13,13 +13,14 @@ import numpy as np
 from mitsonar.acoustics.backscatter import named_materials
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.motion.conventions import CONVENTIONS
+from mitsonar.worlds.imported_view import view_of_objects
 from mitsonar.worlds.model_pieces import Piece, merged, reflectivity_of
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.scene_parts import Matrix, ReadScene, Shapes, rigid
 from mitsonar.worlds.sdf_file import read_sdf
 from mitsonar.worlds.urdf_file import read_urdf
 from mitsonar.worlds.usd_file import read_usd
-from mitsonar.worlds.user_mesh import overview, random_seabed
+from mitsonar.worlds.user_mesh import random_seabed
 from mitsonar.worlds.world import Mesh, World
 
 __all__ = ["SCENE_FORMATS", "imported_world"]
@@ -84,11 +85,15 @@ def imported_world(
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.05)
     half = float(np.abs([low, high])[:, :2].max()) + 3 * radius
     kind = "collision" if collision else "visual"
+    view = view_of_objects({name: pieces for name, pieces in groups.items() if name not in own_axes} or groups)
+    if view.part:
+        told = "no shape is small enough for the sonar's reach: it sees a part; change its pose and window in scene.xml"
+        warnings.warn(f"{path}: {view.about}; {told}", MitsonarWarning, stacklevel=2)
     return World(
         about=f"{path.name}: {len(made)} shapes of {kind} geometry, {sum(len(mesh.faces) for mesh in made)} triangles, "
-        f"{' x '.join(f'{edge:.4g}' for edge in high - low)} m, reflectivity {reflectivity}",
+        f"{' x '.join(f'{edge:.4g}' for edge in high - low)} m, reflectivity {reflectivity}; {view.about}",
         meshes=made,
-        stand=overview(radius, float(high[2] - low[2]), ((low + high)[0] / 2, (low + high)[1] / 2, low[2])),
+        stand=view.stand,
         floor=None if seabed_z is None else random_seabed(half, seabed_z),
         content=content,
     )

@@ -34,7 +34,8 @@ class ModelSearch:
         missing = [folder for folder in folders if not Path(folder).is_dir()]
         if missing:
             raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that holds models or packages")
-        self.roots = [file.resolve().parent, *(Path(folder).resolve() for folder in folders)]
+        roots = (file.resolve().parent, *(Path(folder).resolve() for folder in folders))
+        self.roots = list(dict.fromkeys(roots))  # each once
 
     def find(self, name: str, beside: Path) -> Path:
         """Return the file or folder that a scene names.
@@ -60,8 +61,12 @@ class ModelSearch:
             found = candidate.resolve()
             if any(found.is_relative_to(root) for root in self.roots) and found.exists():
                 return found
+        candidates = [path.resolve() for path in self._candidates(name, scheme, beside)]
+        inside = any(path.is_relative_to(root) for path in candidates for root in self.roots)
+        outside = any(path.exists() for path in candidates)
+        missing = "there is no such file" if inside and not outside else "which is not"
         raise MitsonarError(
-            f"{beside} names {shortened(name)}, which is not within {', '.join(map(str, self.roots))}: give the folder that "
+            f"{beside} names {shortened(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
             "holds it by --search"
         )
 

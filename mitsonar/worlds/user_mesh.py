@@ -101,15 +101,16 @@ def random_seabed(half_m: float, z_m: float = 0.0) -> Floor:
     return Floor(half_m, Floor.cells(int(np.clip(round(2 * half_m / 0.015), 1, 2**20)), (0, 1), 0), z_m)
 
 
-def overview(radius: float, height: float, foot: ArrayLike = (0.0, 0.0, 0.0)) -> Standpoint:
+def overview(radius: float, height: float, foot: ArrayLike = (0.0, 0.0, 0.0), *, nearest: float = 0.0) -> Standpoint:
     """Return a sonar 30 deg above, at the distance at which the model fills a field of view of 29 deg.
 
     Args:
         radius: of the model [m].
         height: of the model [m].
         foot: the point below its middle, at its lowest height ``(3,)`` [m].
+        nearest: the sonar keeps this distance [m].
     """
-    away = 1.1 * radius / np.tan(np.radians(14.5))
+    away = max(1.1 * radius / np.tan(np.radians(14.5)), nearest)
     x, y, z = (float(value) for value in np.asarray(foot))
     middle = z + height / 2
     sin, cos = np.sin(np.radians(30)), np.cos(np.radians(30))

@@ -285,6 +285,12 @@ def test_presets_scenes_and_doctor_print(mitsonar: Command) -> None:
     for printed in (listed.stdout, one.stdout):  # rays and errors of each quality
         assert re.search(errors, printed, re.MULTILINE)
     refused(mitsonar("presets", "gemini"), "gemini-720is")
+    instruments = ("ping2", "a50", "deltat-837", "sonar-3d-15", "starfish-450f")
+    assert all(re.search(rf"^{name} +\w", listed.stdout, re.MULTILINE) for name in instruments)
+    ping = mitsonar("presets", "ping2")
+    assert re.search(r"mounts +\{'down'.* ours: straight down", ping.stdout)
+    assert re.search(r"range_max +30 +ours, inside the instrument's 100 m", ping.stdout)
+    assert "starfish-450f: Blueprint" in mitsonar("presets", "sidescan").stdout
     assert "sunken_ship" in mitsonar("scenes").stdout
     doctor = mitsonar("doctor")
     assert doctor.returncode == 0, doctor.stderr
@@ -419,3 +425,30 @@ def test_all_sensors_of_a_scene_in_one_run(mitsonar: Command, tmp_path: Path) ->
     assert mitsonar(*asked, "--resume").returncode == 0
     refused(mitsonar(*asked), "kept as it is")
     refused(mitsonar(*asked, "--sonar", "didson300", "--overwrite"), "--sonar names one sonar")
+
+
+# ---------------------------------------------------------------- how fast, and how often
+
+
+def test_speed_and_sweeps_are_as_asked_and_haste_is_told(mitsonar: Command, tmp_path: Path) -> None:
+    out, draft = tmp_path / "o", ("--model", "physical", "--quality", "draft", "--set", "beams=8", "--overwrite")
+    way = ("--from", "0,0,2,30,0,0", "--to", "0,3,2,30,0,0", "--frames", 4)
+    done = mitsonar("render", "flat_floor", "--sonar", "didson300", *way, "-o", out, *draft)
+    assert "flies 3 m in 0.143 s, 21 m/s" in done.stderr
+    done = mitsonar("render", "flat_floor", "--sonar", "didson300", *way, "--speed", 2, "-o", out, *draft)
+    assert done.returncode == 0, done.stderr
+    assert "flies" not in done.stderr
+    assert np.loadtxt(out / "poses.tum")[:, 0] == pytest.approx([0, 0.5, 1, 1.5])
+    refused(mitsonar("render", "flat_floor", "--speed", 1, "-o", out), "--speed is above 0 m/s, of --from and --to")
+    head = ("render", "objects", "--sonar", "ping360", "--set", "range_max=10", "--trajectory", "shipped", "-o", out)
+    refused(mitsonar(*head, "--frames", 5), "a sweep lasts 13.33 s", "--frames counts the sweeps")
+
+
+def test_pings_that_overlap_are_told(mitsonar: Command, tmp_path: Path) -> None:
+    asked = ("--sonar", "didson300", "--from", "0,0,2,30,0,0", "--frames", 2, "--model", "physical", "--quality", "draft")
+    done = mitsonar("render", "flat_floor", *asked, "--set", "ping_groups=8", "-o", tmp_path / "o")
+    assert "they overlap, which no instrument does; a frame_rate_hz of 16.7 would do" in done.stderr
+    kept = mitsonar("render", "flat_floor", *asked, "--set", "ping_groups=8", "-o", tmp_path / "o", "--resume")
+    assert "they overlap" in kept.stderr
+    slower = ("--set", "ping_groups=8", "--set", "frame_rate_hz=16")
+    assert "overlap" not in mitsonar("render", "flat_floor", *asked, *slower, "-o", tmp_path / "p").stderr

@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from mitsonar.environments.sonar_env import SonarEnv
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
@@ -96,7 +96,7 @@ def test_masked_resets_and_wrong_arguments(simulator: Simulator) -> None:
     with pytest.raises(MitsonarError, match="2 episodes have ended"):
         env.step(np.zeros((2, 4)))
     env.reset(options={"reset_mask": np.array([True, True])})
-    with pytest.raises(MitsonarError, match="four finite numbers"):
+    with pytest.raises(MitsonarError, match=r"four finite numbers for each of 2: got nan at \[0, 0\]"):
         env.step(np.full((2, 4), np.nan))
     for wrong in ({"start": [1, 2]}, {"bounds": [[1, 1, 1], [0, 0, 0]]}, {"observe": ("pose",)}, {"max_steps": 0}):
         with pytest.raises(MitsonarError):
@@ -132,3 +132,48 @@ def test_what_is_no_scene_is_refused(simulator: Simulator) -> None:
     count: Any = 2.0
     with pytest.raises(MitsonarError, match="whole number in 1"):
         SonarVectorEnv(simulator, num_envs=count)
+
+
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        ({"start": [0, -5, 12, 0.4, 0, 0], "bounds": [[-9, -9, 0.3], [9, 9, 5]]}, "start lies outside bounds"),
+        ({"start": [[0, -5, 2, 0, 0, 0], [0, -5, 0.1, 0, 0, 0]], "bounds": [[-9, -9, 0.3], [9, 9, 5]]}, "outside bounds"),
+        ({"start": [0, -5, 2, 25, 0, 90]}, "heading in rad: got 0, -5, 2, 25, 0, 90; are these degrees"),
+        ({"start": [0, -5, 0.05, 0.4, 0, 0]}, r"start is 0.05 m from a surface, nearer than clearance_m 0.3"),
+        ({"start": START, "foo": 1}, "no argument foo: known: start, bounds"),
+        ({"start": START, "bound": 1}, "did you mean bounds"),
+    ],
+)
+def test_a_start_where_every_episode_ends_is_refused(task: dict[str, Any], said: str, simulator: Simulator) -> None:
+    with pytest.raises(MitsonarError, match=said):
+        SonarVectorEnv(simulator, num_envs=2, **task)
+    with pytest.raises(MitsonarError, match=said):
+        SonarEnv(simulator, **task)
+
+
+def test_a_start_below_the_seabed_is_warned_of(simulator: Simulator) -> None:
+    with pytest.warns(MitsonarWarning, match="below start there is nothing, and a surface 2 m above it"):
+        SonarEnv(simulator, start=[0, -5, -2, 0.4, 0, 0], gain=1.0)
+
+
+def test_steps_before_a_reset_are_refused_as_gymnasium_does(simulator: Simulator) -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        SonarEnv(simulator, start=START).step(np.zeros(4))
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
+        SonarVectorEnv(simulator, num_envs=2, start=START).step(np.zeros((2, 4)))
+
+
+def test_a_reward_may_be_one_number_and_a_wrong_one_is_shown(simulator: Simulator) -> None:
+    one, two = (SonarVectorEnv(simulator, num_envs=n, start=START, reward=lambda step: 1.5) for n in (1, 2))
+    for env, count in ((one, 1), (two, 2)):
+        env.reset(seed=0)
+        np.testing.assert_array_equal(env.step(np.zeros((count, 4)))[1], np.full(count, 1.5))
+    alone = SonarEnv(simulator, start=START, reward=lambda step: 1.0)
+    alone.reset(seed=0)
+    assert alone.step(np.zeros(4))[1] == 1.0
+    for reward, said in ((lambda step: [0, np.nan], r"got nan at \[1\]"), (lambda step: np.zeros(3), r"the shape \(3,\)")):
+        bad = SonarVectorEnv(simulator, num_envs=2, start=START, reward=reward)
+        bad.reset(seed=0)
+        with pytest.raises(MitsonarError, match=said):
+            bad.step(np.zeros((2, 4)))

@@ -9,9 +9,11 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import RAYS, Sonar
 from mitsonar.instruments.named_sonars import preset
 from mitsonar.instruments.ping_groups import (
+    first_sweeps,
     frame_period_s,
     group_of_beams,
     one_beam,
+    overlap_notes,
     scanned,
     scans,
     timed_path,
@@ -89,3 +91,27 @@ def test_mistakes_are_told() -> None:
         Sonar.create(beams=4, ping_groups=5)
     with pytest.raises(MitsonarError, match="a sweep lasts"):
         timed_path(scanned(ONE), Trajectory.between(Pose(0, 0, 1), Pose(0, 1, 1), 2, 1.0))
+
+
+def test_pings_that_overlap_are_told_with_the_rate_that_would_do() -> None:
+    """8 pings of 7.5 ms against 1/21 s; a head that turns follows its own sweeps."""
+    didson = preset("didson300").replace(ping_groups=8)
+    (note,) = overlap_notes(didson, np.arange(3) / 21)
+    assert "the 8 pings of a frame last 0.0597 s and the next frame is due 0.0476 s later" in note
+    rate = float(note.partition("frame_rate_hz of ")[2].split()[0])
+    assert not overlap_notes(didson, np.arange(3) / rate)
+    assert overlap_notes(didson, np.arange(3) / (rate * 1.01))
+    for fine in (preset("didson300"), preset("ping360")):
+        assert not overlap_notes(fine, np.arange(3) / 21)
+    assert not overlap_notes(didson, np.zeros(1))
+
+
+def test_frames_of_a_head_count_its_first_sweeps() -> None:
+    sonar = scanned(ONE, overhead_s=0.005)
+    path = Trajectory.between(Pose(0, 0, 1), Pose(0, 8, 1), 17, 1.0)  # 16 s, two sweeps of 6 s
+    whole, one = timed_path(sonar, path), timed_path(sonar, first_sweeps(sonar, path, 1))
+    np.testing.assert_allclose(one.time_s, whole.time_s[:1])
+    np.testing.assert_allclose(one.poses, whole.poses[:1], atol=1e-12)
+    assert np.ptp(one.poses[0, :, 1]) > 2.9  # it goes on while the head turns
+    with pytest.raises(MitsonarError, match=r"a sweep lasts 6 s and the path 16 s, room for 2: got 3"):
+        first_sweeps(sonar, path, 3)

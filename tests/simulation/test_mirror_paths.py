@@ -271,3 +271,29 @@ def test_mirrors_that_do_not_fit_are_refused() -> None:
         ChannelSonar().replace(bounces=4)
     with pytest.raises(MitsonarError, match="no path goes by 'surfice'"):
         ChannelSimulator(guide(), instrument(), mirrors=GUIDE).paths(SENT_FROM).by("surfice")
+
+
+# ---------------------------------------------------------------- slips
+
+
+def test_receivers_have_names_and_numbers() -> None:
+    simulator = ChannelSimulator(guide(), instrument(), mirrors=GUIDE)
+    by_name, by_number = (simulator.paths(SENT_FROM, receiver=one) for one in ("one", 0))
+    np.testing.assert_array_equal(by_name.delay_s, by_number.delay_s)
+    for wrong in ("two", 1, -1, 0.0, True, None):
+        with pytest.raises(MitsonarError, match=r"receiver must be a name of one, or a number 0\.\.0: got"):
+            simulator.paths(SENT_FROM, receiver=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("part", [-1.0, None, (1.0,), (1.0, 0.0, 0.0), "steel", ("x", 0)])
+def test_a_mirror_that_is_no_pair_is_told(part: Any) -> None:
+    with pytest.raises(MitsonarError, match=r"mirrors: surface takes a pair, .* such as \(-1\.0, 0\.0\): got"):
+        ChannelSimulator(guide(), instrument(), mirrors={"surface": part})
+
+
+def test_mirrors_of_materials_where_there_are_none_are_told() -> None:
+    assert not any("no mirrors" in note for note in ChannelSimulator(guide(), instrument(), mirrors=GUIDE).notes)
+    (note,) = ChannelSimulator(guide(half=5.0), instrument(bounces=1), mirrors="materials").notes
+    assert "the scene has no mirrors: no shape has an acoustic_material with reflection and roughness_m" in note
+    with pytest.raises(MitsonarError, match="mirrors are parts by the ids of the shapes, or `materials`: got 5"):
+        ChannelSimulator(guide(), instrument(), mirrors=5)  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ import pytest
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.simulation.moving_files import said_by
 from mitsonar.simulation.scene import find_scene, load_scene, shipped_scenes, shipped_trajectory, sonar_in
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -81,3 +82,29 @@ def test_shipped_scenes_have_a_trajectory_of_their_name() -> None:
     for name, path in shipped_scenes().items():
         assert find_scene(name) == path
         assert len(Trajectory.load_tum(shipped_trajectory(name))) > 1
+
+
+PATH = '<texture type="trajectory" {}><string name="filename" value="fish.tum"/></texture>'
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        (PATH.format('name="moton"'), 'in sphere fish stands there with name="moton": nothing would move'),
+        (PATH.format(""), "stands there without a name"),
+        ('<ref id="way" name="moton"/>', 'stands there with name="moton"'),
+        (f'<bsdf type="diffuse">{PATH.format("")}</bsdf>', 'write name="motion", in a shape'),
+        (PATH.format('name="motion"'), ""),
+        ('<ref id="way" name="motion"/>', ""),
+    ],
+)
+def test_a_trajectory_that_no_shape_reads_is_refused(shape: str, said: str, tmp_path: Path) -> None:
+    """Mitsuba leaves textures of any other name out without a word."""
+    waits = PATH.format('id="way"') if "<ref" in shape else ""
+    file = tmp_path / "tank.xml"
+    file.write_text(f'<scene version="3.0.0">{waits}<shape type="sphere" id="fish">{shape}</shape></scene>')
+    if said:
+        with pytest.raises(MitsonarError, match=said):
+            load_scene(file)
+    else:
+        assert [found.name for found in said_by(load_scene(file))] == ["fish"]

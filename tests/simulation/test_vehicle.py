@@ -147,3 +147,22 @@ def test_range_rates_are_those_of_body_and_sonar(tank: Path) -> None:
     across = np.sin(frames.bearing_rad)[None, None]
     ahead = np.sqrt(1 - drop**2) * np.cos(across)
     np.testing.assert_allclose(rates[ground], (-0.6 * ahead)[ground], atol=0.03)
+
+
+def test_a_sensor_that_cannot_follow_is_named_before_any_is_rendered(tank: Path, tmp_path: Path) -> None:
+    from mitsonar.acoustics.noise import NOISE_MODELS
+    from mitsonar.simulation.render_run import Outputs
+
+    (tmp_path / "auv.yaml").write_text(
+        "sensors:\n  ahead: {sonar: {beams: 12, range_max: 9, quality: draft}}\n  head: {sonar: ping360}\n"
+    )
+    simulator = VehicleSimulator(load_scene(tank), load_vehicle(tmp_path / "auv.yaml").sensors)
+    calls: list[int] = []
+    for noise, said in (("none", r"sensor head: a sweep lasts 18\.67 s and the path 1 s"), ("low", "sensor head: ")):
+        outputs = Outputs(NOISE_MODELS[noise])
+        with pytest.raises(MitsonarError, match=said):
+            run_vehicle(simulator, PATH, tmp_path / "run", outputs, origin={}, progress=calls.append)
+    assert not calls
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(MitsonarError, match="sensor head: a sweep"):
+        simulator.render(PATH)

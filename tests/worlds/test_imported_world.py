@@ -198,6 +198,10 @@ def test_models_elsewhere_need_the_search_path(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="give the folder that holds it by --search"):
         imported_world(tmp_path / "worlds" / "harbour.sdf")
     assert len(imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "models"]).meshes) == 4
+    (tmp_path / "models" / "buoy" / "ball.stl").unlink()
+    with pytest.raises(MitsonarError, match=r"ball\.stl', there is no such file within") as told:
+        imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "models", tmp_path / "models"])
+    assert str(told.value).count(str(tmp_path / "models,")) + str(told.value).count(f"{tmp_path / 'models'}:") == 1
     with pytest.raises(MitsonarError, match="there is no folder"):
         imported_world(tmp_path / "worlds" / "harbour.sdf", search=[tmp_path / "none"])
 
@@ -263,6 +267,8 @@ def test_the_command_makes_a_scene_and_names_its_shapes(mitsonar: Command, tmp_p
         mitsonar("world", "import", tmp_path / "crane.urdf", "--joint", "shoulder", "-o", out), "--joint takes NAME=VALUE"
     )
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--joint", "shoulder=x", "-o", out), "a number in rad or m")
+    twice = ("--joint", "shoulder=0.1", "--joint", "shoulder=0.2")
+    refused(mitsonar("world", "import", tmp_path / "crane.urdf", *twice, "-o", out), "--joint gives shoulder twice")
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--material", "base=stel", "-o", out), "did you mean steel")
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--material", "bas=steel", "-o", out), "no link", "base")
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--reflectivity", "2", "-o", out), "--reflectivity must be")

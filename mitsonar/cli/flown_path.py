@@ -1,0 +1,105 @@
+"""The path that the options ``--from``, ``--to``, ``--frames``, ``--speed`` and ``--trajectory`` say."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mitsonar.cli.console import numbers, warn
+from mitsonar.errors import MitsonarError, meant
+
+if TYPE_CHECKING:
+    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
+
+__all__ = ["FRAMES", "SIX", "SPEED", "Frame", "path_for", "warn_of_speed"]
+
+SIX = "x,y,z,pitch,roll,heading in m and deg"
+FRAMES = (
+    "Number of frames: with --trajectory evenly spaced in time over all of it; of a head that turns (ping360) of sweeps, "
+    "the first ones; of --vehicle of poses."
+)
+SPEED = "Speed from --from to --to [m/s] (default: a frame every 1 / frame_rate_hz)."
+FAST_M_S = 5.0
+"""Speed above which the vehicle's is told [m/s]: few underwater vehicles reach it."""
+
+Frame = Annotated[
+    str,
+    typer.Option(help="Convention of pose files, read and written: mitsonar, ros-enu or ned (not of --from)."),
+]
+
+
+def path_for(
+    sonar: Sonar,
+    attitude: Pose | None,
+    scene: str,
+    frames: int | None,
+    start: str | None,
+    end: str | None,
+    file: Path | None,
+    frame: str,
+    speed: float | None = None,
+) -> Trajectory:
+    """Return the poses that the options say."""
+    from mitsonar.instruments.ping_groups import first_sweeps, frame_period_s, scans
+    from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.simulation.scene import shipped_trajectory
+
+    if frames is not None and frames < 1:
+        raise MitsonarError(f"--frames must be at least 1: got {frames}")
+    if speed is not None and (file is not None or end is None or not 0 < speed < 1e4):
+        raise MitsonarError(
+            f"--speed is above 0 m/s, of --from and --to: got {speed:g}{' without --to' if end is None else ''}"
+        )
+    if file is not None:
+        if start or end:
+            raise MitsonarError("--trajectory and --from/--to contradict each other: give one")
+        shipped = str(file) == "shipped"
+        if not shipped and not file.exists():
+            raise MitsonarError(
+                f"there is no trajectory {file}: give a TUM or CSV file, or `shipped`{meant(file, ['shipped'])}"
+            )
+        flown = Trajectory.load_tum(shipped_trajectory(scene)) if shipped else Trajectory.load(file, frame)
+        if frames is None:
+            return flown
+        return first_sweeps(sonar, flown, frames) if scans(sonar) else flown.resample(frames)
+    first = numbers(start, 6, "--from")
+    last = numbers(end, 6, "--to")
+    begin = Pose.from_degrees(first) if first else attitude
+    if begin is None:
+        raise MitsonarError(f"the scene gives no pose: give one with --from ({SIX}), or --trajectory FILE.tum")
+    if last is None:
+        return Trajectory.between(begin, begin, _ends(sonar, frames or 1), 1 / frame_period_s(sonar))
+    if frames is None or (frames < 2 and not scans(sonar)):
+        raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
+    ends, poses = (begin, Pose.from_degrees(last)), frames + 1 if scans(sonar) else frames
+    away = math.dist(ends[0][:3], ends[1][:3])
+    if speed is not None and away == 0:
+        raise MitsonarError("--speed needs --from and --to that lie apart: they are one place; leave --speed out")
+    rate_hz = 1 / frame_period_s(sonar) if speed is None else (poses - 1) * speed / away
+    return Trajectory.between(*ends, poses, rate_hz)
+
+
+def _ends(sonar: Sonar, frames: int) -> int:
+    """Return the poses of a vehicle that rests for so many frames; those of a head that turns are the sweeps between."""
+    from mitsonar.instruments.ping_groups import scans
+
+    return frames + 1 if scans(sonar) and frames > 1 else frames
+
+
+def warn_of_speed(path: Trajectory, end: str | None, speed: float | None) -> None:
+    """Tell how fast the vehicle is where --from, --to and --frames leave it to the frame rate, and it is faster than any."""
+    lasts = float(path.time_s[-1] - path.time_s[0])
+    if end is None or speed is not None or lasts <= 0:
+        return
+    away = math.dist(path.poses[0, :3], path.poses[-1, :3])
+    if away / lasts > FAST_M_S:
+        warn(
+            f"the vehicle flies {away:.3g} m in {lasts:.3g} s, {away / lasts:.3g} m/s, since frames follow each other at "
+            "the sonar's rate; give --speed 1 (m/s), or more --frames"
+        )
