@@ -84,11 +84,13 @@ class CorrelatedErrors(NamedTuple):
         onward: correlation of that part from each motion to the next ``(motions - 1,)``, 0 to below 1.
         slope_std: standard deviation of the slope of each component's error (rows) over each of the motion (columns), the
             same slopes for all motions ``(3, 3)``.
+        sloped: what the slopes are over, the motions without the errors of single ones ``(motions, 3)``.
     """
 
     share: float
     onward: Array
     slope_std: Array
+    sloped: Array
 
 
 @dataclass(frozen=True)
