@@ -5,18 +5,21 @@
 
 A seabed of that many triangles and a body of as many, in the models physical and coherent: milliseconds a ping where the
 body stands still in the scene, and where it moves; medians, the two in turn. A frame of eight groups too.
+Then bodies whose vertices move each ping, by their triangles.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import numpy as np
 from bench_impulse import cpu
 from numpy.typing import NDArray
 
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.deforming import Deforming
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
@@ -44,6 +47,9 @@ def main() -> None:
     print("| model | still ms | moving ms | ratio | 8 ping groups ms | ratio |\n|---|---|---|---|---|---|")
     for name, changes in MODELS.items():
         print(row(name, changes, triangles, pings), flush=True)
+    print("\n| triangles that deform | ms a ping | still body ms |\n|---|---|---|")
+    for count in (1_000, 10_000) if asked.quick else (1_000, 10_000, 100_000):
+        print(deforming_row(count, pings), flush=True)
 
 
 def row(name: str, changes: dict[str, object], triangles: int, pings: int) -> str:
@@ -62,6 +68,22 @@ def row(name: str, changes: dict[str, object], triangles: int, pings: int) -> st
     took = np.array([[ping_s(one, number) for one in makers] for number in range(pings + WARM)])[WARM:]
     still, moving, groups = np.median(took, axis=0) * 1e3
     return f"| {name} | {still:.0f} | {moving:.0f} | {moving / still:.2f} | {groups:.0f} | {groups / still:.2f} |"
+
+
+def deforming_row(triangles: int, pings: int) -> str:
+    """Return a row of what a body costs that deforms over a still seabed of 20,000 triangles."""
+    import mitsuba as mi
+
+    sonar = Sonar.create(**MODELS["physical"])
+    body: Any = relief(triangles, 0.6, 1)
+    vertex = np.array(mi.traverse(body)["vertex_positions"]).reshape(-1, 3)
+    placed = mi.load_dict({"type": "scene", "floor": relief(20_000, 12.0, 0), "body": body}, optimize=False)
+    here = Trajectory(np.array([[0, 4, 0.4, 0, 0, 0]], dtype=float), np.zeros(1))
+    swims = Deforming(here, lambda time_s: vertex + 0.01 * np.sin(time_s))
+    makers = [Simulator(placed, sonar, moving={"body": one}) for one in (swims, here)]
+    took = np.array([[ping_s(one, number) for one in makers] for number in range(pings + WARM)])[WARM:]
+    deforms, still = np.median(took, axis=0) * 1e3
+    return f"| {triangles:,} | {deforms:.0f} | {still:.0f} |"
 
 
 def ping_s(simulator: Simulator, number: int) -> float:

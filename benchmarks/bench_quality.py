@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 import mitsonar
 from mitsonar.instruments.named_sonars import named_sonars, preset
+from mitsonar.instruments.ping_groups import one_beam, scans
 from mitsonar.instruments.quality import FAR_GRAZING_RAD, QUALITIES
 from mitsonar.io.whole_files import write_whole
 from mitsonar.simulation.variant import ensure_variant
@@ -109,6 +110,7 @@ class Ground:
 
     def __init__(self, name: str, pings: int) -> None:
         whole = preset(name).replace(model="physical")
+        whole = one_beam(whole) if scans(whole) else whole  # a head that turns: around its one beam
         self.sonar = whole.replace(beams=BEAMS, beam_width_deg=math.degrees(whole.beam_width_rad))
         self.height = whole.range_max * math.sin(FAR_GRAZING_RAD)
         self.pitch = FAR_GRAZING_RAD + math.radians(whole.elevation_fov_deg) / 2

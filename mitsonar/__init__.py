@@ -43,23 +43,30 @@ if TYPE_CHECKING:
     from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
     from mitsonar.mapping.vehicle_sensors import VehicleSensors
     from mitsonar.motion.composition import Motion
+    from mitsonar.motion.deforming import Deforming
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.recordings.mcap_writer import write_mcap
     from mitsonar.recordings.open_recording import open_recording
     from mitsonar.records.echogram import Echogram
     from mitsonar.records.impulse_responses import ImpulseResponses
+    from mitsonar.records.range_rates import range_rates
     from mitsonar.records.sonar_frames import SonarFrames
     from mitsonar.records.soundings import Soundings
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.moving_files import load_meshes, load_motions
     from mitsonar.simulation.scene import load_scene
     from mitsonar.simulation.sounding import SounderSimulator
+    from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
+    from mitsonar.worlds.sea_surface import SeaSurface
+    from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
 
 __all__ = [
     "ChannelSimulator",
     "ChannelSonar",
     "DataStore",
+    "Deforming",
     "Echogram",
     "Estimate",
     "ImpulsePairs",
@@ -67,8 +74,10 @@ __all__ = [
     "MitsonarError",
     "MitsonarWarning",
     "Motion",
+    "Mounted",
     "Pose",
     "RenderedPairs",
+    "SeaSurface",
     "SensorNoise",
     "Simulator",
     "Sonar",
@@ -81,20 +90,27 @@ __all__ = [
     "Soundings",
     "Trajectory",
     "VehicleSensors",
+    "VehicleSimulator",
     "build_mosaic",
     "cramer_rao_bound",
     "create_estimator",
     "load_checkpoint",
     "load_frames",
+    "load_meshes",
+    "load_motions",
     "load_noise",
     "load_recipe",
     "load_scene",
     "load_sensors",
     "load_sonar",
     "load_sounder",
+    "load_vehicle",
     "make_dataset",
+    "net_mesh",
     "odometry",
     "open_recording",
+    "particle_mesh",
+    "range_rates",
     "save_sensors",
     "simulated_sensors",
     "write_mcap",
@@ -104,6 +120,7 @@ _MODULES = {
     "ChannelSimulator": "simulation.channel",
     "ChannelSonar": "instruments.channel_sonar",
     "DataStore": "datasets.store",
+    "Deforming": "motion.deforming",
     "Echogram": "records.echogram",
     "Estimate": "estimation.estimator",
     "ImpulsePairs": "datasets.response_pairs",
@@ -111,8 +128,10 @@ _MODULES = {
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
     "Motion": "motion.composition",
+    "Mounted": "simulation.vehicle",
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered_pairs",
+    "SeaSurface": "worlds.sea_surface",
     "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.imaging_sonar",
@@ -125,22 +144,29 @@ _MODULES = {
     "Soundings": "records.soundings",
     "Trajectory": "motion.trajectory",
     "VehicleSensors": "mapping.vehicle_sensors",
+    "VehicleSimulator": "simulation.vehicle",
     "build_mosaic": "mapping.mosaic",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
     "load_checkpoint": "estimation.named_estimators",
     "load_frames": "mapping.open_frames",
+    "load_meshes": "simulation.moving_files",
+    "load_motions": "simulation.moving_files",
     "load_noise": "acoustics.noise",
     "load_recipe": "config.data_recipe",
     "load_scene": "simulation.scene",
     "load_sensors": "mapping.sensor_files",
     "load_sonar": "instruments.named_sonars",
     "load_sounder": "instruments.named_sounders",
+    "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",
+    "net_mesh": "worlds.water_bodies",
     "odometry": "mapping.odometry",
+    "particle_mesh": "worlds.water_bodies",
+    "open_recording": "recordings.open_recording",
+    "range_rates": "records.range_rates",
     "save_sensors": "mapping.sensor_files",
     "simulated_sensors": "mapping.simulated_sensors",
-    "open_recording": "recordings.open_recording",
     "write_mcap": "recordings.mcap_writer",
 }
 

@@ -26,6 +26,7 @@ PLUGINS = (
     "echo_integrator",
     "cell_noise",
     "perlin",
+    "trajectory_texture",
 )
 """The modules that use Mitsuba, in the order in which they import each other."""
 

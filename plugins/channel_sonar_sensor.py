@@ -26,7 +26,8 @@ class ChannelSensor(mi.Sensor):
     Properties: those of :class:`mitsonar.instruments.channel_sonar.ChannelSonar` (``carrier_hz`` [Hz, 80000],
     ``bandwidth_hz`` [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max``
     [m, 25], ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``,
-    ``points_per_m2`` [1700], ``scatterer_spacing_m`` [m], ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front,
+    ``bounces`` [1], ``direct`` [false], ``points_per_m2`` [1700],
+    ``scatterer_spacing_m`` [m], ``rays`` [50000], ``seed`` [0], ``name``); ``receivers`` [front,
     left, back, right]: names with commas between; ``to_world``: of the vehicle, local +z forward, +y up.
 
     Fields of view of all receivers: ``shape`` [rectangular], ``tilt_deg`` [deg, 25], ``across_deg`` [deg, 10], ``along_deg``
@@ -36,7 +37,7 @@ class ChannelSensor(mi.Sensor):
 
     By default the receivers front, left, back and right lie 0.1 m from the transmitter and point that way. Others must have
     a heading and a position. As a camera the sensor sends one ray, forward; ``mitsonar impulse`` computes responses. It does
-    not model a vehicle that shadows its own receivers, several bounces, or the direct path from transmitter to receiver.
+    not model a vehicle that shadows its own receivers. Several bounces need mirrors (``--mirrors``).
 
     .. code-block:: xml
 

@@ -59,8 +59,9 @@ class ImagingSonar(mi.Sensor):
     Properties: those of :class:`mitsonar.instruments.imaging_sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
     ``elevation_fov_deg`` [deg, 14], ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512],
     ``sound_speed`` [m/s, 1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing],
-    ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``frame_rate_hz`` [Hz, 10],
-    ``ping_groups`` [1], ``group_order`` [interleaved], ``group_interval_s`` [s, 2 range_max / sound_speed]: groups of beams
+    ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``bounces`` [1],
+    ``frame_rate_hz`` [Hz, 10], ``ping_groups`` [1], ``group_order`` [interleaved],
+    ``group_interval_s`` [s, 2 range_max / sound_speed + group_overhead_s], ``group_overhead_s`` [s, 0]: groups of beams
     that ping one after another, which ``mitsonar.Simulator`` reads (docs/guides/moving.md);
     ``quality`` [standard]: draft, standard or fine, ``thesis_rays`` [700], ``rays_per_beam`` and ``rays_across`` [from
     quality; of the model ``thesis`` these are ``thesis_rays`` and one]); of the model ``coherent``, and in part of

@@ -13,6 +13,7 @@ Reflectivity of a surface is one number in 0..1; colours count by their luminanc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -23,17 +24,23 @@ from mitsonar.acoustics.effective_mu import hearing_notes
 from mitsonar.arrays import DeviceArray
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial
+from mitsonar.plugins.bsdf_reflectance import (
+    APPROXIMATED,
+    BENT,
+    DEFAULT_REFLECTIVITY,
+    DIFFUSE,
+    TWO_FACED,
+    WRAPPERS,
+    by_vertex,
+    constant_on_facets,
+    kinds_and_textures,
+    one_number,
+    reflectivity_at,
+    unit,
+)
 from mitsonar.plugins.material_laws import law_rows, material_of, mirror_rows, weighed
 
-__all__ = ["DEFAULT_REFLECTIVITY", "Hit", "Surfaces", "facet_points", "reflectances_of", "reflectivity_at"]
-
-DEFAULT_REFLECTIVITY = 0.5
-
-DIFFUSE = {"SmoothDiffuse", "SmoothPlastic", "RoughPlastic", AcousticMaterial.__name__}
-APPROXIMATED = {"Principled", "PrincipledThin", "BlendBSDF"}
-BENT = {"BumpMap", "NormalMap"}
-TWO_FACED = "a different BSDF on each side"
-WRAPPERS = {"TwoSidedBRDF", "MaskBSDF", TWO_FACED, *BENT}
+__all__ = ["Hit", "Surfaces", "facet_points", "registry_index"]
 
 
 @dataclass
@@ -92,14 +99,18 @@ class Surfaces:
     notes: list[str]
 
     @classmethod
-    def of(cls, scene: mi.Scene) -> Surfaces:
+    def of(cls, scene: mi.Scene, shapes: Sequence[mi.Shape] | None = None) -> Surfaces:
         """Return the tables of a scene. Materials have one reflectivity for all angles; see :meth:`heard_by`.
+
+        Args:
+            scene: that is traced.
+            shapes: that stand for those of the scene, in their order; default: they themselves.
 
         Raises:
             MitsonarError: a shape with several materials.
         """
-        shapes = scene.shapes()
-        size = 1 + max((_registry_index(shape) for shape in shapes), default=0)
+        shapes = scene.shapes() if shapes is None else shapes
+        size = 1 + max((registry_index(shape) for shape in shapes), default=0)
         rows = [[-1, 0, -1, -1] for _ in range(size)]
         constant = [-1.0] * size
         facets: list[mi.Float] = []
@@ -109,15 +120,15 @@ class Surfaces:
         named: dict[str, list[str]] = {"approximated": [], "without": []}
         facet_count = corner_count = 0
         for number, shape in enumerate(shapes):
-            index = _registry_index(shape)
+            index = registry_index(shape)
             rows[index][2] = number
             if shape.bsdf() is None:  # an instance: Mitsuba evaluates the shapes of its group
                 continue
-            kinds, textures = _walk(shape.bsdf())
+            kinds, textures = kinds_and_textures(shape.bsdf())
             rows[index][3] = _number_of_material(shape, materials) if AcousticMaterial.__name__ in kinds else -1
             constant[index] = _fixed_reflectivity(shape, kinds, named)
-            flat = constant[index] >= 0 or (TWO_FACED not in kinds and all(map(_constant_on_facets, textures)))
-            if shape.is_mesh() and (flat or not (kinds & BENT or any(map(_by_vertex, textures)))):
+            flat = constant[index] >= 0 or (TWO_FACED not in kinds and all(map(constant_on_facets, textures)))
+            if shape.is_mesh() and (flat or not (kinds & BENT or any(map(by_vertex, textures)))):
                 rows[index][:2] = facet_count, corner_count
                 tabled.append(mesh := cast(mi.Mesh, shape))
                 facets.append(_facet_rows(mesh, constant[index], flat))
@@ -141,6 +152,19 @@ class Surfaces:
         )
         dr.eval(tables.arrays())
         return tables
+
+    def turn_facets(self, mesh: mi.Mesh) -> None:
+        """Read the normals of a mesh anew: its vertices have moved. Reflectivities stay."""
+        first = int(self.shapes[4 * registry_index(mesh)])
+        if first < 0:
+            return
+        facet = dr.arange(mi.UInt32, mesh.face_count())
+        normal = facet_points(mesh, facet, mi.Point2f(1 / 3)).n
+        facets = mi.Float(self.facets)
+        for place, value in enumerate((normal.x, normal.y, normal.z)):
+            dr.scatter(facets, value, (facet + first) * 4 + place)
+        self.facets = facets
+        dr.eval(self.facets)
 
     def arrays(self) -> dict[str, DeviceArray]:
         """Return the tables by name: the inputs of a launch."""
@@ -185,15 +209,15 @@ class Surfaces:
         if self.textured:
             evaluated = tabled & (reflectivity < 0)
             si = self._on_facet(found, ray, normal, mi.UInt32(shape.y), evaluated)
-            own: DeviceArray = _one_number(found.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
-            reflectivity = dr.select(evaluated, _unit(own), reflectivity)
+            own: DeviceArray = one_number(found.shape.bsdf().eval_diffuse_reflectance(si, evaluated))
+            reflectivity = dr.select(evaluated, unit(own), reflectivity)
         if self.foreign:
             evaluated = valid & ~tabled
             si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, evaluated)
             fixed = dr.select(known, dr.gather(mi.Float, self.constant, index, known), -1)
-            own = _one_number(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
+            own = one_number(si.bsdf().eval_diffuse_reflectance(si, evaluated & (fixed < 0)))
             normal = dr.select(tabled, normal, si.n)
-            reflectivity = dr.select(tabled, reflectivity, _unit(dr.select(fixed < 0, own, fixed)))
+            reflectivity = dr.select(tabled, reflectivity, unit(dr.select(fixed < 0, own, fixed)))
             top: DeviceArray = dr.reinterpret_array(mi.UInt32, found.instance)
             inside = valid & (top > 0) & (top * 4 < dr.width(self.shapes))
             shape_id = dr.select(inside, dr.gather(mi.Vector4i, self.shapes, top, inside).z, shape_id)
@@ -227,7 +251,8 @@ class Surfaces:
         return si
 
 
-def _registry_index(shape: mi.Shape) -> int:
+def registry_index(shape: mi.Shape) -> int:
+    """Return the number by which kernels know a shape: that of ``found.shape``."""
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
     return int(index[0])
 
@@ -305,73 +330,6 @@ def facet_points(mesh: mi.Mesh, facet: DeviceArray, uv: mi.Point2f) -> mi.Surfac
     ray = dr.zeros(mi.Ray3f, count)
     ray.d = mi.Vector3f(0, 0, 1)
     return cast(mi.SurfaceInteraction3f, found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame))
-
-
-def reflectances_of(bsdf: mi.BSDF) -> list[mi.Object]:
-    """Return the textures that a BSDF's reflectivity may come from."""
-    return _walk(bsdf)[1]
-
-
-def reflectivity_at(bsdf: mi.BSDF, si: mi.SurfaceInteraction3f) -> DeviceArray:
-    """Return the reflectivity 0..1 of a BSDF at points; :data:`DEFAULT_REFLECTIVITY` where it has no diffuse reflectance."""
-    if not _walk(bsdf)[0] <= DIFFUSE | APPROXIMATED | WRAPPERS:
-        return mi.Float(DEFAULT_REFLECTIVITY)
-    return _unit(_one_number(bsdf.eval_diffuse_reflectance(si)))
-
-
-def _one_number(spectrum: DeviceArray) -> DeviceArray:
-    """Return the luminance of a spectrum."""
-    return mi.luminance(spectrum) if mi.is_rgb else spectrum[0]
-
-
-def _unit(value: DeviceArray) -> DeviceArray:
-    """Clip to 0..1, by comparisons: LLVM 15 and 16 abort on `max` (see simulation.variant)."""
-    return dr.select(value > 0, dr.select(value < 1, value, 1), 0)
-
-
-class _Children(mi.TraversalCallback):
-    """Collect the objects directly below one."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.objects: list[mi.Object] = []
-
-    def put(self, name: str, value: object, flags: int, cpptype: object = None) -> None:
-        """Keep a value that is an object; Mitsuba calls this for each parameter."""
-        if isinstance(value, mi.Object):
-            self.objects.append(value)
-
-
-def _walk(bsdf: mi.BSDF) -> tuple[set[str], list[mi.Object]]:
-    """Return the class names of a BSDF and all nested ones, and the textures that their reflectance may come from."""
-    children = _Children()
-    bsdf.traverse(children)
-    kinds, textures = {_kind(bsdf)}, []
-    if bsdf.class_name() == "TwoSidedBRDF" and len({id(child) for child in children.objects}) > 1:
-        kinds.add(TWO_FACED)
-    for child in children.objects:
-        if isinstance(child, mi.BSDF):
-            below = _walk(child)
-            kinds |= below[0]
-            textures += below[1]
-        else:
-            textures.append(child)
-    return kinds, textures
-
-
-def _kind(bsdf: mi.Object) -> str:
-    """Return the name of a BSDF's class; Mitsuba calls all that are written in Python ``BSDF``."""
-    name = bsdf.class_name()
-    return type(bsdf).__name__ if name == "BSDF" else name
-
-
-def _constant_on_facets(texture: mi.Object) -> bool:
-    name = texture.class_name()
-    return name == "UniformSpectrum" or (name == "MeshAttribute" and 'name = "face_' in str(texture))
-
-
-def _by_vertex(texture: mi.Object) -> bool:
-    return texture.class_name() == "MeshAttribute"
 
 
 def _notes(named: dict[str, list[str]]) -> list[str]:

@@ -17,6 +17,7 @@ from PIL import Image
 
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
+from mitsonar.records.sonar_frames import SonarFrames
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -79,9 +80,40 @@ def scene(**shapes: MitsubaDict) -> mi.Scene:
     return loaded
 
 
+def separate(**shapes: MitsubaDict) -> mi.Scene:
+    """A scene of these shapes, of which none are merged."""
+    import mitsuba as mi
+
+    loaded = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    assert isinstance(loaded, mi.Scene)
+    return loaded
+
+
 def place_of(scene: mi.Scene, name: str) -> int:
     """The index of a shape in the scene, as in ``shape_id``."""
     return [shape.id() for shape in scene.shapes()].index(name)
+
+
+def lit_plane(sonar: Sonar, height_m: float, pitch_rad: float, slope_deg: float = 0.0) -> tuple[SonarFrames, Array, Array]:
+    """Two frames of a plane that rises forward below the sonar, bright where the fan lights it.
+
+    Returns:
+        The frames, and the heights below the sonar at which the steepest and the shallowest rays end ``(beams,)`` each.
+    """
+    half, bearing = np.radians(sonar.elevation_fov_deg) / 2, sonar.bearing_rad
+    reach, below = [], []
+    for e in (-half, half):
+        forward = np.cos(bearing) * np.cos(e) * np.cos(pitch_rad) + np.sin(e) * np.sin(pitch_rad)
+        down = np.cos(bearing) * np.cos(e) * np.sin(pitch_rad) - np.sin(e) * np.cos(pitch_rad)
+        reach.append(height_m / (down + forward * np.tan(np.radians(slope_deg))))
+        below.append(reach[-1] * down)
+    grain = 0.3 + 0.7 * np.random.default_rng(1).random((sonar.range_bins, sonar.beams), dtype=np.float32)
+    lit = (sonar.range_m[:, None] >= reach[0]) & (sonar.range_m[:, None] <= reach[1])
+    image = np.repeat((grain * lit)[None], 2, axis=0)
+    poses = np.tile([0.0, 0.0, height_m, pitch_rad, 0.0, 0.0], (2, 1))
+    height = np.full(2, height_m)
+    frames = SonarFrames(image, sonar.range_m, bearing, np.arange(2.0), sonar, poses=poses, height_m=height)
+    return frames, below[0], below[1]
 
 
 # ---------------------------------------------------------------- geometry

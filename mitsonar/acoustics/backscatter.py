@@ -78,7 +78,9 @@ class Material(BaseModel):
     source: str = Field("", max_length=20_000, description="where its numbers come from")
     law: Law = Field("lambert", description="lambert, lommel-seeliger, rough-fluid or table")
     mu: float | None = Field(None, gt=0, le=1 / math.pi, description="cross-section at normal incidence [1/sr]")
-    reflection: float | None = Field(None, gt=0, le=1, description="reflection coefficient of the mirror part, of pressures")
+    reflection: float | None = Field(
+        None, ge=-1, le=1, description="reflection coefficient of the mirror part, of pressures; -1: the sea surface"
+    )
     roughness_m: float | None = Field(None, ge=0, le=1, description="rms height of the roughness of the mirror part [m]")
     density_ratio: float | None = Field(None, ge=0.5, le=20, description="density over that of water")
     sound_speed_ratio: float | None = Field(None, ge=0.5, le=6, description="speed of sound over that of water")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -51,6 +51,14 @@ def impulse(
         list[str] | None, typer.Option("--set", help="Change a key of the instrument, KEY=VALUE: carrier_hz=160e3.")
     ] = None,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
+    mirrors: Annotated[
+        bool,
+        typer.Option("--mirrors", help="Paths by way of smooth materials; see docs/guides/impulse-responses.md."),
+    ] = False,
+    mirror: Annotated[
+        list[str] | None,
+        typer.Option("--mirror", help="NAME=V,H: reflection of pressures and rms height [m] of a shape: surface=-1,0.002."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing run.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped run.")] = False,
 ) -> None:
@@ -66,7 +74,9 @@ def impulse(
     flown, speeds = _path(sonar, attitude, velocity, frames, start, trajectory, frame)
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
-    simulator = ChannelSimulator(loaded, sonar)
+    parts = _mirrors(mirrors, mirror or [])
+    origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
+    simulator = ChannelSimulator(loaded, sonar, mirrors=parts)
     with progress_bar("measuring", len(flown), "pings") as progress:
         report = run_impulse(
             simulator, flown, speeds, folder, origin=origin, overwrite=overwrite, resume=resume, progress=progress
@@ -106,6 +116,22 @@ def _instrument(
     fields |= {} if model is None else {"model": model}
     fields |= {} if seed is None else {"seed": seed}
     return sonar.replace(**fields), attitude
+
+
+def _mirrors(materials: bool, given: list[str]) -> dict[str, tuple[float, float]] | Literal["materials"] | None:
+    """Return the mirrors that --mirrors or --mirror say; None where they say nothing."""
+    if not given:
+        return "materials" if materials else None
+    if materials:
+        raise MitsonarError("--mirrors takes the mirrors of all materials, --mirror those of named shapes: give one of both")
+    parts: dict[str, tuple[float, float]] = {}
+    for one in given:
+        name, _, values = one.rpartition("=")
+        part = numbers(values, 2, "--mirror NAME=V,H")
+        if not name or part is None:
+            raise MitsonarError(f"--mirror takes NAME=V,H, reflection and rms height [m] of a shape: got {one!r}")
+        parts[name] = (part[0], part[1])
+    return parts
 
 
 def _receivers(sonar: ChannelSonar, names: str) -> list[dict[str, object]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,9 +13,9 @@ from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
-    from mitsonar.motion.moving_bodies import MovingBodies
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.simulation.moving_files import Said
 
 __all__ = ["NOISE", "SIX", "Frame", "instrument_for", "path_for", "render", "scene_parameters", "sonar_changes"]
 
@@ -57,11 +58,18 @@ def render(
     cartesian: Annotated[bool, typer.Option("--cartesian", help="A figure with metre axes for each frame.")] = False,
     exr: Annotated[bool, typer.Option("--exr", help="Every ray's echo, one EXR a frame.")] = False,
     mirrors: Annotated[
-        bool, typer.Option("--mirrors", help="Glints of smooth materials (model coherent); see docs/guides/coherent.md.")
+        bool,
+        typer.Option("--mirrors", help="Smooth materials glint (coherent) and mirror (bounces); docs/guides/multipath.md."),
     ] = False,
     moving: Annotated[
         list[str] | None,
-        typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; see docs/guides/moving.md."),
+        typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
+    ] = None,
+    all_sensors: Annotated[
+        bool, typer.Option("--all-sensors", help="All sonars and cameras of the scene, on one vehicle (several-sensors.md).")
+    ] = False,
+    vehicle: Annotated[
+        Path | None, typer.Option(help="All sensors of a vehicle, a YAML file; see docs/guides/several-sensors.md.")
     ] = None,
     rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
@@ -71,9 +79,13 @@ def render(
     """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.sonar_losses import absorption_line
+    from mitsonar.cli.vehicle_rendering import VehicleOptions, first_pose, render_vehicle, vehicle_file
+    from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.io.provenance import file_digest
     from mitsonar.motion.conventions import convention_named
+    from mitsonar.motion.moving_bodies import MovingBodies
     from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.render_run import Outputs, run
     from mitsonar.simulation.scene import find_scene, load_scene
 
@@ -85,21 +97,32 @@ def render(
     )
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
-    instrument, attitude = instrument_for(loaded, sonar, model, seed, sonar_changes(set_ or [], quality))
+    changes, folder = sonar_changes(set_ or [], quality), out or Path("out") / find_scene(scene).stem
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+    if all_sensors or vehicle is not None:
+        if mirrors:
+            raise MitsonarError("--mirrors is of one sonar: leave it out, or render the sonars one by one")
+        file = vehicle_file(vehicle, all_sensors, sonar)
+        changes |= {name: value for name, value in (("model", model), ("seed", seed)) if value is not None}
+        begin = first_pose(loaded) if file is None else None
+        flown = path_for(Sonar(), begin, scene, frames, start, end, trajectory, frame)
+        said = moving_said(loaded, moving or [], named, [] if file is None else file.said)
+        options = VehicleOptions(changes, overwrite, resume)
+        return render_vehicle(loaded, file, flown, folder, outputs, said, origin, options)
+    instrument, attitude = instrument_for(loaded, sonar, model, seed, changes)
     refuse_noise(outputs.noise, instrument)
     path = path_for(instrument, attitude, scene, frames, start, end, trajectory, frame)
-    folder = out or Path("out") / find_scene(scene).stem
-    if mirrors and instrument.model != "coherent":
+    if mirrors and instrument.model != "coherent" and instrument.bounces == 1:
         raise MitsonarError(
-            f"--mirrors needs the model coherent: got {instrument.model}; leave it out, or give --model coherent"
+            f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one"
         )
-    bodies = moving_bodies(moving or [], named)
+    said = moving_said(loaded, moving or [], named)
+    bodies = MovingBodies.of(read_said(said), named, path)
     simulator = Simulator(
         loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
     )
-    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     origin |= {"mirrors": True} if mirrors else {}
-    origin |= {"moving": {pair: file_digest(Path(pair.partition("=")[2])) for pair in moving}} if moving else {}
+    origin |= {"moving": digests_of(said)} if said else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     with progress_bar("rendering", len(path), "pings") as progress:
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
@@ -112,18 +135,24 @@ def render(
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
 
 
-def moving_bodies(pairs: list[str], frame: str) -> MovingBodies | None:
-    """Return what --moving says."""
-    from mitsonar.motion.moving_bodies import MovingBodies
-    from mitsonar.motion.trajectory import Trajectory
+def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said] = ()) -> list[Said]:
+    """Return what the scene says of its bodies' motion, and in its place what --moving and a vehicle's file say."""
+    from mitsonar.config.body_motion import BodyMotion
+    from mitsonar.simulation.moving_files import Said, said_by, said_in
 
-    found: dict[str, list[Trajectory]] = {}
-    for pair in pairs:
-        name, _, file = pair.partition("=")
-        if not name or not file:
-            raise MitsonarError(f"--moving takes ID=FILE.tum: got {pair!r}")
-        found.setdefault(name, []).append(Trajectory.load(file, frame, looks_ahead=False))
-    return MovingBodies.of(found) if found else None
+    given: list[Said] = []
+    for option in options:
+        name, _, file = option.partition("=")
+        if option.lower().endswith((".yaml", ".yml")) and not file:
+            given += said_in(option)
+        elif name and file:
+            given.append(Said(name, BodyMotion(path=file, frame=frame), [Path()]))
+        else:
+            raise MitsonarError(f"--moving takes ID=FILE.tum, ID=vehicle or FILE.yaml: got {option!r}")
+    for weaker in (also, said_by(scene)):
+        named = {one.name for one in given}
+        given += [one for one in weaker if one.name not in named]
+    return given
 
 
 def scene_parameters(pairs: list[str]) -> dict[str, str]:
@@ -183,6 +212,7 @@ def path_for(
     frame: str,
 ) -> Trajectory:
     """Return the poses that the options say."""
+    from mitsonar.instruments.ping_groups import frame_period_s
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import shipped_trajectory
@@ -205,7 +235,14 @@ def path_for(
     if begin is None:
         raise MitsonarError(f"the scene gives no pose: give one with --from ({SIX}), or --trajectory FILE.tum")
     if last is None:
-        return Trajectory.between(begin, begin, frames or 1, sonar.frame_rate_hz)
+        return Trajectory.between(begin, begin, _ends(sonar, frames or 1), 1 / frame_period_s(sonar))
     if frames is None or frames < 2:
         raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
-    return Trajectory.between(begin, Pose.from_degrees(last), frames, sonar.frame_rate_hz)
+    return Trajectory.between(begin, Pose.from_degrees(last), _ends(sonar, frames), 1 / frame_period_s(sonar))
+
+
+def _ends(sonar: Sonar, frames: int) -> int:
+    """Return the poses of a path that has so many frames; those of a head that turns are the sweeps between poses."""
+    from mitsonar.instruments.ping_groups import scans
+
+    return frames + 1 if scans(sonar) and frames > 1 else frames

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.render_command import SIX, Frame, path_for, scene_parameters, sonar_changes
+from mitsonar.cli.render_command import SIX, Frame, moving_said, path_for, scene_parameters, sonar_changes
 
 __all__ = ["sound"]
 
@@ -30,6 +30,10 @@ def sound(
     quality: Annotated[str | None, typer.Option(help="draft, standard or fine: rays by the error wanted.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="KEY=VALUE of the instrument: range_max=20.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of jitter, speckle and noise.")] = None,
+    moving: Annotated[
+        list[str] | None,
+        typer.Option("--moving", help="ID=FILE.tum: the shape ID follows that path; or FILE.yaml (docs/guides/moving.md)."),
+    ] = None,
     rays_per_launch: Annotated[int, typer.Option(help="Bound of memory: about 30 bytes a ray.")] = 2**22,
     parameter: Annotated[list[str] | None, typer.Option("-D", help="NAME=VALUE for the scene's $NAME.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is there.")] = False,
@@ -40,6 +44,8 @@ def sound(
     from mitsonar.io.provenance import file_digest
     from mitsonar.mapping.sounding_run import run_sounder
     from mitsonar.motion.conventions import convention_named
+    from mitsonar.motion.moving_bodies import MovingBodies
+    from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.scene import find_scene, load_scene
     from mitsonar.simulation.sounding import SounderSimulator
 
@@ -52,8 +58,11 @@ def sound(
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame)
-    simulator = SounderSimulator(loaded, sounder, rays_per_launch=rays_per_launch)
-    origin = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+    said = moving_said(loaded, moving or [], named)
+    bodies = MovingBodies.of(read_said(said), named, flown)
+    simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)
+    origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
+    origin |= {"moving": digests_of(said)} if said else {}
     options: dict[str, Any] = {"frame": named, "overwrite": overwrite, "resume": resume}
     folder = out or Path("out") / sounder.name
     with progress_bar("sounding", len(flown), "pings") as progress:

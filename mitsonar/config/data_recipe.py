@@ -242,7 +242,9 @@ class Recipe(RecipePart):
             )
         fields = {**self.world, **self.scenes[group].world}
         if "family" not in fields:
-            raise MitsonarError("world lacks family: give rocky-field, ship-hull, pattern, flat-objects or scene")
+            raise MitsonarError(
+                "world lacks family: give rocky-field, ship-hull, pattern, flat-objects, sea-surface or scene"
+            )
         return create_family(str(fields.pop("family")), **fields)
 
     def level_of(self, view: View) -> str:

@@ -53,8 +53,13 @@ class SceneRenderer:
         return {"gain": gain, "level_scale": 1 / gain}
 
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
-        """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view."""
-        return self.simulator.render_views(poses, first=self.scene.number * FRAMES_A_SCENE + first, labels=labels)
+        """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view.
+
+        Bodies that the scene's file moves are where they are at frame / ``frame_rate_hz``.
+        """
+        time_s = (first + np.arange(len(poses))) / self.simulator.sonar.frame_rate_hz
+        number = self.scene.number * FRAMES_A_SCENE + first
+        return self.simulator.render_views(poses, first=number, labels=labels, time_s=time_s)
 
     def frames(self, poses: NDArray[np.float64], first: int, gain: float) -> dict[str, Values]:
         """Render frames of the scene. Return what is stored of them, ``(frames, ...)`` by array name.

@@ -55,7 +55,7 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
-        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask(**task))
+        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create(task))
         self.render_mode = render_mode
         self.action_space, self.observation_space = action_space(), observation_space(self.fleet)
         self._image: NDArray[np.uint8] | None = None

@@ -50,14 +50,16 @@ class SonarFleet:
         steps: of each since the begin of its episode ``(count,)``.
 
     Raises:
-        MitsonarError: no vehicle, no start, or a sonar whose beams ping in groups.
+        MitsonarError: no vehicle, no start, or a source that is no scene.
     """
 
     def __init__(
         self, source: SonarSource, sonar: Sonar | str | None, count: int, moving: Moving | None, task: SonarTask
     ) -> None:
-        if not 1 <= count <= 100_000:
-            raise MitsonarError(f"num_envs must lie in 1..100000: got {count}")
+        if not (isinstance(count, int | np.integer) and 1 <= count <= 100_000):
+            raise MitsonarError(f"num_envs must be a whole number in 1..100000: got {count!r}")
+        if not isinstance(source, Simulator | str | Path) and not hasattr(source, "shapes"):
+            raise MitsonarError(f"scene is a scene, its file or name, or a Simulator: got {type(source).__name__}")
         if isinstance(source, Simulator):
             if sonar is not None or moving is not None:
                 raise MitsonarError("a simulator has its sonar and its moving bodies: leave sonar and moving out")

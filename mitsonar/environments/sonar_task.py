@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeAlias
+from dataclasses import dataclass, fields
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,16 +88,35 @@ class SonarTask:
     def __post_init__(self) -> None:
         for name, least in (("step_s", 1e-6), ("gain", 0.0), ("max_steps", 1), ("clearance_m", 0.0), ("altimeter_m", 1e-6)):
             value = getattr(self, name)
-            if value is not None and not (least <= value < np.inf):
-                raise MitsonarError(f"{argument(name)} must be a finite number of at least {least:g}: got {value!r}")
-        speeds = np.asarray(self.max_velocity, dtype=float)
+            known = int | np.integer if name == "max_steps" else int | float | np.number
+            if value is not None and not (isinstance(value, known) and least <= value < np.inf):
+                kind = "whole" if name == "max_steps" else "finite"
+                raise MitsonarError(f"{argument(name)} must be a {kind} number of at least {least:g}: got {value!r}")
+        if self.noise is not None and not isinstance(self.noise, NoiseModel):
+            raise MitsonarError(f"noise is a NoiseModel, as mitsonar.acoustics.noise.load_noise gives: got {self.noise!r}")
+        speeds = _numbers("max_velocity", self.max_velocity)
         if speeds.shape != (4,) or not (np.isfinite(speeds).all() and (speeds >= 0).all()):
             raise MitsonarError(f"max_velocity is four numbers of 0 or more, {', '.join(VELOCITY)}: got {self.max_velocity}")
+        if not isinstance(self.observe, tuple | list):
+            raise MitsonarError(f"observe is a tuple of image and others: got {self.observe!r}; give ('image',)")
         unknown = [name for name in self.observe if name not in OBSERVABLE]
-        if unknown or "image" not in self.observe or isinstance(self.observe, str):
+        if unknown or "image" not in self.observe:
             wrong = str(unknown[0] if unknown else self.observe)
             raise MitsonarError(f"observe is a tuple of image and others: got {wrong!r}; {nearest_names(wrong, OBSERVABLE)}")
         self.span, self.box  # noqa: B018  # refuse them now
+
+    @classmethod
+    def create(cls, given: dict[str, Any]) -> Self:
+        """Create a task from its fields by name.
+
+        Raises:
+            MitsonarError: an unknown field, or a value that is not allowed.
+        """
+        known = [field.name for field in fields(cls)]
+        for name in given:
+            if name not in known:
+                raise MitsonarError(f"an environment has no argument {name}: {nearest_names(name, known)}")
+        return cls(**given)
 
     @property
     def span(self) -> Table:
@@ -108,7 +127,7 @@ class SonarTask:
         """
         if self.start is None:
             return np.full((2, 6), np.nan)
-        table = np.atleast_2d(np.asarray(self.start, dtype=float))
+        table = np.atleast_2d(_numbers("start", self.start))
         if table.shape not in ((1, 6), (2, 6)) or not np.isfinite(table).all():
             raise MitsonarError(f"start is one pose or two, of x, y, z [m], pitch, roll, heading [rad]: got {table.shape}")
         return np.asarray(np.broadcast_to(table, (2, 6)))
@@ -122,7 +141,19 @@ class SonarTask:
         """
         if self.bounds is None:
             return np.array([[-np.inf] * 3, [np.inf] * 3])
-        box = np.asarray(self.bounds, dtype=float)
+        box = _numbers("bounds", self.bounds)
         if box.shape != (2, 3) or not (box[0] < box[1]).all():
             raise MitsonarError(f"bounds are the lowest and the highest x, y, z [m]: got {box.tolist()}")
         return box
+
+
+def _numbers(name: str, value: object) -> Table:
+    """Return numbers as a table.
+
+    Raises:
+        MitsonarError: they are none.
+    """
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise MitsonarError(f"{name} is made of numbers, rows of one length: got {value!r}") from None

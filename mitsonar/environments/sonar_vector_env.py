@@ -71,7 +71,7 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if name not in modes:
             raise MitsonarError(f"autoreset_mode is {' or '.join(modes)}: got {name!r}")
-        self.fleet = SonarFleet(scene, sonar, num_envs, moving, SonarTask(**task))
+        self.fleet = SonarFleet(scene, sonar, num_envs, moving, SonarTask.create(task))
         self.num_envs, self.render_mode, self._mode = num_envs, render_mode, modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.single_action_space, self.single_observation_space = action_space(), observation_space(self.fleet)

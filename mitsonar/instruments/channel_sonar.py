@@ -175,6 +175,8 @@ class ChannelSonar(Instrument):
     model: ChannelModel = Field(
         "scatterers", description="scatterers of the world, or rays of the vehicle (Almanza-Medina's)"
     )
+    bounces: int = Field(1, ge=1, le=3, description="reflections of a path, at most; a scatterer's counts as one")
+    direct: bool = Field(False, description="sound also arrives directly from transmitter to receiver")
     spreading: bool | None = Field(None, description="amplitudes fall with distance; default: scatterers yes, rays no")
     points_per_m2: float = Field(
         1700.0, gt=0, le=1e7, description="scatterers of surfaces without cells of their own [1/m2]"
@@ -217,6 +219,11 @@ class ChannelSonar(Instrument):
             raise ValueError(
                 f"sampling_hz must be a whole number of frequency_step_hz: got {self.sampling_hz:g} / "
                 f"{self.frequency_step_hz:g}; give {self.sampling_hz / math.ceil(taps):.9g} Hz"
+            )
+        if self.model == "rays" and (self.bounces > 1 or self.direct):
+            raise ValueError(
+                f"bounces and direct are of the model scatterers, rays has one bounce: got bounces {self.bounces}, direct "
+                f"{str(self.direct).lower()}; leave them out, or choose the model scatterers"
             )
         names = [receiver.name for receiver in self.receivers]
         if len(set(names)) < len(names):

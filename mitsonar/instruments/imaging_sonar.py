@@ -126,6 +126,9 @@ class Sonar(Instrument):
         "physical",
         description="coherent: with speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's",
     )
+    bounces: int = Field(
+        1, ge=1, le=3, description="largest number of reflections of a path: 1, 2 or 3 (docs/guides/multipath.md)"
+    )
     gain_exponent: int = Field(
         0,
         ge=0,
@@ -139,6 +142,9 @@ class Sonar(Instrument):
     )
     group_interval_s: float | None = Field(
         None, ge=0, le=1e3, description="from the ping of a group to the next [s]; default: 2 range_max / sound_speed"
+    )
+    group_overhead_s: float = Field(
+        0.0, ge=0, le=1e3, description="what a ping takes beyond its echo [s], where group_interval_s is not given"
     )
     quality: Quality = Field(
         "standard", description="rays of `physical`: draft, standard or fine; `mitsonar presets` prints what each errs by"
@@ -248,6 +254,11 @@ class Sonar(Instrument):
         if self.pulse_m is not None and self.bandwidth_hz is not None:
             raise ValueError("pulse_m and bandwidth_hz say the same: give one of them")
         check_groups(self)
+        if self.bounces > 1 and self.model == "thesis":
+            raise ValueError(
+                f"the model thesis knows one reflection: got bounces {self.bounces}; leave bounces out, or use physical or "
+                "coherent"
+            )
         if self.model == "coherent":
             self._check_coherent()
         if self.beam_pattern != "box":

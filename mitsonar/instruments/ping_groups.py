@@ -20,7 +20,18 @@ from mitsonar.motion.trajectory import Trajectory
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
 
-__all__ = ["GroupOrder", "TimedPath", "check_groups", "group_of_beams", "ping_interval_s", "scanned", "scans", "timed_path"]
+__all__ = [
+    "GroupOrder",
+    "TimedPath",
+    "check_groups",
+    "frame_period_s",
+    "group_of_beams",
+    "one_beam",
+    "ping_interval_s",
+    "scanned",
+    "scans",
+    "timed_path",
+]
 
 GroupOrder: TypeAlias = Literal["interleaved", "sequential"]
 
@@ -50,8 +61,15 @@ def group_of_beams(sonar: Sonar) -> NDArray[np.int64]:
 
 
 def ping_interval_s(sonar: Sonar) -> float:
-    """Return the time from the ping of one group to that of the next [s]: as given, or until the last echo is back."""
-    return 2 * sonar.range_max / sonar.sound_speed if sonar.group_interval_s is None else sonar.group_interval_s
+    """Return the time from the ping of one group to that of the next [s]: as given, or echo and overhead."""
+    if sonar.group_interval_s is not None:
+        return sonar.group_interval_s
+    return 2 * sonar.range_max / sonar.sound_speed + sonar.group_overhead_s
+
+
+def frame_period_s(sonar: Sonar) -> float:
+    """Return the time from frame to frame [s]: one over the frame rate, of a head that turns its sweep."""
+    return sonar.ping_groups * ping_interval_s(sonar) if scans(sonar) else 1 / sonar.frame_rate_hz
 
 
 def scanned(sonar: Sonar, *, sector_deg: float = 360.0, step_deg: float = 0.9, overhead_s: float = 0.0) -> Sonar:
@@ -86,7 +104,8 @@ def scanned(sonar: Sonar, *, sector_deg: float = 360.0, step_deg: float = 0.9, o
         beam_layout="even",
         ping_groups=steps,
         group_order="sequential",
-        group_interval_s=interval,
+        group_interval_s=None,
+        group_overhead_s=overhead_s,
         frame_rate_hz=1 / (steps * interval),
     )
 

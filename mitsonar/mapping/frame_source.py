@@ -14,6 +14,7 @@ from mitsonar.acoustics.local_contrast import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.measured_heights import measured
+from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_errors import associated
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels
@@ -115,7 +116,7 @@ class FrameSource:
         """Take frames whose times, poses, attitudes and heights are in memory, and whose images are read on demand."""
         time = np.asarray(time_s, dtype=float)
         time = time.mean(axis=1) if time.ndim == 2 else time
-        like = replace(like, beam_poses=None, body_poses=None, body_names=())  # as labels: truth that is not kept
+        like = replace(like, beam_poses=None, **BodyStates().fields())  # as labels: truth that is not kept
         return cls(name, like, time, images, poses, attitude_rad, height_m, first_number=first_number, note=note)
 
     def with_noise(self, noise: NoiseModel, seed: int = 0) -> Self:

@@ -13,9 +13,10 @@ from mitsonar.estimation.estimator import AnyEstimator
 from mitsonar.mapping.error_correlation import ErrorCorrelation
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_solver import GraphSolution, solved
+from mitsonar.mapping.loop_appearance import Canvas
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, LoopSearch, canvas_of, search_loops
 from mitsonar.mapping.motion_series import MotionSeries, path_of
-from mitsonar.mapping.pose_graph import Headings, PoseEdges, PoseGraph, relative_motions, wrapped
+from mitsonar.mapping.pose_graph import CorrelatedErrors, Headings, PoseEdges, PoseGraph, relative_motions, wrapped
 from mitsonar.mapping.trajectory_smoothing import fit_noise
 from mitsonar.mapping.vehicle_sensors import UNKNOWN_STD, VehicleSensors
 from mitsonar.motion.pose import Pose
@@ -114,6 +115,20 @@ def normalised_errors(path: Trajectory, covariances: Array, true: Trajectory) ->
     off[:, 2] = wrapped(off[:, 2])
     solution = np.linalg.solve(covariances[1:], off[..., None])[..., 0]
     return np.asarray((off * solution).sum(axis=1) / 3)
+
+
+def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:
+    """Return how errors of consecutive motions ``(n, 3)`` depend on each other.
+
+    Args:
+        motions: sideways, forward [m], yaw [rad].
+        canvas: the ground that frames show; None: not known how far ahead of the sonar.
+    """
+    if canvas is None:
+        return ErrorCorrelation().of(motions, DEFAULT_REACH_M)
+    # without relief errors are noise, which no two pairs share
+    law = ErrorCorrelation(share=0.0) if canvas.view.attitude.even else ErrorCorrelation()
+    return law.of(motions, canvas.reach_m)
 
 
 def graph_path(

@@ -266,7 +266,7 @@ def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors,
     whitening = edges.whitening * own
     by_first, by_second = motion_derivatives(poses, edges.first, edges.second)
     common = np.broadcast_to(np.sqrt(correlated.share) * own * np.eye(3), (count, 3, 3))
-    by_slopes = whitening @ _slope_derivatives(correlated.sloped, correlated.slope_std)
+    by_slopes = whitening @ correlated.by_slopes()
     off = _residuals(edges, poses) * own + (common @ wander[..., None])[..., 0] + by_slopes @ slopes
     number, begin = np.arange(count), poses.size
     rows.add(
@@ -285,11 +285,3 @@ def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors,
         (begin + 3 * number[1:], fresh[:, None, None] * np.eye(3)),
     )
     rows.add(slopes[None], (np.array([begin + 3 * count]), np.eye(9)[None]))
-
-
-def _slope_derivatives(motions: Array, std: Array) -> Array:
-    """Return the derivative of an error by its nine slopes over the motion, in their standard deviations ``(n, 3, 9)``."""
-    table = np.zeros((len(motions), 3, 3, 3))
-    for axis in range(3):
-        table[:, axis, axis] = motions * std[axis]
-    return table.reshape(-1, 3, 9)

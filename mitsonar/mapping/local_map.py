@@ -19,7 +19,7 @@ from scipy.ndimage import percentile_filter
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.patches import PatchImage, patch_image
-from mitsonar.geometry.attitude import STD_GIVEN, attitude_of
+from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.sonar_projection import Views, polar_of
 from mitsonar.mapping.bundle_adjustment import adjusted
 from mitsonar.mapping.frame_source import FrameSource
@@ -300,9 +300,9 @@ def _of_one(whole: Array, poses: Array) -> Array:
 def _relief(frames: SonarFrames, pose: Array, before: float) -> float:
     """Return the mean height of what is seen over the ground, by first echoes where there are any."""
     attitude = attitude_of(frames, "the local map", float(pose[2]), float(pose[3]))
-    if attitude.reason or attitude.height_std_m >= STD_GIVEN * attitude.height_m:
+    if attitude.reason or attitude.first is None:
         return before
-    measured = max(LEAST_RELIEF_M, CONTRAST * (float(pose[2]) - attitude.height_m))
+    measured = max(LEAST_RELIEF_M, CONTRAST * (float(pose[2]) - attitude.first.height_m))
     return 0.9 * before + 0.1 * measured
 
 

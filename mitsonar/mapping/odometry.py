@@ -21,15 +21,16 @@ from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, graph_path
+from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, errors_along, graph_path
 from mitsonar.mapping.height_profile import HeightProfile, height_profile
 from mitsonar.mapping.local_map import USED, map_attitudes, mapped
-from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops
+from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, canvas_of
 from mitsonar.mapping.mode_continuity import continued
 from mitsonar.mapping.motion_series import MotionSeries, fit_scale, path_of, scaled
 from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.pose_covariance import pose_covariances
+from mitsonar.mapping.pose_graph import CorrelatedErrors
 from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
 from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.composition import motions
@@ -68,6 +69,7 @@ class Odometry:
         heights: over the ground along the path.
         closure: what loops of motions leave over, where it was asked for.
         graph: the pose graph's path, where sensors or loops were asked for.
+        correlated: how errors of motions over the same ground depend on each other; None: as ``series`` says, or not.
     """
 
     frames: Index
@@ -81,6 +83,7 @@ class Odometry:
     heights: HeightProfile
     closure: Closure | None = None
     graph: GraphPath | None = None
+    correlated: CorrelatedErrors | None = None
 
     @property
     def believed(self) -> NDArray[np.bool_]:
@@ -96,15 +99,17 @@ class Odometry:
     def pose_covariances(self) -> Array | None:
         """Return the covariances of x, y [m] and heading [rad] along the path ``(frames, 3, 3)``.
 
-        Errors of different motions count as independent. Common errors, such as a wrong scale by a wrong height, are not
-        included. None where the covariances of the motions are not known. With sensors or loops they are the marginal
-        covariances of the pose graph, which includes common errors.
+        Errors over the same ground are alike, as :class:`~mitsonar.mapping.error_correlation.ErrorCorrelation` says, but for
+        motions by the local map. Of smoothed motions, and of records that do not show ground, they count as independent.
+        None where the covariances of the motions are not known. With sensors or loops they are the marginals of the pose
+        graph.
         """
         if self.graph is not None:
             return self.graph.covariances
         if self.series.covariances is None:
             return None
-        return pose_covariances(self.series, Pose(*self.path.poses[0]))
+        by_map = np.array([one.about.get("map") == USED for one in self.estimates], dtype=bool)
+        return pose_covariances(self.series, Pose(*self.path.poses[0]), correlated=self.correlated, alone=by_map)
 
     def rows(self) -> list[Row]:
         """Return name, value and unit of all results: the one table for console, file and README."""
@@ -221,7 +226,10 @@ def odometry(
         )
         series, path = graph.series, graph.path
     heights = height_profile(source, numbers, pairs, sensors, path)
-    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, fitted, heights, closing, graph)
+    alike = (
+        None if shown is None or smooth != "none" or graph is not None else errors_along(series.motions, canvas_of(shown))
+    )
+    return Odometry(numbers, estimates, series, path, source.true, smooth, factors, fitted, heights, closing, graph, alike)
 
 
 def _ground_shown(

@@ -92,6 +92,13 @@ class CorrelatedErrors(NamedTuple):
     slope_std: Array
     sloped: Array
 
+    def by_slopes(self) -> Array:
+        """Return the derivative of errors by the nine slopes, in their standard deviations ``(motions, 3, 9)``."""
+        table = np.zeros((len(self.sloped), 3, 3, 3))
+        for axis in range(3):
+            table[:, axis, axis] = self.sloped * self.slope_std[axis]
+        return table.reshape(-1, 3, 9)
+
 
 @dataclass(frozen=True)
 class PoseGraph:

@@ -114,7 +114,7 @@ def _render(simulator: SounderSimulator, flown: Trajectory, run: RunDirectory, p
     folder.mkdir(exist_ok=True)
     if done == len(flown):
         return
-    for batch in simulator.pings(flown.poses[done:], first=done):
+    for batch in simulator.pings(flown.poses[done:], first=done, time_s=flown.time_s[done:]):
         part = folder / f"{batch.first:09d}.npz"
         whole = part.with_suffix(".part")
         with whole.open("wb") as file:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Pose", "mounted", "pose_from_to_world", "poses_from", "to_world_matrices", "vehicle_rotation"]
+__all__ = ["Pose", "mount_between", "mounted", "pose_from_to_world", "poses_from", "to_world_matrices", "vehicle_rotation"]
 
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
@@ -55,6 +55,13 @@ def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:
         return pitched
     turn = vehicle_rotation(table)
     return poses_from(table[:, :3] + turn.apply(mount[:3]), turn * vehicle_rotation(mount))
+
+
+def mount_between(vehicle: Pose, sensor: Pose) -> Pose:
+    """Return the mount that puts a sensor where it is on a vehicle: ``mounted(vehicle, mount)`` is the sensor's pose."""
+    turn = vehicle_rotation(vehicle).inv()
+    place = turn.apply(np.subtract(sensor[:3], vehicle[:3]))
+    return Pose(*(float(value) for value in poses_from(place, turn * vehicle_rotation(sensor))[0]))
 
 
 def vehicle_rotation(poses: ArrayLike) -> Rotation:

@@ -28,7 +28,9 @@ FLOOR_DB = -100.0
 LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
 """Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
 
-PER_FRAME = ("image", "time_s", "poses", "beam_poses", "body_poses", "attitude_rad", "height_m", *LABELS)
+BODIES = ("body_poses", "body_velocities")
+
+PER_FRAME = ("image", "time_s", "poses", "beam_poses", *BODIES, "attitude_rad", "height_m", *LABELS)
 
 IMAGE = ("frames", "bins", "beams")
 
@@ -40,6 +42,7 @@ COLUMNS = {
     "poses": Column(("frames", "six"), low=-1e9, high=1e9),
     "beam_poses": Column(("frames", "beams", "six"), low=-1e9, high=1e9),
     "body_poses": Column(("frames", "bodies", "six"), low=-1e9, high=1e9),
+    "body_velocities": Column(("frames", "bodies", "six"), low=-1e9, high=1e9),
     "attitude_rad": Column(("frames", "three"), low=-7, high=7, nan=True),
     "height_m": Column(("frames",), low=0, nan=True),
     "elevation_rad": Column(IMAGE, low=-math.pi, high=math.pi, nan=True),
@@ -63,6 +66,7 @@ class SonarFrames:
         poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
         beam_poses: poses of the sonar at the time of each beam ``(frames, beams, 6)``, where beams ping one after another.
         body_poses: poses of the scene's bodies that move ``(frames, bodies, 6)`` [m, rad], by ``body_names``.
+        body_velocities: of these in the world's axes: of the origin [m/s], turn a second [rad/s] ``(frames, bodies, 6)``.
         height_m: height over the ground below, measured straight down ``(frames,)``; nan where nothing is below.
         level: how image values stand for level: ``linear`` (level = value * level_scale), ``dB``, ``gamma`` or ``contrast``.
         level_scale: what undoes the constant gain.
@@ -96,6 +100,7 @@ class SonarFrames:
     attitude_rad: NDArray[np.float64] | None = None
     beam_poses: NDArray[np.float64] | None = None
     body_poses: NDArray[np.float64] | None = None
+    body_velocities: NDArray[np.float64] | None = None
     body_names: tuple[str, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
 
@@ -192,7 +197,7 @@ class SonarFrames:
             "sonar": np.array(self.sonar.model_dump_json()),
             "about": np.array(json.dumps(self.about)),
         }
-        optional = ("poses", "beam_poses", "body_poses", "attitude_rad", "height_m", *LABELS)
+        optional = ("poses", "beam_poses", *BODIES, "attitude_rad", "height_m", *LABELS)
         table |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
         names = {"shapes": self.shape_names, "objects": self.object_names}
         names |= {"bodies": self.body_names} if self.body_names else {}

@@ -135,6 +135,12 @@ class BeamFormer:
         return math.sqrt(self.sonar.beam_width_rad / (self.aperture.equivalent_width * kept))
 
     @cached_property
+    def kept(self) -> float:
+        """Return the part of the power that linear deposit on the grid keeps, over sine and range."""
+        over_range = _kept_power(self.pulse.shape, self.range_step, 20 * self.pulse.resolution_m)
+        return over_range * _kept_power(self.aperture.pattern, self.sine_step, 40 / self.aperture.length)
+
+    @cached_property
     def _away(self) -> NDArray[np.float64]:
         """Return the sine of each beam's axis less that of each line ``(beams, sines)``."""
         line = self.first_sine + np.arange(self.sines) * self.sine_step

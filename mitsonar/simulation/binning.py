@@ -52,7 +52,9 @@ def stride(sonar: Sonar) -> int:
     return sonar.range_bins + 1 + COUNTERS
 
 
-def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer) -> mi.UInt64:
+def accumulate(
+    seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer, more: mi.UInt64 | None = None, *, counted: bool = True
+) -> mi.UInt64:
     """Sum the levels of a launch; joins the kernel that traces the echoes.
 
     Args:
@@ -60,6 +62,8 @@ def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer
         ping: index of each ray's ping in the launch.
         pings: number of pings in the launch.
         tracer: of the view.
+        more: sums that these levels are added to; default: none.
+        counted: whether the rays that bring nothing into the window are counted.
 
     Returns:
         The sums ``(pings, beams, stride)``, flat.
@@ -67,7 +71,7 @@ def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer
     sonar, active, beams = tracer.view.sonar, seen.active, len(tracer.view.bearing_rad)
     exact = _exact(seen.echoes)
     hit = exact.hit > 0
-    sums = dr.zeros(mi.UInt64, pings * beams * stride(sonar))
+    sums = dr.zeros(mi.UInt64, pings * beams * stride(sonar)) if more is None else more
     start = (ping * beams + seen.beam) * stride(sonar)
     value = level(exact, sonar, dr.select) * 2.0**tracer.bits
     if sonar.model == "thesis":
@@ -87,7 +91,7 @@ def accumulate(seen: ViewEchoes, ping: mi.UInt32, pings: int, tracer: ViewTracer
     same, apart = inside & (last == first), inside & (last > first + 1)
     second = dr.select(same, late - left, dr.select(apart, late, late + left - whole))
     begin = dr.select(inside, dr.select(same, left, whole) - late, 1)
-    dr.scatter_reduce(dr.ReduceOp.Add, sums, begin, start + cell, active, mode=ADD)
+    dr.scatter_reduce(dr.ReduceOp.Add, sums, begin, start + cell, active if counted else inside, mode=ADD)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, second, start + first + 1, inside, mode=ADD)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, left - whole, start + last, apart, mode=ADD)
     dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.UInt64(0) - left, start + last + 1, inside & ~same & (left > 0), mode=ADD)
@@ -105,14 +109,26 @@ def footprint(exact: Echoes, sonar: Sonar) -> tuple[DeviceArray, DeviceArray, De
     return a, b, b - a
 
 
-def develop(sums: mi.UInt64, pings: int, tracer: ViewTracer) -> tuple[mi.Float, mi.UInt64]:
-    """Turn sums into levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat."""
+def develop(
+    sums: mi.UInt64, pings: int, tracer: ViewTracer, more: tuple[mi.UInt64, int] | None = None
+) -> tuple[mi.Float, mi.UInt64]:
+    """Turn sums into levels ``(pings, beams, stride)`` and counters ``(COUNTERS, pings, beams)``, flat.
+
+    Args:
+        sums: of :func:`accumulate`.
+        pings: number of pings in the launch.
+        tracer: of the view.
+        more: sums of other fraction bits, and these, whose levels are added; default: none.
+    """
     view = tracer.view
     size, lines = stride(view.sonar), pings * len(view.bearing_rad)
     total = sums if view.sonar.model == "thesis" else dr.block_prefix_sum(sums, size, exclusive=False)
     index = dr.arange(mi.UInt32, lines * COUNTERS)
     counters = dr.gather(mi.UInt64, sums, index % lines * size + (view.sonar.range_bins + 1) + index // lines)
-    return mi.Float(mi.Float64(total) * 2.0**-tracer.bits), counters
+    levels: DeviceArray = mi.Float64(total) * 2.0**-tracer.bits
+    if more is not None:
+        levels = levels + mi.Float64(dr.block_prefix_sum(more[0], size, exclusive=False)) * 2.0 ** -more[1]
+    return mi.Float(levels), counters
 
 
 def fetch(image: mi.Float, counters: mi.UInt64, pings: int, view: View) -> tuple[NDArray[np.float32], Counts]:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mitsonar.plugins.imaging_sonar_sensor import Fan
     from mitsonar.simulation.tracing import Rays
 
-__all__ = ["ReceiverTracer"]
+__all__ = ["ReceiverTracer", "half_path_rate"]
 
 
 class ReceiverTracer:
@@ -49,6 +49,7 @@ class ReceiverTracer:
         import drjit as dr
         import mitsuba as mi
 
+        from mitsonar.simulation.beam_of_direction import beam_of
         from mitsonar.simulation.tracing import hidden
 
         lines = [dr.gather(mi.Vector4f, tables["rows"], rays.ping * 3 + axis) for axis in range(3)]
@@ -59,39 +60,11 @@ class ReceiverTracer:
         distance = dr.norm(way)
         u = way / distance
         port, up, forward = (sum(line[axis] * u[row] for row, line in enumerate(lines)) for axis in range(3))
-        beam, inside, elevation = self._beam(-port, forward, up)
+        beam, inside, elevation = beam_of(self.view.sonar, -port, forward, up)
         toward = dr.dot(normal, u)
         lit = (echoes.hit > 0) & inside & (toward * dr.dot(normal, fan.d) > 0)
         active = lit & ~hidden(scene, point, normal, u, distance, lit)
         return ViewEchoes(self._received(echoes, fan, way, distance, normal), dr.select(active, beam, 0), active, elevation)
-
-    def _beam(
-        self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray
-    ) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
-        """Return beam, whether the direction lies in the field of view, and elevation [rad]."""
-        import drjit as dr
-        import mitsuba as mi
-
-        place: DeviceArray
-        sonar = self.view.sonar
-        half = math.radians(sonar.azimuth_fov_deg) / 2
-        if sonar.bearing == "azimuth":
-            bearing, elevation = dr.atan2(starboard, forward), _asin(up)
-        else:
-            bearing, elevation = _asin(starboard), dr.atan2(up, forward)
-        if sonar.beam_layout == "even":
-            place = bearing * (sonar.beams / (2 * half)) + sonar.beams / 2
-        else:
-            place = dr.sin(bearing) * (sonar.beams / (2 * math.sin(half))) + sonar.beams / 2
-        aside: DeviceArray = dr.abs(bearing)
-        lift: DeviceArray = dr.abs(elevation)
-        inside = (place >= 0) & (place < sonar.beams) & (aside <= half)
-        inside &= lift <= math.radians(sonar.elevation_fov_deg) / 2
-        beam = mi.UInt32(dr.select(inside, place, 0))
-        if sonar.beam_width_deg is not None and sonar.model == "physical":
-            axes = mi.Float(sonar.bearing_rad.tolist())
-            inside &= dr.abs(bearing - dr.gather(mi.Float, axes, beam)) <= sonar.beam_width_rad / 2
-        return beam, inside, elevation
 
     def _received(self, echoes: Echoes, fan: Fan, way: DeviceArray, distance: DeviceArray, normal: DeviceArray) -> Echoes:
         """Compute range, footprint, cosine and weight of the echoes between transmitter and receiver; ``way`` from it."""
@@ -104,8 +77,8 @@ class ReceiverTracer:
             received.near_m = received.far_m = half
             return received
         u = way / distance
-        lift = self._rate(echoes, fan.d, fan.lift, u, normal)
-        side = self._rate(echoes, fan.d, fan.side, u, normal)
+        lift = half_path_rate(echoes.range_m, fan.d, fan.lift, u, normal)
+        side = half_path_rate(echoes.range_m, fan.d, fan.side, u, normal)
         middle = half + side * fan.aside
         rises = dr.dot(normal, fan.lift) * dr.dot(normal, fan.d) < 0
         ends = (dr.select(rises, echoes.near_m, echoes.far_m), dr.select(rises, echoes.far_m, echoes.near_m))
@@ -139,22 +112,26 @@ class ReceiverTracer:
         back = dr.norm(way + toward * end - fan.d * echoes.range_m)
         return dr.select(flatter(normal, fan.d, toward), (end + back) * 0.5, otherwise)
 
-    @staticmethod
-    def _rate(echoes: Echoes, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray) -> DeviceArray:
-        """Return the change of half the path by an angle of the transmitter's ray, on the tangent plane [m/rad]."""
-        import drjit as dr
 
-        from mitsonar.plugins.echo_integrator import steep
+def half_path_rate(
+    range_m: DeviceArray, d: DeviceArray, turn: DeviceArray, u: DeviceArray, normal: DeviceArray
+) -> DeviceArray:
+    """Return the change of half a path by an angle of its ray, on the tangent plane [m/rad].
 
-        along = -echoes.range_m * dr.dot(normal, turn) / steep(dr.dot(normal, d))
-        return (along + dr.dot(u, d * along + turn * echoes.range_m)) * 0.5
+    Args:
+        range_m: along the ray [m].
+        d: direction of the ray.
+        turn: its derivative by the angle.
+        u: unit direction from the other end of the path to the point hit.
+        normal: of the surface there.
+    """
+    import drjit as dr
+
+    from mitsonar.plugins.echo_integrator import steep
+
+    along = -range_m * dr.dot(normal, turn) / steep(dr.dot(normal, d))
+    return (along + dr.dot(u, d * along + turn * range_m)) * 0.5
 
 
 def _window(sonar: Sonar) -> dict[str, float]:
     return {name: getattr(sonar, name) for name in ("range_min", "range_max", "range_bins")}
-
-
-def _asin(value: DeviceArray) -> DeviceArray:
-    import drjit as dr
-
-    return dr.asin(dr.select(value < 1, dr.select(value > -1, value, -1), 1))

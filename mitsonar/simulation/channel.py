@@ -11,23 +11,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument
+from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.simulation.nonuniform_fft import phasor_sums
+from mitsonar.simulation.nonuniform_fft import phasor_sums, phasors
 from mitsonar.simulation.variant import thread_count
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.simulation.channel_tracing import EchoValues
+    from mitsonar.simulation.channel_tracing import ChannelTracer, EchoValues
+    from mitsonar.simulation.mirror_parts import Mirroring
+    from mitsonar.simulation.mirror_paths import MirrorPaths
 
 __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impulse_response"]
 
 FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "phase", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
-"""Fields of :class:`~mitsonar.simulation.channel_tracing.EchoBatch` that a launch returns."""
+"""Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` that a launch returns."""
 
 PINGS_AT_A_TIME = 16
 """Pings whose echoes wait in memory for their transforms: 50 bytes an echo and receiver."""
@@ -64,12 +66,31 @@ class Paths:
         amplitude: ``(n,)`` complex128, before the carrier's phase -2 pi f_c tau; real and positive in the model ``rays``.
         doppler_hz: shift of the carrier ``(n,)``, positive where the path gets shorter.
         dropped: number of echoes from beyond ``range_max``.
+        way: index of what the path meets in ``ways`` ``(n,)``; by default all are of the first.
+        ways: what paths may meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``, ``surface-seabed`` ...
     """
 
     delay_s: NDArray[np.float64]
     amplitude: NDArray[np.complex128]
     doppler_hz: NDArray[np.float64]
     dropped: int
+    way: NDArray[np.int64] | None = None
+    ways: tuple[str, ...] = ("scatterer",)
+
+    def by(self, name: str) -> Paths:
+        """Return the paths of one way.
+
+        Args:
+            name: of :attr:`ways`.
+
+        Raises:
+            MitsonarError: no such way.
+        """
+        if name not in self.ways:
+            raise MitsonarError(f"no path goes by {name!r}: {nearest_names(name, self.ways)}")
+        way = np.zeros(len(self.delay_s), np.int64) if self.way is None else self.way
+        own = way == self.ways.index(name)
+        return Paths(self.delay_s[own], self.amplitude[own], self.doppler_hz[own], 0, way[own], self.ways)
 
 
 class ChannelSimulator:
@@ -80,25 +101,45 @@ class ChannelSimulator:
     number. The mean of its square is the level of an imaging sonar's echo. Model ``rays`` (Almanza-Medina, 5.2.1): rays that
     are fixed to the vehicle, evenly over each receiver's field of view. The amplitude is C cos_A.
 
+    With ``mirrors`` sound also arrives by way of flat mirrors, with up to ``sonar.bounces`` reflections in all: from image
+    sources, with the carrier's phase of each path. Mirrors that are not flat, such as waves, reflect once.
+
     Args:
         scene: any Mitsuba scene.
         sonar: the instrument.
         like: a simulator of the same scene; its scatterers are shared where both instruments have the same.
+        mirrors: reflection coefficient and rms height [m] by the ids of shapes, ``{"surface": (-1.0, 0.0)}``, or
+            ``materials``: those of the shapes' materials.
 
     Attributes:
-        notes: what a user should know about the scene's BSDFs.
+        ways: what paths meet in turn, by name: ``scatterer``, ``surface-scatterer``, ``direct``, ``surface`` ...
 
     Raises:
-        MitsonarError: no surface can carry scatterers.
+        MitsonarError: no surface can carry scatterers; a mirror that the scene does not have; bounces without mirrors.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None) -> None:
+    def __init__(
+        self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None, mirrors: Mirroring = None
+    ) -> None:
         self.sonar = sonar
         from mitsonar.simulation.channel_tracing import ChannelTracer
+        from mitsonar.simulation.mirror_parts import mirror_of
+        from mitsonar.simulation.mirror_paths import MirrorPaths
+        from mitsonar.simulation.moving_files import refuse_motion
 
-        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer)
-        self.notes = self.tracer.notes
+        refuse_motion(scene, "impulse responses")
+
+        parts = mirror_of(scene, mirrors) if mirrors else None
+        _check_mirrors(sonar, parts is not None)
+        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer, parts)
+        self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
+        self.ways = tuple([way.name for way in self.tracer.ways] + self.without_scatterer.names)
         self.reset()
+
+    @property
+    def notes(self) -> list[str]:
+        """Return what a user should know about the scene's BSDFs and mirrors."""
+        return [*self.tracer.notes, *self.without_scatterer.notes]
 
     def responses(
         self, flown: Trajectory, velocity: ArrayLike | None = None, progress: Callable[[int], None] = lambda pings: None
@@ -199,22 +240,34 @@ class ChannelSimulator:
         if not 0 <= receiver < len(self.sonar.receivers):
             raise MitsonarError(f"receiver must be 0..{len(self.sonar.receivers) - 1}, its number: got {receiver!r}")
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
-        received = self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS)
+        parts = [
+            *(self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, way=way) for way in self.tracer.ways),
+            *self.without_scatterer.trace(table[0], speeds[0], receiver, FOR_PATHS),
+        ]
+        received = joined(parts)
         keep = received["counts"].astype(bool)
         names = ("delay", "amplitude", "phase", "doppler")
         delay, size, phase, doppler = (received[name][keep].astype(float) for name in names)
-        return Paths(delay, size * np.exp(1j * phase), doppler, int(np.count_nonzero(received["beyond"])))
+        way = np.repeat(np.arange(len(parts)), [len(part["counts"]) for part in parts])[keep]
+        beyond = int(np.count_nonzero(received["beyond"]))
+        return Paths(delay, size * np.exp(1j * phase), doppler, beyond, way, self.ways)
 
     def _channels(
         self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
     ) -> Channels:
         """Simulate some pings, one launch each; threads select its points and transform its echoes in parallel."""
         shape = (len(poses), len(self.sonar.receivers))
-        asked = [threads.submit(self.tracer.source.asked, poses[k], receiver) for k, receiver in np.ndindex(shape)]
+        ways = self.tracer.ways
+        each = [(k, receiver, way) for k, receiver in np.ndindex(shape) for way in ways]
+        asked = [threads.submit(self.tracer.asked, poses[k], receiver, way) for k, receiver, way in each]
         made = []
-        for (k, receiver), ready in zip(np.ndindex(shape), asked, strict=True):
-            received = self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result())
-            made.append(threads.submit(_one_response, self.sonar, received))
+        parts: list[EchoValues] = []
+        for (k, receiver, way), ready in zip(each, asked, strict=True):
+            parts.append(self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result(), way))
+            if len(parts) == len(ways):
+                parts += self.without_scatterer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES)
+                made.append(threads.submit(_one_response, self.sonar, parts))
+                parts = []
         response, echoes, dropped = zip(*(future.result() for future in made), strict=True)
         return Channels(
             first=first,
@@ -225,8 +278,14 @@ class ChannelSimulator:
         )
 
 
-def _one_response(sonar: ChannelSonar, received: EchoValues) -> tuple[NDArray[np.complex128], int, int]:
-    """Return one response, the number of its echoes, and the number from beyond ``range_max``."""
+def joined(parts: list[EchoValues]) -> EchoValues:
+    """Return the echoes of several ways as one."""
+    return parts[0] if len(parts) == 1 else {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _one_response(sonar: ChannelSonar, parts: list[EchoValues]) -> tuple[NDArray[np.complex128], int, int]:
+    """Return one response of the echoes of all ways, the number of echoes, and the number from beyond ``range_max``."""
+    received = joined(parts)
     keep = np.flatnonzero(received["counts"])
     strength = np.empty(len(keep), np.complex128)
     strength.real, strength.imag = received["real"][keep], received["imag"][keep]
@@ -248,7 +307,7 @@ def frequency_response(
         Frequencies of the band ``(k,)``, from the carrier [Hz], and H_f ``(k,)``.
     """
     delay = np.asarray(delay_s, dtype=float)
-    turn, strength = _phasors(delay, np.asarray(amplitude), sonar, 1)
+    turn, strength = phasors(delay, np.asarray(amplitude), sonar, 1)
     half = _half(sonar, 1)
     frequency = np.arange(-half, half + 1, dtype=np.float64) * sonar.frequency_step_hz
     return frequency, _spectrum(sonar, turn, strength, 1)
@@ -268,17 +327,8 @@ def impulse_response(delay_s: ArrayLike, amplitude: ArrayLike, sonar: ChannelSon
         The response ``(taps,)``.
     """
     delay = np.asarray(delay_s, dtype=float)
-    turn, strength = _phasors(delay, np.asarray(amplitude), sonar, PADDING)
+    turn, strength = phasors(delay, np.asarray(amplitude), sonar, PADDING)
     return _taps(sonar, _spectrum(sonar, turn, strength, PADDING), PADDING)
-
-
-def _phasors(
-    delay: NDArray[np.float64], amplitude: NDArray[np.inexact], sonar: ChannelSonar, padding: int
-) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Compute phase step and complex amplitude of echoes in NumPy, as :class:`EchoBatch` holds them."""
-    turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
-    strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
-    return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)
 
 
 def _half(sonar: ChannelSonar, padding: int) -> int:
@@ -301,6 +351,21 @@ def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -
     band = np.zeros(length_, np.complex128)
     np.add.at(band, number % length_, spectrum * sonar.raised_cosine(number * sonar.frequency_step_hz / padding))
     return np.asarray(np.fft.ifft(band)[: sonar.taps])
+
+
+def _check_mirrors(sonar: ChannelSonar, any_mirror: bool) -> None:
+    """Refuse several bounces without mirrors, and mirrors in the model ``rays``.
+
+    Raises:
+        MitsonarError: they do not fit.
+    """
+    if sonar.bounces > 1 and not any_mirror:
+        raise MitsonarError(
+            f"bounces {sonar.bounces} need mirrors, and the scene has none: give reflection and rms height by the ids of "
+            'shapes, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with a material that has both'
+        )
+    if any_mirror and sonar.model == "rays":
+        raise MitsonarError("mirrors are of the model scatterers: got the model rays; leave them out, or choose scatterers")
 
 
 def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDArray[np.float64]:

@@ -4,48 +4,81 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from dataclasses import replace
+from typing import Any, NamedTuple, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar, FieldOfView, Maths
-from mitsonar.motion.pose import vehicle_rotation
-from mitsonar.plugins.surfaces import Surfaces
+from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.plugins.surfaces import Surfaces, registry_index
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables, padded
+from mitsonar.simulation.image_sources import MirrorWay, mirror_ways, mirrored_table
+from mitsonar.simulation.link_geometry import EchoBatch, Leg, LinkGeometry, ScatteringPoints, link_table
+from mitsonar.simulation.mirror_parts import Mirrors
+from mitsonar.simulation.mirror_planes import FlatMirrors, flat_mirrors
+from mitsonar.simulation.mirrored_link import MirroredLink
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.scatterers import Scatterers
-from mitsonar.simulation.tracing import height_below, hidden
+from mitsonar.simulation.tracing import height_below
 from mitsonar.simulation.variant import replayed
 
-__all__ = ["ChannelTracer", "EchoBatch", "EchoValues"]
+__all__ = ["DIRECT", "ChannelTracer", "EchoValues", "ScattererWay"]
 
 EchoValues: TypeAlias = dict[str, NDArray[Any]]
-"""Fields of :class:`EchoBatch` by name as NumPy arrays ``(points,)``, numbers or truth values."""
+"""Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` by name as NumPy arrays ``(points,)``."""
 
 _Launch: TypeAlias = Callable[..., list[DeviceArray]]
 """A frozen launch: indices, scene, link table and tables to values."""
 
-DRJIT = Maths(dr.asin, dr.atan2, dr.cos, dr.clip, dr.select)
+
+class ScattererWay(NamedTuple):
+    """The mirrors between transmitter and scatterers, and those between receiver and scatterers."""
+
+    out: MirrorWay = MirrorWay()
+    back: MirrorWay = MirrorWay()
+
+    @property
+    def name(self) -> str:
+        """Return the names of what sound meets, as ``surface-scatterer-seabed``."""
+        return "-".join([name for name in (self.out.name, "scatterer", MirrorWay(self.back.planes[::-1]).name) if name])
+
+
+DIRECT = ScattererWay()
+"""The way without mirrors."""
 
 
 class ChannelTracer:
     """Trace the echoes of a scene at the receivers of a channel sonar.
 
+    Args:
+        scene: any.
+        sonar: the instrument.
+        like: a tracer of the same scene, whose scatterers may be shared.
+        mirrors: mirror parts of the scene's shapes.
+
     Attributes:
         notes: what a user should know about the scene's BSDFs.
+        flat: the scene's mirrors.
+        registry: index of each mirror's shape by its place in the scene.
+        ways: by which scatterers are reached, the direct one first.
 
     Raises:
-        MitsonarError: no surface can carry scatterers.
+        MitsonarError: no surface can carry scatterers, or a mirror has too many triangles.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: ChannelTracer | None = None) -> None:
+    def __init__(
+        self, scene: mi.Scene, sonar: ChannelSonar, like: ChannelTracer | None = None, mirrors: Mirrors | None = None
+    ) -> None:
         self.scene, self.sonar = scene, sonar
         surfaces = Surfaces.of(scene)
-        self.notes = surfaces.notes
+        self.flat: FlatMirrors = flat_mirrors(scene, mirrors)
+        self.notes = [*surfaces.notes, *self.flat.notes_on(sonar.bounces)]
+        shapes = scene.shapes()
+        self.registry = {plane.shape: registry_index(shapes[plane.shape]) for plane in self.flat.reflecting(2)}
+        self.ways = _scatterer_ways(self.flat, sonar.bounces)
         self.source: _WorldScatterers | _VehicleRays
         if sonar.model == "scatterers":
             shared = (
@@ -53,10 +86,10 @@ class ChannelTracer:
                 if like is not None and like.scene is scene and isinstance(like.source, _WorldScatterers)
                 else None
             )
-            self.source = _WorldScatterers(scene, sonar, shared)
+            self.source = _WorldScatterers(scene, sonar, shared, mirrors)
         else:
             self.source = _VehicleRays(sonar, surfaces)
-        self.launches: dict[tuple[int, tuple[str, ...]], _Launch] = {}
+        self.launches: dict[tuple[int, tuple[str, ...], int, int], _Launch] = {}
 
     def trace(
         self,
@@ -65,8 +98,9 @@ class ChannelTracer:
         receiver: int,
         wanted: tuple[str, ...],
         asked: NDArray[np.uint32] | None = None,
+        way: ScattererWay = DIRECT,
     ) -> EchoValues:
-        """Trace one ping at one receiver: values of :class:`EchoBatch`, one for each point that it may receive from.
+        """Trace one ping at one receiver: values of an echo batch, one for each point that it may receive from.
 
         Args:
             pose: of the transmitter ``(6,)`` [m, rad].
@@ -74,28 +108,45 @@ class ChannelTracer:
             receiver: its index.
             wanted: names of the values.
             asked: indices of the points to trace; default: those that the receiver may receive from.
+            way: the mirrors between sonar and points.
         """
-        asked = self.source.asked(pose, receiver) if asked is None else asked
+        asked = self.asked(pose, receiver, way) if asked is None else asked
         if not len(asked):
             return {name: np.zeros(0) for name in wanted}
-        if (receiver, wanted) not in self.launches:
-            self.launches[receiver, wanted] = self._compile(receiver, wanted)
-        table = mi.Float64(link_table(self.sonar, receiver, pose, velocity))
-        launch, inputs = self.launches[receiver, wanted], (mi.UInt32(padded(asked)), self.scene, table)
+        key = (receiver, wanted, len(way.out.planes), len(way.back.planes))
+        if key not in self.launches:
+            self.launches[key] = self._compile(*key)
+        table = mi.Float64(self._table(pose, velocity, receiver, way))
+        launch, inputs = self.launches[key], (mi.UInt32(padded(asked)), self.scene, table)
         received = replayed(launch, *inputs, self.source.tables(receiver))
         return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}
+
+    def asked(self, pose: NDArray[np.float64], receiver: int, way: ScattererWay = DIRECT) -> NDArray[np.uint32]:
+        """Return indices of the points that a receiver may receive from, by way of mirrors."""
+        return self.source.asked(self._table(pose, np.zeros(4), receiver, way), receiver)
+
+    def _table(
+        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, way: ScattererWay
+    ) -> NDArray[np.float64]:
+        table = link_table(self.sonar, receiver, pose, velocity)
+        return table if way == DIRECT else mirrored_table(table, way.out, way.back, self.registry)
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height of each pose over what is straight below it ``(pings,)`` [m]; nan where there is nothing."""
         place = mi.Point3f(*(mi.Float(padded(axis.astype(np.float32))) for axis in poses[:, :3].T))
         return np.array(height_below(self.scene, place), dtype=float)
 
-    def _compile(self, receiver: int, wanted: tuple[str, ...]) -> _Launch:
-        """Record a receiver's launch; later calls replay it (``dr.freeze``)."""
+    def _compile(self, receiver: int, wanted: tuple[str, ...], out: int, back: int) -> _Launch:
+        """Record a receiver's launch by a number of mirrors; later calls replay it (``dr.freeze``)."""
 
         @dr.freeze
         def launch(index: mi.UInt32, scene: mi.Scene, table: mi.Float64, tables: DeviceArray) -> list[DeviceArray]:
-            received = self.source.received(LinkGeometry(self.sonar, receiver, table), index, scene, tables)
+            link: LinkGeometry
+            if out + back == 0:
+                link = LinkGeometry(self.sonar, receiver, table)
+            else:
+                link = MirroredLink(self.sonar, receiver, table, out, back)
+            received = self.source.received(link, index, scene, tables)
             values = [getattr(received, name) for name in wanted]
             dr.eval(values)
             return values
@@ -103,171 +154,84 @@ class ChannelTracer:
         return launch
 
 
-@dataclass
-class EchoBatch:
-    """Echoes as Dr.Jit arrays that are not evaluated yet, one value for each point.
-
-    Attributes:
-        delay: of the echo [s].
-        amplitude: magnitude of the echo.
-        phase: of the scatterer itself, beside that of the delay [rad]; one 0 for all in the model rays.
-        doppler: shift of the carrier [Hz].
-        counts: whether there is an echo within ``range_max``.
-        beyond: whether there is an echo from beyond ``range_max``.
-        turn: phase of the delay at the finest frequency, -pi..pi, for the transform [rad].
-        real, imag: the amplitude with the scatterer's and the carrier's phase.
-    """
-
-    delay: DeviceArray
-    amplitude: DeviceArray
-    phase: DeviceArray
-    doppler: DeviceArray
-    counts: DeviceArray
-    beyond: DeviceArray
-    turn: DeviceArray
-    real: DeviceArray
-    imag: DeviceArray
-
-
-def link_table(
-    sonar: ChannelSonar, receiver: int, pose: NDArray[np.float64], velocity: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the geometry of one ping in the world ``(30,)``.
-
-    Three numbers each: positions of transmitter and receiver [m], their velocities [m/s]. Nine numbers each: axes of the
-    receiver's field of view, and of the transmitter's.
-    """
-    turn = vehicle_rotation(pose).as_matrix()[0]
-    one = sonar.receivers[receiver]
-    offset = np.array(one.position)
-    swing = velocity[:3] + np.cross([0.0, 0.0, -velocity[3]], offset)
-    axes = [field.axes @ turn.T for field in (one.field, sonar.transmitter)]
-    places, velocities = (pose[:3], pose[:3] + turn @ offset), (turn @ velocity[:3], turn @ swing)
-    return np.concatenate([*places, *velocities, *(each.ravel() for each in axes)])
-
-
-class LinkGeometry:
-    """Geometry between transmitter and receiver in one ping, on the device; what affects the phase is float64.
-
-    Args:
-        sonar: the instrument.
-        receiver: its index.
-        table: of :func:`link_table`.
-    """
-
-    def __init__(self, sonar: ChannelSonar, receiver: int, table: mi.Float64) -> None:
-        self.sonar = sonar
-        self.numbers = [dr.gather(mi.Float64, table, mi.UInt32(k)) for k in range(30)]
-        dr.eval(self.numbers)  # read once, not once a point
-        self.listens: FieldOfView = sonar.field_of_view[sonar.receivers[receiver].name]
-        self.sends: FieldOfView = sonar.transmitter
-
-    def vector(self, start: int) -> list[DeviceArray]:
-        """Return three numbers of the table."""
-        return self.numbers[start : start + 3]
-
-    @property
-    def sent_from(self) -> list[DeviceArray]:
-        """Return the position of the transmitter [m]."""
-        return self.vector(0)
-
-    @property
-    def velocity(self) -> list[DeviceArray]:
-        """Return the velocity of the receiver [m/s]."""
-        return self.vector(9)
-
-    def axes(self, which: int) -> list[mi.Vector3f]:
-        """Return the axes of the receiver's field of view (0) or the transmitter's (1)."""
-        return [mi.Vector3f(*self.vector(12 + 9 * which + 3 * k)) for k in range(3)]
-
-    def to_point(self, point: list[DeviceArray]) -> tuple[list[DeviceArray], list[DeviceArray]]:
-        """Return the vectors from the transmitter and from the receiver to points of the world [m]."""
-        sent, received = ([p - a for p, a in zip(point, self.vector(start), strict=True)] for start in (0, 3))
-        return sent, received
-
-    def sensitivity(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
-        """Return the sensitivity of transmitter and receiver together, given unit directions to the points."""
-        ahead, aside, above = (dr.dot(axis, received) for axis in self.axes(0))
-        both = self.listens.sensitivity(ahead, aside, above, DRJIT)
-        if self.sends.shape != "all":
-            ahead, aside, above = (dr.dot(axis, sent) for axis in self.axes(1))
-            both = both * self.sends.sensitivity(ahead, aside, above, DRJIT)
-        return both
-
-    def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
-        """Return the shift of the carrier [Hz], given unit directions to the points.
-
-        It is positive where the vehicle approaches the point: both parts of the path get shorter. In a turn transmitter and
-        receiver have velocities of their own. Terms of second order in velocity over sound speed are left out.
-        """
-        sender, receiver = (mi.Vector3f(*self.vector(start)) for start in (6, 9))
-        return (dr.dot(sent, sender) + dr.dot(received, receiver)) * (1 / self.sonar.wavelength_m)
-
-    def echo_batch(
-        self, delay: DeviceArray, amplitude: DeviceArray, phase: DeviceArray, doppler: DeviceArray, valid: DeviceArray
-    ) -> EchoBatch:
-        """Return the echoes, divided into those within ``range_max`` and those from beyond."""
-        beyond = valid & (delay > 2 * self.sonar.range_max / self.sonar.sound_speed)
-        turn = delay * (self.sonar.frequency_step_hz / PADDING)
-        turns = delay * self.sonar.carrier_hz
-        sin, cos = dr.sincos(mi.Float((turns - dr.round(turns)) * (2 * math.pi)) - phase)  # float32 once the turns are away
-        return EchoBatch(
-            delay=delay,
-            amplitude=amplitude,
-            phase=phase,
-            doppler=doppler,
-            counts=valid & ~beyond,
-            beyond=beyond,
-            turn=(turn - dr.round(turn)) * (2 * math.pi),
-            real=amplitude * cos,
-            imag=-amplitude * sin,
-        )
+def _scatterer_ways(flat: FlatMirrors, bounces: int) -> list[ScattererWay]:
+    """Return all ways of scatterers of up to ``bounces`` reflections; that of the scatterer counts as one."""
+    return [
+        ScattererWay(out, back)
+        for mirrors in range(bounces)
+        for there in range(mirrors + 1)
+        for out in mirror_ways(flat.reflecting(bounces), there)
+        for back in mirror_ways(flat.reflecting(bounces), mirrors - there)
+    ]
 
 
 class _WorldScatterers:
     """Echoes of the world's own scatterers."""
 
-    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: _WorldScatterers | None) -> None:
+    def __init__(self, scene: mi.Scene, sonar: ChannelSonar, like: _WorldScatterers | None, mirrors: Mirrors | None) -> None:
         self.sonar = sonar
         self.scatterers: Scatterers
         self.stored: mi.Float
-        if like is not None and _points_of(like.sonar) == _points_of(sonar):
+        self.smooth: frozenset[int] | None = None
+        if mirrors is not None or sonar.direct:
+            places = (
+                [] if mirrors is None else np.flatnonzero((mirrors.reflection != 0) & (mirrors.roughness_m == 0)).tolist()
+            )
+            self.smooth = frozenset(places)
+        if like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth:
             self.scatterers, self.stored = like.scatterers, like.stored
-            return
-        self.scatterers = Scatterers.of(scene, sonar)
+        else:
+            self.scatterers = Scatterers.of(scene, sonar, self.smooth)
+            self.stored = self._rows()
+        self.wavenumber = 2 * math.pi / sonar.wavelength_m
+        self.roughness: mi.Float | None = None  # rms height of each point's mirror; below 0: it is no mirror
+        if mirrors is not None:
+            height = np.where(mirrors.reflection == 0, -1.0, mirrors.roughness_m).astype(np.float32)
+            self.roughness = mi.Float(height[self.scatterers.shape])
+
+    def _rows(self) -> mi.Float:
+        """Return place, strength, normal and phase of all points."""
         rows = np.zeros((len(self.scatterers), 8), np.float32)  # two fetches of 16 bytes a point
         rows[:, :3], rows[:, 3] = self.scatterers.place, self.scatterers.strength
         rows[:, 4:7], rows[:, 7] = self.scatterers.normal, self.scatterers.phase
-        self.stored = mi.Float(rows.ravel())
+        return mi.Float(rows.ravel())
 
-    def asked(self, pose: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
-        """Return indices of the scatterers that a receiver may receive from."""
-        turn = vehicle_rotation(pose).as_matrix()[0]
-        one = self.sonar.receivers[receiver]
-        return self.scatterers.within(pose[:3] + turn @ np.array(one.position), one.field.axes @ turn.T, one.field)
+    def asked(self, table: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
+        """Return indices of the scatterers that a receiver may receive from, given the geometry of its link."""
+        return self.scatterers.within(table[3:6], table[12:21].reshape(3, 3), self.sonar.receivers[receiver].field)
 
-    def tables(self, receiver: int) -> mi.Float:
-        """Return the inputs of a launch: position, strength, normal and phase of all points."""
-        return self.stored
+    def tables(self, receiver: int) -> list[mi.Float]:
+        """Return the inputs of a launch: position, strength, normal and phase of all points; roughness with mirrors."""
+        return [self.stored] if self.roughness is None else [self.stored, self.roughness]
 
-    def received(self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: mi.Float) -> EchoBatch:
+    def received(self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: list[mi.Float]) -> EchoBatch:
         """Return the echoes of the scatterers that transmitter and receiver see."""
-        first: DeviceArray = dr.gather(mi.Vector4f, tables, index * 2)
-        second: DeviceArray = dr.gather(mi.Vector4f, tables, index * 2 + 1)
+        first: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2)
+        second: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2 + 1)
         at, strength, normal = mi.Point3f(first.x, first.y, first.z), first.w, mi.Normal3f(second.x, second.y, second.z)
-        to_point, from_receiver = link.to_point([mi.Float64(value) for value in at])
+        exact = [mi.Float64(value) for value in at]
+        to_point, from_receiver = link.to_point(exact)
         delay = delay_exact(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
         way_out, way_back = mi.Vector3f(*to_point), mi.Vector3f(*from_receiver)
         sent, received = dr.norm(way_out), dr.norm(way_back)
         u_sent: DeviceArray = way_out / sent
         u_received: DeviceArray = way_back / received
         weight = link.sensitivity(u_sent, u_received)
-        lambert = dr.dot(normal, u_sent) * dr.dot(normal, u_received)
+        cosines = dr.dot(normal, u_sent), dr.dot(normal, u_received)
+        lambert = cosines[0] * cosines[1]
         inside = (weight > 0) & (lambert > 0)
-        seen = inside & ~hidden(scene, at, normal, u_sent, sent, inside)
+        point = ScatteringPoints(at, exact, normal)
+        open_, factor = link.reached(scene, point, Leg(u_sent, sent), Leg(u_received, received), inside)
+        seen = inside & open_
         amplitude = weight * dr.sqrt(dr.select(seen, strength * lambert, 0))
         if self.sonar.spreads:
             amplitude /= sent * received
+        if factor is not None:
+            amplitude *= factor
+        if len(tables) > 1:  # a mirror scatters what its roughness takes from the mirror's echo
+            height = dr.gather(mi.Float, tables[1], index)
+            lost = 1 - dr.exp(-dr.square(height * self.wavenumber * (cosines[0] + cosines[1])))
+            amplitude *= dr.sqrt(dr.select(height < 0, 1, lost))
         return link.echo_batch(delay, amplitude, second.w, link.doppler(u_sent, u_received), seen)
 
 
@@ -285,7 +249,7 @@ class _VehicleRays:
         self.numbers = [np.arange(len(each), dtype=np.uint32) for each in directions]
         self.stored = [mi.Float64(each.ravel()) for each in directions]
 
-    def asked(self, pose: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
+    def asked(self, table: NDArray[np.float64], receiver: int) -> NDArray[np.uint32]:
         """Return indices of the rays that belong to a receiver."""
         return self.numbers[receiver]
 

@@ -46,6 +46,9 @@ class Clearance:
             time_s: of each, for bodies that move ``(n,)`` [s].
         """
         count = len(after)
+        if self.tracer.deforms and count > 1:  # a launch has one shape of each body
+            each = (slice(number, number + 1) for number in range(count))
+            return np.concatenate([self.of(before[one], after[one], time_s[one]) for one in each])
         way = after - before
         gone = np.linalg.norm(way, axis=1)
         ahead = np.where(gone[:, None] > 0, way / np.maximum(gone, 1e-12)[:, None], (0.0, 0.0, -1.0))

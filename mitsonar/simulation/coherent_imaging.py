@@ -22,6 +22,9 @@ from mitsonar.instruments.views import CONES, Segment, View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.coherent_tracing import CoherentTracer, FieldCounts, point_pitch
+from mitsonar.simulation.corner_tracing import CornerTracer
+from mitsonar.simulation.diffuse_field import DiffuseField
+from mitsonar.simulation.ghost_tracing import GhostTracer
 from mitsonar.simulation.hashed_points import MOST_CANDIDATES
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of
 from mitsonar.simulation.mirror_tracing import MirrorTracer
@@ -84,6 +87,10 @@ class CoherentImager:
         self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side, motion) for side in self.sides}
         self.tracer = self.tracers[self.sides[0]]
         self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
+        several = parts is not None and sonar.bounces > 1
+        self.ghosts = GhostTracer(self.tracer) if several else None
+        self.diffuse = DiffuseField(self.tracer) if sonar.bounces > 1 else None
+        self.corners = CornerTracer(scene, sonar, self.former, parts) if parts is not None and several else None
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
     def image(self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
@@ -123,6 +130,9 @@ class CoherentImager:
         field, counts = (self.tracer if side is None else self.tracers[side]).field(pose, time_s)
         if self.glints is not None:
             self.glints.add(pose, field)
+        for further in (self.ghosts, self.corners, self.diffuse):
+            if further is not None:
+                further.add(pose, field)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
@@ -318,8 +328,11 @@ def coherent_imager(
         MitsonarError: receivers elsewhere, cones, or portions with mirrors; mirrors in other models.
     """
     if sonar.model != "coherent":
-        if mirrors:
-            raise MitsonarError(f"the model {sonar.model} has no mirrors: give the sonar model coherent")
+        if mirrors and sonar.bounces == 1:
+            raise MitsonarError(
+                f"the model {sonar.model} has no mirrors: give the sonar model coherent"
+                + (", or bounces 2" if sonar.model == "physical" else "")
+            )
         return None
     return CoherentImager(scene, sonar, mirrors, views, motion)
 

@@ -238,13 +238,17 @@ def add_waves(
 
 @dataclass
 class SeenPoint:
-    """A point as the sonar sees it: exact range [m], sine of the bearing, tangent of the elevation, cosine, its ray."""
+    """A point as the sonar sees it: exact range [m], sine of the bearing, tangent of the elevation, cosine, its ray.
+
+    ``ahead``: whether its direction lies in the fan.
+    """
 
     range_m: DeviceArray
     sine: DeviceArray
     tangent: DeviceArray
     cosine: DeviceArray
     mine: DeviceArray
+    ahead: DeviceArray
 
 
 class FanRays:
@@ -261,20 +265,25 @@ class FanRays:
         side: of the elevation: +1 up, -1 down, 0 both.
 
     Attributes:
+        sine, tangent: of the bearing and of the elevation of each ray.
         on_side: rays of that side; a point's side is that of its ray.
         inside: those of them in the field of view.
     """
 
     def __init__(self, fan: CommonFan, sonar: Sonar, index: mi.UInt32, lines: list[list[Any]], side: int = 0) -> None:
-        self.fan, self.cone, self.lines = fan, sonar.bearing == "cone", lines
+        self.fan, self.cone, self.lines, self.sonar, self.index = fan, sonar.bearing == "cone", lines, sonar, index
         strip, place = index // (STRIP * fan.rows), index % (STRIP * fan.rows)
         self.column, self.row = mi.Int32(strip * STRIP + place % STRIP), mi.Int32(place // STRIP)
         self.sine_step, self.tangent_step = 2 * fan.sine / fan.columns, 2 * fan.tangent / fan.rows
         u = (mi.Float(self.column) + 0.5) * self.sine_step - fan.sine
-        t = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
+        t: DeviceArray = fan.tangent - (mi.Float(self.row) + 0.5) * self.tangent_step
         sides = math.sin(math.radians(sonar.azimuth_fov_deg) / 2), math.tan(math.radians(sonar.elevation_fov_deg) / 2)
         self.on_side = mi.Bool(True) if side == 0 else (t > 0) == (side > 0)
-        self.inside = (dr.abs(u) <= sides[0]) & (dr.abs(t) <= sides[1]) & self.on_side
+        aside: DeviceArray = dr.abs(u)
+        lift: DeviceArray = dr.abs(t)
+        self.inside = (aside <= sides[0]) & (lift <= sides[1]) & self.on_side
+        self.sine: DeviceArray = u
+        self.tangent: DeviceArray = t
         self._aim(u, t)
 
     def _aim(self, u: DeviceArray, t: DeviceArray) -> None:
@@ -292,10 +301,23 @@ class FanRays:
         self.by_sine, self.by_tangent = self._world(*by_sine), self._world(*by_tangent)
         self.origin = mi.Point3f(*(mi.Float(line[3]) for line in self.lines))
 
+    def from_lines(self, lines: list[list[Any]]) -> FanRays:
+        """Return the same rays of a sonar elsewhere, of both sides of the elevation."""
+        return FanRays(self.fan, self.sonar, self.index, lines)
+
     def _world(self, starboard: DeviceArray, forward: DeviceArray, up: DeviceArray) -> mi.Vector3f:
         """Turn (starboard, forward, up) into the world's axes."""
         rows = [[mi.Float(value) for value in line[:3]] for line in self.lines]
         return mi.Vector3f(*(row[0] * -starboard + row[1] * up + row[2] * forward for row in rows))
+
+    def direction(self, u: DeviceArray) -> tuple[DeviceArray, DeviceArray, DeviceArray]:
+        """Return sine of the bearing and tangent of the elevation of directions, and whether these lie in the fan."""
+        port, up, forward = (sum(mi.Float(line[axis]) * u[row] for row, line in enumerate(self.lines)) for axis in range(3))
+        level = dr.sqrt(port * port + forward * forward)
+        sine, tangent = -port if self.cone else -port / level, up / (forward if self.cone else level)
+        aside: DeviceArray = dr.abs(sine)
+        lift: DeviceArray = dr.abs(tangent)
+        return sine, tangent, (forward > 0) & (aside <= self.fan.sine) & (lift <= self.fan.tangent)
 
     def _steep(self, hit: Hit) -> DeviceArray:
         """Return the cosine between normal and ray, kept away from 0."""
@@ -330,7 +352,8 @@ class FanRays:
         column = mi.Int32(dr.floor((sine + self.fan.sine) * (1 / self.sine_step)))
         row = mi.Int32(dr.floor((self.fan.tangent - tangent) * (1 / self.tangent_step)))
         mine = (column == self.column) & (row == self.row) & (forward > 0)
-        return SeenPoint(range_m, sine, tangent, cosine, mine)
+        ahead = (forward > 0) & (dr.abs(sine) <= self.fan.sine) & (dr.abs(tangent) <= self.fan.tangent)
+        return SeenPoint(range_m, sine, tangent, cosine, mine, ahead)
 
     def _along(self, points: HashedPoints, way: list[DeviceArray], column: int) -> DeviceArray:
         """Return the component of vectors along one axis of the sensor."""

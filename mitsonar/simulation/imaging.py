@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.ping_groups import TimedPath, timed_path
+from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
@@ -45,8 +45,8 @@ class Simulator:
         sonar: the instrument; default: the scene's ``imaging_sonar``.
         views: makes the images of a ping from its echoes; default: one, of all of them.
         mirrors: reflection coefficient and rms height [m] of shapes that reflect as mirrors, by the shapes' ids, or their
-            materials (model ``coherent``); default: none.
-        moving: trajectories, or their files, by the ids of the shapes that follow them (docs/guides/moving.md).
+            materials (model ``coherent``, and ``physical`` with several ``bounces``); default: none.
+        moving: trajectories, or their files, by the shapes' ids (docs/guides/moving.md); default: as the shapes say.
         rays_per_launch: bound of a launch's rays and of its image cells, about 30 bytes each.
 
     Attributes:
@@ -68,8 +68,11 @@ class Simulator:
     ) -> None:
         self.variant = ensure_variant()
         from mitsonar.instruments.views import Whole
+        from mitsonar.simulation.bounce_sums import bounce_sums
+        from mitsonar.simulation.bright_surfaces import bright_notes
         from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.expected_former import expected_former
+        from mitsonar.simulation.image_launch import ImageLaunch
         from mitsonar.simulation.moving_scene import motion_in
         from mitsonar.simulation.moving_tracing import tracer_of
         from mitsonar.simulation.scene import sonar_in
@@ -83,21 +86,29 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar = sonar
-        check_timed(sonar, moving, views, mirrors)
         self.motion = motion_in(scene, moving)
+        check_timed(sonar, self.motion, views, mirrors)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
-            self.grouped = GroupedPings(Simulator(scene, one, moving=moving, rays_per_launch=rays_per_launch), sonar)
+            bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}
+            self.grouped = GroupedPings(
+                Simulator(scene, one, mirrors=mirrors, moving=bodies, rays_per_launch=rays_per_launch), sonar
+            )
         self.coherent = coherent_imager(scene, one, views, mirrors, self.motion)
         self.former = expected_former(one, views)
         traced = one if self.former is None else self.former.traced
         self.tracer = tracer_of(scene, traced, self.motion)
         self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
+        self.notes = [*self.notes, *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ())]
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)
-        self.pings_per_launch = max(1, rays_per_launch // max(traced.rays, cells))
-        self._launches: dict[tuple[int, bool], Callable[..., Any]] = {}
+        # a launch has one shape of each body
+        self.pings_per_launch = 1 if self.tracer.deforms else max(1, rays_per_launch // max(traced.rays, cells))
+        self.bounces = bounce_sums(scene, one, traced, mirrors)
+        formed = None if self.former is None else one
+        self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
+        self._launches: dict[tuple[int, bool], tuple[Callable[..., Any], Any]] = {}
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
 
@@ -143,7 +154,7 @@ class Simulator:
         levels, counts, cut = self.coherent.levels(pose, number, time_s)
         if labels:
             pings = self._launch(pose[None], np.array([time_s]), [number], True)[0]
-            pings.levels, pings.expected, pings.cut = levels[None], pings.levels, cut
+            pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
             return pings
         height_m = self.tracer.height_m(self.tracer.scene_at(time_s), self.tracer.inputs(pose[None], [number])[0])
         return RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
@@ -155,15 +166,19 @@ class Simulator:
 
         key = (len(poses), labels)
         if key not in self._launches:
-            self._launches[key] = self._compile(*key)
+            self._launches[key] = self._maker.compiled(*key)
+        scene = self.tracer.scene_at(time_s)  # first: bodies may deform, and the inputs are of their normals
         inputs = self.tracer.inputs(poses, numbers)
         tables = [tracer.tables(poses) for tracer in self.view_tracers]
-        height, made = replayed(self._launches[key], self.tracer.scene_at(time_s), *inputs, tables)
+        mirrors = None if self.bounces is None else self.bounces.tables_of_mirrors
+        launch, rays = self._launches[key]
+        height, made = replayed(launch, rays, scene, *inputs, tables, mirrors)
         height_m = np.array(height, dtype=float).reshape(len(poses), -1)[:, self.sonar.ping_groups // 2]
         looks = []
-        for view, (image, counters, truth) in zip(self.views, made, strict=True):
+        for view, (image, counters, truth, single) in zip(self.views, made, strict=True):
             pings = RenderedPings(numbers[0], *binning.fetch(image, counters, len(poses), view), height_m)
             if labels:
+                pings.expected = None if single is None else binning.fetch(single, counters, len(poses), view)[0]
                 pings.labels = labels_of(pings, truth, self.tracer.sonar.rays)
             looks.append(pings if self.former is None else self._formed(pings, self.former))
         return looks
@@ -171,57 +186,8 @@ class Simulator:
     def _formed(self, pings: RenderedPings, former: ExpectedFormer) -> RenderedPings:
         """Return pings of traced boxes as the beams and the pulse spread them; labels are those of the boxes."""
         labels = {name: former.crop(values) for name, values in pings.labels.items()}
-        expected = former.crop(pings.levels) if labels else None
+        expected = former.crop(pings.echoes) if labels else None
         return RenderedPings(pings.first, former.levels(pings.levels), pings.counts, pings.height_m, labels, expected)
-
-    def _compile(self, pings: int, labels: bool) -> Callable[..., Any]:
-        """Compile the fused launch.
-
-        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python.
-        """
-        import drjit as dr
-
-        from mitsonar.simulation.binning import accumulate, develop, strongest
-        from mitsonar.simulation.elevation_pattern import elevation_gain
-        from mitsonar.simulation.tracing import Rays
-
-        tracer, sonar, own = self.tracer, self.tracer.sonar, self.sonar
-
-        @dr.freeze
-        def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any) -> Any:
-            rays = Rays(sonar, index)
-            ray, fan = tracer.rays_of(rays, rows, keys)
-            echoes = tracer.echoes(scene, ray, fan, surfaces)
-            if self.former is not None:
-                echoes = replace(
-                    echoes, reflectivity=echoes.reflectivity * dr.square(elevation_gain(own, dr.tan(fan.elevation)))
-                )
-            looks = [
-                tracer.view_echoes(scene, rays, fan, echoes, table)
-                for tracer, table in zip(self.view_tracers, tables, strict=True)
-            ]
-            sums = [
-                accumulate(seen, rays.ping, pings, tracer) for seen, tracer in zip(looks, self.view_tracers, strict=True)
-            ]
-            truths: list[Any] = [None] * len(looks)
-            if labels:
-                truths = [
-                    (
-                        strongest(seen, rays.ping, rays.ray, pings, view),
-                        seen.elevation,
-                        seen.echoes.shape_id,
-                        seen.echoes.object_id,
-                    )
-                    for seen, view in zip(looks, self.views, strict=True)
-                ]
-            dr.eval(sums, truths)  # all that reads the echoes in one kernel, before any sum is read: rays are traced once
-            made = [
-                (*develop(total, pings, tracer), truth)
-                for total, tracer, truth in zip(sums, self.view_tracers, truths, strict=True)
-            ]
-            return tracer.height_m(scene, rows), made
-
-        return partial(launch, Rays.numbered(sonar, pings))
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """One ping's echoes as NumPy arrays, in the order of the film; all beams ping at ``time_s`` [s]."""
@@ -298,7 +264,6 @@ class Simulator:
         """Return images and labels as frames of the sonar; with labels go the names that these refer to."""
         shapes, objects = self.label_names(bool(labelled))
         time_s, beam_poses = timed.of_beams(self.sonar)
-        body_names, body_poses = self.bodies(timed.frames.time_s)
         return SonarFrames(
             image=image,
             range_m=self.sonar.range_m,
@@ -307,8 +272,7 @@ class Simulator:
             sonar=self.sonar,
             poses=timed.frames.poses,
             beam_poses=beam_poses,
-            body_poses=body_poses,
-            body_names=body_names,
+            **self.bodies(timed.frames.time_s).fields(),
             height_m=height_m,
             level=self.sonar.value_coding,
             level_scale=1 / gain,
@@ -326,9 +290,9 @@ class Simulator:
         objects = object_names_in(self.tracer.scene)
         return shape_names_in(self.tracer.scene), objects if self.motion is None else self.motion.object_names(objects)
 
-    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
-        """Return the names of the bodies that move and their poses at times ``(times, bodies, 6)``; None: all is still."""
-        return ((), None) if self.motion is None else (self.motion.bodies.names, self.motion.bodies.poses(time_s))
+    def bodies(self, time_s: ArrayLike) -> BodyStates:
+        """Return the names of the bodies that move, their poses and velocities at times; none where all is still."""
+        return BodyStates() if self.motion is None else self.motion.bodies.states(time_s)
 
     def step(
         self,

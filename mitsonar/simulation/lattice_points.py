@@ -29,6 +29,10 @@ BEYOND = 1e-5
 """Part of a ray's length by which the next one begins behind a surface that was hit."""
 
 
+ROUNDING = 5e-6
+"""The same as a part of the coordinate, forty times its rounding: or a ray would meet a far, small shape without end."""
+
+
 class SurfacePoints(NamedTuple):
     """Points of a shape.
 
@@ -111,7 +115,9 @@ class _Search:
     """Follows rays through one shape."""
 
     def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None) -> None:
+        name = shape.id()
         self.scene: mi.Scene = mi.load_dict({"type": "scene", "shape": shape})
+        shape.set_id(name)  # Mitsuba renames it
         self.surfaces = Surfaces.of(self.scene)
         self.pitch, self.patches = pitch, patches
         self.table = None if patches is None else mi.Float(patch_amplitudes(BLENDED * patches.nu))
@@ -126,7 +132,8 @@ class _Search:
         if self.patches is not None and self.table is not None:
             amplitude *= patch_weight((p, q), bits, key, self.table, dr.width(self.table), self.patches.side_m)
         begin, way = (cells.ends[1], -1.0) if side else (cells.ends[0], 1.0)  # from where the surface faces
-        a, skip = dr.full(mi.Float, begin, len(numbers)), way * BEYOND * (cells.ends[1] - cells.ends[0])
+        reach = max(BEYOND * (cells.ends[1] - cells.ends[0]), ROUNDING * max(abs(end) for end in cells.ends))
+        a, skip = dr.full(mi.Float, begin, len(numbers)), way * reach
         u = _along(cells.axis, mi.Float(0), mi.Float(0), mi.Float(way))
         made: list[SurfacePoints] = []
         while True:

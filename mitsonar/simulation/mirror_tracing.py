@@ -44,7 +44,7 @@ from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.mirror_parts import Mirrors, parts_at, smooth_share
 from mitsonar.simulation.variant import replayed
 
-__all__ = ["MirrorTracer"]
+__all__ = ["LEVEL_PART", "NEIGHBOURS", "FinerRays", "MirrorTracer", "facing_share", "rows_of", "sinc"]
 
 FADING, LAST = 0.866, 0.707
 """Cosines between normal and ray where the integral begins to fade, and where it ends."""
@@ -86,6 +86,7 @@ class MirrorTracer:
         self.scene, self.sonar, self.former, self.finest = scene, sonar, former, finest
         self.fan, self.surfaces, self.table = CommonFan.of(sonar), Surfaces.of(scene), mirrors.table()
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
+        self.wavenumber = 2 * math.pi / self.wavelength
         self.last = former.first_range + (former.ranges - 1) * former.range_step
         # the sum of all amplitudes in a cell of the grid is below k / pi times its solid angle, at most twice this
         loudest = 16 / self.wavelength * former.sine_step * self.fan.tangent
@@ -152,7 +153,7 @@ class MirrorTracer:
     def _compile_survey(self) -> Callable[..., Any]:
         @dr.freeze
         def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
-            rays = FanRays(self.fan, self.sonar, index, _lines(rows))
+            rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
             hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
             mirror = hit.valid & (parts_at(table, hit)[0] != 0)
             mirror &= rays.may_reach(hit, self.former.first_range, self.last)
@@ -216,24 +217,26 @@ class MirrorTracer:
     def _compile_sum(self) -> Callable[..., Any]:
         @dr.freeze
         def launch(inputs: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
-            rays = FinerRays(self.fan, self.sonar, inputs, _lines(rows))
-            hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+            rays = FinerRays(self.fan, self.sonar, inputs, rows_of(rows))
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
-            self._add(rays, hit, table, (sums[0], sums[1]))
+            self._sum(scene, tables, rays, table, (sums[0], sums[1]))
             dr.eval(sums)
             return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
 
         return launch
 
-    def _add(self, rays: FinerRays, hit: Hit, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]) -> None:
+    def _sum(
+        self, scene: mi.Scene, tables: Any, rays: FinerRays, table: mi.Float, sums: tuple[mi.UInt64, mi.UInt64]
+    ) -> None:
         """Add the echo of each ray's cell to the grid."""
-        wavenumber = 2 * math.pi / self.wavelength
+        hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
+        wavenumber = self.wavenumber
         reflection, roughness_m = parts_at(table, hit)
         cosine = dr.abs(dr.dot(hit.n, rays.d))
         across, down = rays.steps_on(hit)
         level = reflection * smooth_share(roughness_m, cosine, wavenumber) * _fading(cosine)
         level *= (wavenumber / (2 * math.pi)) * cosine * dr.norm(dr.cross(across, down)) / dr.square(hit.t)
-        level *= _sinc(dr.dot(rays.d, across) * wavenumber) * _sinc(dr.dot(rays.d, down) * wavenumber)
+        level *= sinc(dr.dot(rays.d, across) * wavenumber) * sinc(dr.dot(rays.d, down) * wavenumber)
         level *= elevation_gain(self.sonar, rays.tangent)
         range_m = mi.Float64(hit.t)
         turns = range_m * (2 / self.wavelength)
@@ -258,12 +261,17 @@ class FinerRays(FanRays):
     def __init__(self, fan: CommonFan, sonar: Sonar, inputs: tuple[mi.UInt32, ...], lines: list[list[Any]]) -> None:
         cell, parts, over, down = inputs
         super().__init__(fan, sonar, cell, lines)
+        self.inputs = inputs
         self.sine_step: DeviceArray = self.sine_step / mi.Float(parts)
         self.tangent_step: DeviceArray = self.tangent_step / mi.Float(parts)
         column = mi.Float(self.column * mi.Int32(parts) + mi.Int32(over)) + 0.5
         row = mi.Float(self.row * mi.Int32(parts) + mi.Int32(down)) + 0.5
         self.sine, self.tangent = column * self.sine_step - fan.sine, fan.tangent - row * self.tangent_step
         self._aim(self.sine, self.tangent)
+
+    def from_lines(self, lines: list[list[Any]]) -> FinerRays:
+        """Return the same rays of a sonar elsewhere."""
+        return FinerRays(self.fan, self.sonar, self.inputs, lines)
 
 
 def _expanded(cell: NDArray[np.intp], parts: NDArray[np.int64]) -> tuple[NDArray[np.uint32], ...]:
@@ -277,7 +285,7 @@ def _expanded(cell: NDArray[np.intp], parts: NDArray[np.int64]) -> tuple[NDArray
     return cells, each, number % each, number // each
 
 
-def _lines(rows: mi.Float64) -> list[list[Any]]:
+def rows_of(rows: mi.Float64) -> list[list[Any]]:
     """Return three rows of four numbers of an array of twelve."""
     return [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
 
@@ -289,7 +297,15 @@ def _fading(cosine: DeviceArray) -> DeviceArray:
     return dr.select(x < 1, inner, 1)
 
 
-def _sinc(x: DeviceArray) -> DeviceArray:
+def facing_share(cosine: DeviceArray) -> DeviceArray:
+    """Return what counts of a mirror's cell, by the cosine between its mirrored ray and the line to the sonar.
+
+    A ray that meets one mirror at an angle from its normal leaves at twice this angle from the line back.
+    """
+    return _fading(dr.sqrt((1 + dr.select(cosine > -1, cosine, -1)) * 0.5))
+
+
+def sinc(x: DeviceArray) -> DeviceArray:
     """Return sin(x) / x."""
     size: DeviceArray = dr.abs(x)
     return dr.select(size > 1e-3, dr.sin(x) / x, 1 - x * x / 6)

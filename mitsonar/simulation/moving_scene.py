@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.motion.moving_bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices
+from mitsonar.simulation.deforming_mesh import DeformingMesh
 from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.moving_files import motions_of
 
-__all__ = ["MovingScene", "SceneMotion", "carried_back", "motion_in"]
+__all__ = ["MovingScene", "SceneMotion", "carried_back", "motion_in", "scene_of"]
 
 
 @dataclass
@@ -138,28 +140,48 @@ class SceneMotion:
 
     Attributes:
         still: a scene of the other shapes.
+        shapes: of the scene; those that deform are copies.
+        deformed: those that deform.
 
     Raises:
-        MitsonarError: a shape that the scene does not have.
+        MitsonarError: a shape that the scene does not have, or that cannot deform; a scene with instances.
     """
 
     def __init__(self, scene: mi.Scene, bodies: MovingBodies) -> None:
         self.scene, self.bodies = scene, bodies
-        shapes = list(scene.shapes())
-        names = [shape.id() for shape in shapes]
+        self.shapes = list(scene.shapes())
+        names = [shape.id() for shape in self.shapes]
         for name in bodies.shapes:
             if name not in names:
                 raise MitsonarError(f"moving: the scene has no shape {name}: {nearest_names(name, names)}")
+        instances = [shape.id() for shape in self.shapes if shape.class_name() == "Instance"]
+        if instances:
+            raise MitsonarError(
+                f"moving: bodies move in scenes without instances: got {', '.join(instances[:3])}; give these as meshes"
+            )
         moved = dict.fromkeys(bodies.shapes)
         self.numbers = {name: names.index(name) for name in moved}
         self.copies = [bodies.shapes.count(name) for name in moved]
-        self.still = _scene_of([shape for shape in shapes if shape.id() not in moved])
-        self._movers = [_scene_of([shapes[number]]) for number in self.numbers.values()]
-        self._spheres = [_sphere(shapes[number]) for number in self.numbers.values()]
+        self.deformed = [DeformingMesh(self.shapes[names.index(name)], law) for name, law in bodies.deforming.items()]
+        for one in self.deformed:
+            self.shapes[names.index(one.mesh.id())] = one.mesh
+        self.still = scene_of([shape for shape in self.shapes if shape.id() not in moved])
+        self._movers = [scene_of([self.shapes[number]]) for number in self.numbers.values()]
+        self._spheres = [_sphere(self.shapes[number]) for number in self.numbers.values()]
+        for one in self.deformed:
+            one.scene = self._movers[list(moved).index(one.mesh.id())]
         dr.make_opaque(self._spheres)
 
     def at(self, time_s: ArrayLike) -> MovingScene:
-        """Return the scene at moments ``(moments,)`` [s]; rays name theirs by its number, as their time."""
+        """Return the scene at moments ``(moments,)`` [s]; rays name theirs by its number, as their time.
+
+        Bodies that deform have one shape at all of them: that of the middle.
+        """
+        for one in self.deformed:
+            one.deform(float(np.asarray(time_s, dtype=float).mean()))
+            place = list(self.numbers).index(one.mesh.id())
+            self._spheres[place] = _sphere(one.mesh)
+            dr.make_opaque(self._spheres[place])
         rows = self.bodies.from_world(time_s)
         rest = np.broadcast_to(np.eye(4)[:3], (len(rows), 1, 3, 4))
         table = np.concatenate([rest, rows], axis=1).astype(np.float32)
@@ -187,13 +209,14 @@ class SceneMotion:
 
 
 def motion_in(scene: mi.Scene, moving: Moving | MovingBodies | None) -> SceneMotion | None:
-    """Return what moves in a scene; None where nothing does."""
+    """Return what moves in a scene: as given, or by default as the scene's own shapes say; None where nothing does."""
+    moving = motions_of(scene) if moving is None else moving
     if not moving:
         return None
     return SceneMotion(scene, moving if isinstance(moving, MovingBodies) else MovingBodies.of(moving))
 
 
-def _scene_of(shapes: list[mi.Shape]) -> mi.Scene:
+def scene_of(shapes: list[mi.Shape]) -> mi.Scene:
     """Return a scene of some shapes of another."""
     names = [shape.id() for shape in shapes]
     numbered = {f"shape{number}": shape for number, shape in enumerate(shapes)}

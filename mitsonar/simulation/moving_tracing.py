@@ -26,17 +26,31 @@ class MovingSurfaces(Surfaces):
     Attributes:
         first_object: number below that of the first body's object.
         shape_count: shapes of the scene.
+        motion: of the scene.
+        versions: of the meshes that deform, when their normals were read.
     """
 
     first_object: int = 0
     shape_count: int = 0
+    motion: SceneMotion | None = None
+    versions: tuple[int, ...] = ()
 
     @classmethod
     def of_motion(cls, motion: SceneMotion, sonar: Sonar) -> MovingSurfaces:
         """Return the tables of the scene that a motion belongs to, for one sonar."""
-        tables = cls.of(motion.scene).heard_by(sonar)
+        tables = cls.of(motion.scene, motion.shapes).heard_by(sonar)
         assert isinstance(tables, MovingSurfaces)
-        return replace(tables, first_object=motion.first_objects, shape_count=len(motion.scene.shapes()))
+        return replace(tables, first_object=motion.first_objects, shape_count=len(motion.shapes), motion=motion)
+
+    def arrays(self) -> dict[str, DeviceArray]:
+        """Return the tables by name, with the normals that meshes have now."""
+        deformed = () if self.motion is None else self.motion.deformed
+        now = tuple(one.version for one in deformed)
+        if now != self.versions:
+            for one in deformed:
+                self.turn_facets(one.mesh)
+            self.versions = now
+        return super().arrays()
 
     def hit(self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
         """Trace rays to the nearest surface; directions are of the world."""
@@ -71,7 +85,7 @@ class MovingTracer(Tracer):
 
     def __init__(self, motion: SceneMotion, sonar: Sonar) -> None:
         super().__init__(motion.scene, sonar)
-        self.motion = motion
+        self.motion, self.deforms = motion, bool(motion.deformed)
         self.surfaces = MovingSurfaces.of_motion(motion, sonar)
 
     def scene_at(self, time_s: ArrayLike) -> MovingScene:

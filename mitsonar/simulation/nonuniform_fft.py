@@ -8,9 +8,10 @@ import finufft
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.simulation.variant import current_variant
 
-__all__ = ["TOLERANCE", "phasor_sums"]
+__all__ = ["TOLERANCE", "phasor_sums", "phasors"]
 
 TOLERANCE = 1e-9
 """Relative error of the sums."""
@@ -52,3 +53,19 @@ def _on_the_device(turn: NDArray[np.float64], strength: NDArray[np.complex128], 
 
     there = [torch.from_numpy(np.ascontiguousarray(values)).cuda() for values in (turn, strength)]
     return np.asarray(cufinufft.nufft1d1(*there, modes, eps=TOLERANCE, isign=-1).cpu().numpy())
+
+
+def phasors(
+    delay: NDArray[np.float64], amplitude: NDArray[np.inexact], sonar: ChannelSonar, padding: int
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """Compute phase step and complex amplitude of echoes in NumPy, as a launch does on the device.
+
+    Args:
+        delay: of each echo ``(n,)`` [s].
+        amplitude: of each echo ``(n,)``, before the carrier's phase.
+        sonar: carrier and frequency step.
+        padding: factor by which the frequency response is sampled finer.
+    """
+    turn, phase = delay * (sonar.frequency_step_hz / padding), delay * sonar.carrier_hz
+    strength = amplitude * np.exp(-2j * np.pi * (phase - np.rint(phase)))
+    return 2 * np.pi * (turn - np.rint(turn)), np.asarray(strength, np.complex128)

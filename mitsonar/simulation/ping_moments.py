@@ -69,10 +69,11 @@ def moments_of(
 def sonar_of_one_ping(sonar: Sonar) -> Sonar | None:
     """Return the sonar whose pings make up the frames; None where one launch traces all groups, each from its own pose.
 
-    That is so where the beams are apart: boxes. Where each beam is formed of more than its own rays, all beams of the fan
-    are formed at each group's pose, and those of the group are kept. A head that turns has one beam.
+    That is so where the beams are apart: boxes. Where each beam is formed of more than its own rays, or hears those of
+    others by way of several reflections, all beams of the fan are formed at each group's pose, and those of the group are
+    kept. A head that turns has one beam.
     """
-    if sonar.ping_groups == 1 or sonar.beam_pattern == "box":
+    if sonar.ping_groups == 1 or (sonar.beam_pattern == "box" and sonar.bounces == 1):
         return None
     return one_beam(sonar) if scans(sonar) else sonar.replace(ping_groups=1)
 
@@ -81,11 +82,16 @@ def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirr
     """Refuse what has no bodies that move, and no groups of beams.
 
     Raises:
-        MitsonarError: receivers elsewhere, portions, or mirrors.
+        MitsonarError: receivers elsewhere or portions; bodies that move, with mirrors or several reflections.
     """
     what = "bodies that move" if moving else "ping groups" if sonar.ping_groups > 1 else ""
-    if what and mirrors:
-        raise MitsonarError(f"mirrors are of still scenes and of frames at one moment: leave mirrors or {what} out")
+    if moving and (mirrors or sonar.bounces > 1):
+        other = "mirrors" if mirrors else "bounces"
+        raise MitsonarError(f"{other} are of still scenes: leave {other} or bodies that move out")
+    if sonar.bounces > 1 and any(not isinstance(view, Whole) for view in views or ()):
+        raise MitsonarError(
+            "receivers elsewhere and portions hear one reflection: leave bounces out, or render the whole view"
+        )
     if what and any(not isinstance(view, Whole) for view in views or ()):
         raise MitsonarError(f"receivers elsewhere and portions have no {what}: render the whole view")
 

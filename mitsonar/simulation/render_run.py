@@ -20,6 +20,7 @@ from mitsonar.instruments.ping_groups import TimedPath, timed_path
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import write_whole
+from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.plotting.fan_pictures import FanPictures
@@ -74,8 +75,8 @@ class Source(Protocol):
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """One ping's echoes in the order of the film."""
 
-    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
-        """Return the names of the bodies that move and their poses at times; None: all is still."""
+    def bodies(self, time_s: ArrayLike) -> BodyStates:
+        """Return the names of the bodies that move, their poses and velocities at times."""
 
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window [m]."""
@@ -189,7 +190,7 @@ def _asked(source: Source, trajectory: Trajectory, outputs: Outputs, origin: dic
 
 def _save_bodies(source: Source, trajectory: Trajectory, folder: Path, frame: str) -> None:
     """Write the path of each body that moves, a file each, at the times of the frames."""
-    names, poses = source.bodies(trajectory.time_s)
+    names, poses, _ = source.bodies(trajectory.time_s)
     for number, name in enumerate(names):
         assert poses is not None
         folder.mkdir(exist_ok=True)
@@ -286,7 +287,7 @@ class StoredEchoes:
         change |= {} if window is None else {"range_min": window[0], "range_max": window[1]}
         if frames.sonar.model == "coherent":  # echoes have no phase: what can be binned are expected levels in hard boxes
             change |= {"model": "physical", "pattern": "box"}
-        self.sonar = frames.sonar.replace(**change)
+        self.sonar = frames.sonar.replace(**change, bounces=1)  # echoes are of one reflection
         self.notes: list[str] = []
 
     def pings(
@@ -320,9 +321,9 @@ class StoredEchoes:
         """Nearest and farthest return outside the window [m]."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 
-    def bodies(self, time_s: ArrayLike) -> tuple[tuple[str, ...], NDArray[np.float64] | None]:
+    def bodies(self, time_s: ArrayLike) -> BodyStates:
         """Return none: where bodies were is in the run that stored the echoes."""
-        return (), None
+        return BodyStates()
 
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return none: stored echoes have no labels."""
@@ -342,7 +343,6 @@ def _frames_of(
     image = to_image(pings.levels, gain, sonar)
     numbers = np.arange(pings.first, pings.first + len(pings))
     time_s, beam_poses = timed.of_beams(sonar)
-    bodies, body_poses = source.bodies(timed.frames.time_s[numbers])
     frames = SonarFrames(
         image=np.ascontiguousarray(outputs.noise.apply(image, seed=sonar.seed, frames=numbers)),
         range_m=sonar.range_m,
@@ -351,8 +351,7 @@ def _frames_of(
         sonar=sonar,
         poses=timed.frames.poses[numbers],
         beam_poses=None if beam_poses is None else beam_poses[numbers],
-        body_poses=body_poses,
-        body_names=bodies,
+        **source.bodies(timed.frames.time_s[numbers]).fields(),
         height_m=pings.height_m,
         level=sonar.value_coding,
         level_scale=1 / gain,

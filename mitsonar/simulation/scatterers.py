@@ -25,16 +25,16 @@ from scipy.sparse.csgraph import connected_components
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.plugins.bsdf_reflectance import reflectances_of, reflectivity_at
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
-from mitsonar.plugins.surfaces import reflectances_of, reflectivity_at
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.lattice_points import Patches, SurfacePoints, lattice_points, lattice_size
 
 __all__ = ["Scatterers"]
 
 MOST = 2**26
-"""Largest number of points of a scene, 32 bytes each: place, normal, strength and phase."""
+"""Largest number of points of a scene, 36 bytes each: place, normal, strength, phase and shape."""
 
 A_BUCKET = 256
 """Points in a bucket, about: few enough to fit a field of view closely, enough to keep the buckets few."""
@@ -85,6 +85,7 @@ class Scatterers:
         normal: unit normal of the surface ``(points, 3)`` float32.
         strength: reflectivity times the area that a point represents, times |zeta|^2 ``(points,)`` float32 [m2].
         phase: of zeta ``(points,)`` float32, -pi..pi [rad].
+        shape: place in ``scene.shapes()`` of the shape that has the point ``(points,)`` int32.
         first: index of the first point of each bucket, and the number of points ``(buckets + 1,)``.
         one_sided: whether a bucket's points lie on closed bodies, visible from outside only ``(buckets,)``.
     """
@@ -93,22 +94,32 @@ class Scatterers:
     normal: NDArray[np.float32]
     strength: NDArray[np.float32]
     phase: NDArray[np.float32]
+    shape: NDArray[np.int32]
     first: NDArray[np.int64]
     one_sided: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, scene: mi.Scene, sonar: ChannelSonar) -> Scatterers:
+    def of(cls, scene: mi.Scene, sonar: ChannelSonar, smooth: frozenset[int] | None = None) -> Scatterers:
         """Place scatterers on a scene's shapes.
+
+        Args:
+            scene: any.
+            sonar: gives number and seed of the points.
+            smooth: places in the scene of perfect mirrors, which scatter nothing; where it is given there may be no points.
 
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
         """
-        parts, closed = [], []
+        parts, closed, shapes = [], [], []
         for number, shape in enumerate(scene.shapes()):
-            if shape.bsdf() is not None:
+            if shape.bsdf() is not None and number not in (smooth or ()):
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
                 parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
+                shapes.append(np.full(len(parts[-1].strength), number, np.int32))
+        if not sum(map(len, closed)) and smooth is not None:
+            none = np.zeros((0, 3), np.float32)
+            return cls(none, none, none[:, 0], none[:, 0], np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, bool))
         if not sum(map(len, closed)):
             raise MitsonarError(
                 "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
@@ -117,7 +128,8 @@ class Scatterers:
         place, normal, strength, phase = (np.concatenate(values) for values in zip(*parts, strict=True))
         one_sided = np.concatenate(closed)
         order, first = _buckets(place, np.where(one_sided, _side(normal), 0))
-        return cls(place[order], normal[order], strength[order], phase[order], first, one_sided[order[first[:-1]]])
+        of_shape, sided = np.concatenate(shapes)[order], one_sided[order[first[:-1]]]
+        return cls(place[order], normal[order], strength[order], phase[order], of_shape, first, sided)
 
     def __len__(self) -> int:
         return len(self.strength)
@@ -147,6 +159,8 @@ class Scatterers:
             axes: :attr:`FieldOfView.axes` in the world ``(3, 3)``.
             field: shape of the field of view.
         """
+        if not len(self):
+            return np.zeros(0, np.uint32)
         blocks, buckets = self.spheres
         near = blocks.may_be_seen(np.arange(len(blocks.radius)), eye, axes, field)
         inner = (near[:, None] * A_BLOCK + np.arange(A_BLOCK)).ravel()

@@ -20,6 +20,8 @@ from mitsonar.simulation.imaging import Simulator
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitsonar.motion.moving_bodies import Moving, MovingBodies
+
 __all__ = ["SoundedPings", "SounderSimulator"]
 
 FEW = 8
@@ -46,31 +48,43 @@ class SounderSimulator:
     Args:
         scene: a Mitsuba scene.
         sounder: the instrument.
+        moving: trajectories of bodies, as of :class:`mitsonar.Simulator`.
         rays_per_launch: bound of a launch's rays and of its image cells.
 
     Raises:
         MitsonarError: as :class:`mitsonar.Simulator` does.
     """
 
-    def __init__(self, scene: mi.Scene, sounder: Sounder, *, rays_per_launch: int = 2**23) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sounder: Sounder,
+        *,
+        moving: Moving | MovingBodies | None = None,
+        rays_per_launch: int = 2**23,
+    ) -> None:
         self.sounder = sounder
-        self.simulator = Simulator(scene, sounder.fan, rays_per_launch=rays_per_launch)
+        self.simulator = Simulator(scene, sounder.fan, moving=moving, rays_per_launch=rays_per_launch)
         self.variant, self.notes = self.simulator.variant, self.simulator.notes
         self.noise = self._noise()
 
-    def pings(self, poses: ArrayLike, *, first: int = 0) -> Iterator[SoundedPings]:
+    def pings(self, poses: ArrayLike, *, first: int = 0, time_s: ArrayLike | None = None) -> Iterator[SoundedPings]:
         """Levels of consecutive pings of the vehicle, in batches; every fan of every ping draws its own jitter.
 
         Args:
             poses: of the vehicle ``(pings, 6)`` x, y, z [m], pitch, roll, heading [rad].
             first: number of the first ping.
+            time_s: of the pings ``(pings,)``, where bodies move [s]; default: their number / ``frame_rate_hz``.
         """
         table = np.atleast_2d(np.asarray(poses, dtype=float))
+        rate = self.sounder.fan.frame_rate_hz
+        time = (first + np.arange(len(table))) / rate if time_s is None else np.asarray(time_s, dtype=float)
         fans = len(self.sounder.channels)
         together = FEW if self.simulator.coherent is not None else max(1, self.simulator.pings_per_launch // fans)
         for start in range(0, len(table), together):
             own = self.sounder.fan_poses(table[start : start + together])
-            rendered = list(self.simulator.pings(own.reshape(-1, 6), first=(first + start) * fans))
+            now = np.repeat(time[start : start + together], fans)
+            rendered = list(self.simulator.pings(own.reshape(-1, 6), first=(first + start) * fans, time_s=now))
             levels = np.concatenate([part.levels for part in rendered])
             height_m = np.concatenate([part.height_m for part in rendered])[::fans]
             yield SoundedPings(first + start, levels.reshape(len(own), fans, *levels.shape[1:]), height_m)
@@ -89,14 +103,14 @@ class SounderSimulator:
         """
         if self.sounder.fan.beams > 1:
             raise MitsonarError(f"an echogram has one beam a fan: got {self.sounder.fan.beams}; use soundings()")
-        batches = list(self.pings(flown.poses))
+        batches = list(self.pings(flown.poses, time_s=flown.time_s))
         levels = np.concatenate([batch.levels[..., 0] for batch in batches])
         height_m = np.concatenate([batch.height_m for batch in batches])
         return Echogram(flown.time_s, flown.poses, self.sounder, levels, height_m)
 
     def soundings(self, flown: Trajectory) -> Soundings:
         """Render all pings and detect an echo in each beam."""
-        found = [self.detect(batch.levels) for batch in self.pings(flown.poses)]
+        found = [self.detect(batch.levels) for batch in self.pings(flown.poses, time_s=flown.time_s)]
         joined = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return Soundings(flown.time_s, flown.poses, self.sounder, *joined)
 

@@ -80,7 +80,10 @@ class Tracer:
 
     Attributes:
         notes: what a user should know about the scene's BSDFs and materials.
+        deforms: whether a body deforms, so that a launch is of one moment.
     """
+
+    deforms = False
 
     def __init__(self, scene: mi.Scene, sonar: Sonar) -> None:
         self.scene = scene
@@ -123,8 +126,8 @@ class Tracer:
         All beams ping at once.
         """
         rays = Rays(self.sonar, Rays.numbered(self.sonar, 1))
-        rows, keys, tables = self.inputs(np.tile(np.reshape(pose, (1, 1, 6)), (1, self.sonar.ping_groups, 1)), [ping])
         scene = self.scene_at([time_s] * self.sonar.ping_groups)
+        rows, keys, tables = self.inputs(np.tile(np.reshape(pose, (1, 1, 6)), (1, self.sonar.ping_groups, 1)), [ping])
         traced = self.echoes(scene, *self.rays_of(rays, rows, keys), tables)
         values = {field.name: dr.zeros(mi.Float, self.sonar.rays) for field in fields(Echoes)}
         for name, target in values.items():

@@ -9,6 +9,7 @@ from mitsonar.worlds.flat_objects import FlatObjects
 from mitsonar.worlds.pattern import Pattern
 from mitsonar.worlds.rocky_field import RockyField
 from mitsonar.worlds.scene_file import SceneFile
+from mitsonar.worlds.sea_surface import SeaSurface
 from mitsonar.worlds.ship_hull import ShipHull
 from mitsonar.worlds.world import Family
 
@@ -19,6 +20,7 @@ FAMILIES: dict[str, type[Family]] = {
     "ship-hull": ShipHull,
     "pattern": Pattern,
     "flat-objects": FlatObjects,
+    "sea-surface": SeaSurface,
 }
 
 

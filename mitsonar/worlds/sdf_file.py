@@ -22,6 +22,9 @@ __all__ = ["read_sdf"]
 MOST_INCLUDES = 20
 """Longest chain of files that include one another, and of models within models."""
 
+MOST_MODELS = 10_000
+"""Models of a file with all that it includes: a short chain of files may place one very often."""
+
 NOT_READ = ("heightmap", "polyline", "image")
 """Geometries that are left out."""
 
@@ -52,6 +55,7 @@ class _Reader:
         self.search, self.shapes, self.joints, self.collision = search, shapes, dict(joints), collision
         self.found = ReadScene()
         self.joint_names: list[str] = []
+        self.models = 0
 
     # ---------------------------------------------------------------- models and their frames
 
@@ -59,6 +63,9 @@ class _Reader:
         """Read the frames of a model, and of the models in it; geometries are read later."""
         if depth > MOST_INCLUDES:
             raise refused(file, element, f"models lie within each other more than {MOST_INCLUDES} deep")
+        self.models += 1
+        if self.models > MOST_MODELS:
+            raise refused(file, element, f"there are more than {MOST_MODELS:,} models, with those of included files")
         made = _Model(name, file, element, Scope(file))
         for child in element:
             if child.tag in ("link", "frame", "joint"):

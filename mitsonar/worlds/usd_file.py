@@ -68,7 +68,8 @@ def _read_apart(path: Path, search: ModelSearch, collision: bool) -> tuple[Plain
     asked = {"path": str(path.resolve()), "roots": [str(root) for root in search.roots], "collision": collision}
     settings = {name: value for name, value in os.environ.items() if not name.startswith(("PXR_", "USD_"))}
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "mitsonar.worlds.usd_reading", f"{folder}/prims.npz"]
+        # -P: modules beside the scene, in the folder that the command runs in, are a stranger's
+        command = [sys.executable, "-P", "-m", "mitsonar.worlds.usd_reading", f"{folder}/prims.npz"]
         try:
             done = subprocess.run(
                 command, input=json.dumps(asked).encode(), capture_output=True, timeout=SECONDS, env=settings

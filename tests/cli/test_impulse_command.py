@@ -14,6 +14,7 @@ from helpers import PROGRAM, Command, refused
 from PIL import Image
 
 from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.worlds.sea_surface import SeaSurface
 
 SCENE = """<scene version="3.0.0">
     <default name="half" value="13"/>
@@ -163,3 +164,47 @@ def test_mistakes_are_answered(mitsonar: Command, scene: Path, tmp_path: Path, m
     bare.write_text('<scene version="3.0.0"/>')
     refused(mitsonar("impulse", bare, "--from", "0,0,10,0,0,0"), "no surface that can carry scatterers")
     assert not (tmp_path / "out").exists()  # nothing was begun
+
+
+SEA = """<scene version="3.0.0">
+    <sensor type="channel_sonar">
+        <string name="receivers" value="front"/><string name="shape" value="all"/>
+        <transform name="to_world"><lookat origin="0, 0, 3" target="0, 1, 3" up="0, 0, 1"/></transform>
+    </sensor>
+    <shape type="ply" id="surface">
+        <string name="filename" value="sea/meshes/surface.ply"/>
+        <bsdf type="acoustic_material"><string name="material" value="sea/surface.yaml"/></bsdf>
+    </shape>
+</scene>"""
+
+
+def test_a_sea_surface_is_a_mirror_of_ones_own_scene(mitsonar: Command, tmp_path: Path) -> None:
+    """`world sea-surface`, then its material (--mirrors) or numbers of one's own (--mirror) give the same bits."""
+    made = mitsonar("world", "sea-surface", "--wind-m-s", 2, "--size-m", 8, "--step-m", 0.1, "-o", tmp_path / "sea")
+    assert made.returncode == 0, made.stderr
+    height = SeaSurface(wind_m_s=2.0, size_m=8.0, step_m=0.1).state.roughness_m
+    assert f"waves below 0.4 m are its roughness, rms {height:.3g} m" in made.stdout
+    scene = tmp_path / "mine.xml"
+    scene.write_text(SEA)
+    runs = {}
+    for name, more in {"own": ["--mirror", f"surface=-1,{height:.4g}"], "material": ["--mirrors"], "none": []}.items():
+        done = mitsonar("impulse", scene, "--set", "points_per_m2=1", *more, "-o", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        runs[name] = ImpulseResponses.load(tmp_path / name).response
+        assert json.loads((tmp_path / name / "run.json").read_text())["asked"].get("mirrors") == (
+            {"own": {"surface": [-1.0, float(f"{height:.4g}")]}, "material": True}.get(name)
+        )
+    assert np.array_equal(runs["own"], runs["material"])
+    assert np.abs(runs["own"] - runs["none"]).max() > 0.1 * np.abs(runs["none"]).max()
+
+
+def test_mirrors_that_do_not_fit_are_refused(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    for given, *words in (
+        (["--mirror", "floor=-1"], "--mirror NAME=V,H takes 2 numbers, separated by commas: got '-1'"),
+        (["--mirror", "=-1,0"], "--mirror takes NAME=V,H, reflection and rms height [m] of a shape: got '=-1,0'"),
+        (["--mirror", "floor=-1,0", "--mirrors"], "give one of both"),
+        (["--mirror", "flor=-1,0"], "the scene has no shape flor: did you mean floor?"),
+        (["--mirror", "floor=-2,0"], "lies in -1..1"),
+        (["--mirrors", "--set", "bounces=2"], "bounces 2 need mirrors"),
+    ):
+        refused(mitsonar("impulse", scene, *given, "-o", tmp_path / "out"), *words)

@@ -40,6 +40,8 @@ SLIPS = [
         "give the sonar noise_level_db",
     ),
     ("render flat_floor --mirrors", "--mirrors needs the model coherent"),
+    ("render flat_floor --set bounces=4", "bounces: input should be less than or equal to 3"),
+    ("render flat_floor --model thesis --set bounces=2", "the model thesis knows one reflection"),
     ("render flat_floor --model coherent --noise low", "give the sonar noise_level_db"),
     ("crlb flat_floor --segments stabord", "did you mean starboard?"),
     ("crlb flat_floor --vary hight_m=2", "did you mean height_m?"),
@@ -148,7 +150,8 @@ def test_the_table_names_options_that_there_are() -> None:
 
     tree: Any = typer.main.get_command(application())
     for name, options in OPTIONS.items():
-        command = tree.commands["world"].get_command(None, "mesh") if name == "mesh" else tree.commands[name]
+        world = {"mesh": "mesh", "import_scene": "import"}.get(name)
+        command = tree.commands[name] if world is None else tree.commands["world"].get_command(None, world)
         there = {option for parameter in command.params for option in parameter.opts}
         assert {option for option in options.values() if option.startswith("--")} <= there, name
 

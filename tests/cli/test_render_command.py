@@ -406,3 +406,16 @@ def test_a_damaged_state_is_not_gone_on_with(scene: Path, tmp_path: Path) -> Non
     run(simulator, path, tmp_path / "run", outputs, origin={}, resume=True)
     run(simulator, path, tmp_path / "whole", outputs, origin={})
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "run").image, SonarFrames.load(tmp_path / "whole").image)
+
+
+def test_all_sensors_of_a_scene_in_one_run(mitsonar: Command, tmp_path: Path) -> None:
+    """Each has its folder; a finished run is resumed for nothing; wrong pairs of options are one sentence."""
+    second = SENSOR.replace('type="imaging_sonar"', 'type="imaging_sonar" id="down"').replace("0,3.57,0", "0,2,0")
+    (tmp_path / "two.xml").write_text(f'<scene version="3.0.0">{DEFAULT}{SENSOR}{second}{FLOOR}</scene>')
+    asked = ("render", tmp_path / "two.xml", "--all-sensors", "--frames", 2, "-o", tmp_path / "out")
+    done = mitsonar(*asked)
+    assert done.returncode == 0, done.stderr
+    assert len(SonarFrames.load(tmp_path / "out" / "down")) == len(SonarFrames.load(tmp_path / "out" / "sensor0")) == 2
+    assert mitsonar(*asked, "--resume").returncode == 0
+    refused(mitsonar(*asked), "kept as it is")
+    refused(mitsonar(*asked, "--sonar", "didson300", "--overwrite"), "--sonar names one sonar")

@@ -103,3 +103,32 @@ def test_masked_resets_and_wrong_arguments(simulator: Simulator) -> None:
             SonarEnv(simulator, **wrong)
     with pytest.raises(MitsonarError, match="num_envs"):
         SonarVectorEnv(simulator, num_envs=0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"strat": [0, 0, 2, 0, 0, 0]}, "no argument strat: did you mean start"),
+        ({"start": "here"}, "start is made of numbers"),
+        ({"start": [[1, 2], [3]]}, "start is made of numbers"),
+        ({"bounds": "wide"}, "bounds is made of numbers"),
+        ({"max_velocity": "fast"}, "max_velocity is made of numbers"),
+        ({"max_steps": "9"}, "whole number"),
+        ({"max_steps": 2.5}, "whole number"),
+        ({"observe": "image"}, "tuple of image"),
+        ({"observe": 3}, "tuple of image"),
+        ({"noise": "low"}, "noise is a NoiseModel"),
+    ],
+)
+def test_mistakes_are_answered_in_a_sentence(simulator: Simulator, wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(MitsonarError, match=said):
+        SonarEnv(simulator, **{"start": START, **wrong})
+
+
+def test_what_is_no_scene_is_refused(simulator: Simulator) -> None:
+    nothing: Any = None
+    with pytest.raises(MitsonarError, match="got NoneType"):
+        SonarEnv(nothing, SONAR, start=START)
+    count: Any = 2.0
+    with pytest.raises(MitsonarError, match="whole number in 1"):
+        SonarVectorEnv(simulator, num_envs=count)

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.ping_groups import group_of_beams, scanned, scans, timed_path
+from mitsonar.instruments.imaging_sonar import RAYS, Sonar
+from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.ping_groups import (
+    frame_period_s,
+    group_of_beams,
+    one_beam,
+    scanned,
+    scans,
+    timed_path,
+)
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
@@ -50,6 +58,20 @@ def test_sweeps_follow_one_another() -> None:
     assert timed.time_s.shape == (2, 400)
     np.testing.assert_allclose(np.diff(timed.time_s.ravel()), sweep / 400)
     np.testing.assert_allclose(timed.frames.time_s, (0.5 * sweep, 1.5 * sweep))
+
+
+def test_a_named_head_takes_seconds_a_sweep() -> None:
+    """Ping360, a head turned by 0.9 deg: 35 s a turn at 50 m, 9 s at 2 m by its page; by keys as by `scanned`."""
+    head = preset("ping360")
+    assert scans(head)
+    for range_max, turn in ((50.0, 35.0), (2.0, 9.0)):
+        assert frame_period_s(head.replace(range_max=range_max)) == pytest.approx(turn, rel=0.03)
+    assert frame_period_s(head) == pytest.approx(1 / head.frame_rate_hz, rel=2e-3)
+    made = scanned(one_beam(head), overhead_s=0.02)
+    assert made == head.replace(
+        frame_rate_hz=made.frame_rate_hz, beam_width_deg=made.beam_width_deg, **made.model_dump(include={*RAYS})
+    )
+    assert frame_period_s(Sonar(frame_rate_hz=8)) == 1 / 8
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drawn_frames import SONAR, START, as_zarr, over_ground, sway
-from helpers import files_of, tiny_recipe
+from helpers import files_of, lit_plane, tiny_recipe
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -25,6 +25,8 @@ from mitsonar.estimation.image.direct import Direct
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping import odometry_run
 from mitsonar.mapping.frame_source import FrameSource
+from mitsonar.mapping.graph_odometry import errors_along
+from mitsonar.mapping.loop_appearance import Canvas
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import bridged, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
@@ -143,6 +145,24 @@ def test_direct_finds_the_path_over_a_drawn_floor() -> None:
     assert (rmse < [6e-4, 3e-4, 3e-4]).all(), rmse
     assert found.pose_covariances is not None
     assert found.pose_covariances.shape == (16, 3, 3)
+
+
+def test_errors_over_relief_are_alike_and_those_over_even_ground_are_not() -> None:
+    """First echoes tell; where they do not, relief is assumed. A smoothed path counts errors as independent."""
+    found = odometry(over_ground(sway(16)), Direct())
+    assert found.correlated is not None
+    assert found.correlated.share == 0.9
+    even, _, _ = lit_plane(Sonar(range_min=2.0, range_max=7.0), 2.5, np.radians(35))
+    canvas = Canvas.of(even.select(np.array([0])))
+    assert canvas is not None
+    apart = replace(found, correlated=errors_along(found.series.motions, canvas))
+    assert apart.correlated is not None
+    assert apart.correlated.share == 0.0
+    staying, told = found.pose_covariances, apart.pose_covariances
+    assert staying is not None
+    assert told is not None
+    assert np.trace(staying[-1]) > 2 * np.trace(told[-1])
+    assert odometry(over_ground(sway(16)), Direct(), smooth="kalman").correlated is None
 
 
 def test_workers_change_no_bit() -> None:

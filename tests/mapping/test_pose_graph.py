@@ -66,6 +66,20 @@ def test_motions_alone_give_their_composition_and_its_covariance() -> None:
     np.testing.assert_allclose(found.motion_covariances(own, following), graph.chain.covariances, rtol=1e-6, atol=1e-12)
 
 
+def test_errors_that_are_alike_give_the_covariances_of_the_path_that_the_graph_has() -> None:
+    """Two routes to one number, with errors that wander and slopes; a path whose errors are alike drifts by far more."""
+    moved = square()
+    correlated = ErrorCorrelation().of(moved, 3.0)
+    own, _ = solved(replace(graph_of(moved), correlated=correlated)).covariances()
+    series = MotionSeries(moved, np.arange(45.0), graph_of(moved).chain.covariances)
+    told = pose_covariances(series, Pose(0, 0, 0), correlated=correlated)
+    np.testing.assert_allclose(told, own, rtol=1e-5, atol=1e-12)
+    independent = pose_covariances(series, Pose(0, 0, 0))
+    assert np.trace(told[-1]) > 4 * np.trace(independent[-1])
+    alone = pose_covariances(series, Pose(0, 0, 0), correlated=correlated, alone=np.ones(44, dtype=bool))
+    np.testing.assert_allclose(alone, independent, rtol=1e-9, atol=1e-15)
+
+
 def test_one_biased_edge_of_a_closed_square_is_shared_out_by_variance() -> None:
     """Along a line, a loop and n motions share an error by their variances; an exact loop closes the square."""
     moved = np.tile([0.0, 0.2, 0.0], (9, 1))

@@ -142,7 +142,7 @@ def test_without_a_sonar_one_number_stands_for_the_law(steep: Path) -> None:
     for name in ("steel", steep):
         loaded = scene(floor=floor(made_of(name)))
         np.testing.assert_allclose(reflectivity(loaded, down(50, 1.5), None), single_mu(material(name)), rtol=1e-6)
-        from mitsonar.plugins.surfaces import reflectivity_at
+        from mitsonar.plugins.bsdf_reflectance import reflectivity_at
 
         si = loaded.ray_intersect(down(50, 1.5))
         got = np.array(reflectivity_at(loaded.shapes()[0].bsdf(), si))

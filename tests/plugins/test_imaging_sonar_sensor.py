@@ -79,9 +79,11 @@ def test_properties_are_those_of_a_sonar() -> None:
         **{"speckle_patch_m": 0.2, "source_level_db": 210.0, "noise_level_db": 60.0, "absorption_db_per_m": 0.3},
         **{"temperature_c": 4.0, "salinity_psu": 0.5, "water_depth_m": 3.0, "ph": 7.0, "gain_absorption": True},
         **{
+            "bounces": 1,
             "ping_groups": 5,
             "group_order": "sequential",
             "group_interval_s": 0.004,
+            "group_overhead_s": 0.001,
             "volume_db": -70.0,
             "near_glow_db": 30.0,
             "near_glow_m": 0.4,
@@ -92,6 +94,7 @@ def test_properties_are_those_of_a_sonar() -> None:
     assert set(fields) == set(Sonar.model_fields) - {"name", "pulse_m"}  # the band says it
     loaded = mi.load_dict({"type": "imaging_sonar", **fields})
     assert loaded.sonar == Sonar(**fields)
+    assert mi.load_dict({"type": "imaging_sonar", "bounces": 3}).sonar == Sonar(bounces=3)
     assert mi.load_dict({"type": "imaging_sonar"}).sonar == Sonar()
 
 

@@ -13,6 +13,8 @@ from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator
 
 if TYPE_CHECKING:
+    import mitsuba as mi
+
     from mitsonar.simulation.scatterers import Scatterers
 
 C = 1500.0
@@ -27,6 +29,15 @@ def received_from(place: tuple[float, float, float] = (0, 0, 0), **field: Any) -
 
 def cells_floor(half: float = 14.0, cells: float = 512.0) -> dict[str, object]:
     return floor(diffuse({**CELLS, "cells": cells}), half)
+
+
+def unmerged(**shapes: Any) -> mi.Scene:
+    """A scene of these shapes, each with its own name: Mitsuba would merge rectangles and meshes."""
+    import mitsuba as mi
+
+    loaded = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    assert isinstance(loaded, mi.Scene)
+    return loaded
 
 
 def simulator(sonar: ChannelSonar, **shapes: Any) -> ChannelSimulator:

@@ -282,12 +282,33 @@ def test_a_launch_is_recorded_once_and_not_for_every_call(flat: mi.Scene) -> Non
     simulator = Simulator(flat, SMALL)
     for k in range(12):
         list(simulator.pings([Pose(k, 0, 2.5 + 0.01 * k, PITCH, 0, 0.3 * k)] * 2, first=7 * k))
-    (launch,) = simulator._launches.values()
-    recorded: Any = getattr(launch, "func", launch)
+    ((launch, _),) = simulator._launches.values()
+    recorded: Any = launch
     assert recorded.n_recordings == 1
     list(simulator.pings([POSE] * 3))
     list(simulator.pings([POSE] * 3, labels=True))
     assert len(simulator._launches) == 3
+
+
+def test_a_launch_that_cannot_be_replayed_is_recorded_anew(flat: mi.Scene) -> None:
+    """Dr.Jit refuses where other scenes came or went; here a stand-in refuses once."""
+    simulator = Simulator(flat, SMALL)
+    (before,) = simulator.pings([POSE])
+    ((key, (launch, rays)),) = simulator._launches.items()
+    recorded: Any = launch
+    left = ["registry entries"]
+
+    class Refusing:
+        clear = staticmethod(recorded.clear)
+
+        def __call__(self, *inputs: object) -> Any:
+            if left:
+                raise RuntimeError(left.pop())
+            return recorded(*inputs)
+
+    simulator._launches[key] = Refusing(), rays
+    (after,) = simulator.pings([POSE])
+    np.testing.assert_array_equal(before.levels, after.levels)
 
 
 def test_a_replayed_launch_gives_what_a_new_one_gives(flat: mi.Scene) -> None:

@@ -6,31 +6,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from helpers import MitsubaDict, box, diffuse, floor, plate, sphere
+from helpers import box, diffuse, floor, plate, separate, sphere
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.scene import load_scene
 
 if TYPE_CHECKING:
-    import mitsuba as mi
+    pass
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
 
 SONAR = Sonar.create(range_min=2, range_max=9, beams=12, azimuth_fov_deg=14, range_bins=256, quality="draft")
 COHERENT = SONAR.replace(model="coherent", frequency_hz=1.8e6, bearing="cone", azimuth_fov_deg=3.6, scatterers_per_cell=6)
 HERE = Pose(0, 0, 1.0, 0.1)
-
-
-def separate(**shapes: MitsubaDict) -> mi.Scene:
-    """A scene whose meshes stay apart."""
-    import mitsuba as mi
-
-    loaded = mi.load_dict({"type": "scene", **shapes}, optimize=False)
-    assert isinstance(loaded, mi.Scene)
-    return loaded
 
 
 def fixed(pose: Pose) -> Trajectory:
@@ -141,6 +133,11 @@ def test_steps_are_the_frames_of_a_run() -> None:
 def test_mistakes_are_told(moving: Any, said: str) -> None:
     with pytest.raises(MitsonarError, match=said):
         Simulator(separate(floor=floor(), wall=plate((0, 0, 0), (0, -1, 0))), SONAR, moving=moving)
+
+
+def test_scenes_with_instances_are_refused() -> None:
+    with pytest.raises(MitsonarError, match=r"without instances: got cannon, barrel, boat; give these as meshes"):
+        Simulator(load_scene("objects"), SONAR, moving={"sand": fixed(Pose(0, 0, 0))})
 
 
 def test_mirrors_are_refused() -> None:

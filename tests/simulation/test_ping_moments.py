@@ -102,6 +102,10 @@ def test_a_tank_that_is_scanned_under_way(changes: dict[str, Any], tolerance: fl
     expected = -y * np.cos(bearing) + np.sqrt(25 - (y * np.sin(bearing)) ** 2)
     np.testing.assert_allclose(measured(frames), expected, atol=tolerance)
     assert np.abs(expected - 5).max() > 0.5
+    assert frames.beam_poses is not None
+    for place, off in ((frames.beam_poses[0, :, 1], tolerance), (0.0, speed * sweep)):  # by the pose of each beam; by none
+        radius = np.hypot(measured(frames) * np.sin(bearing), place + measured(frames) * np.cos(bearing))
+        assert np.abs(radius - 5).max() == pytest.approx(off, abs=max(tolerance, 0.05 * off))
 
 
 def test_what_has_no_groups_is_refused() -> None:
@@ -110,5 +114,3 @@ def test_what_has_no_groups_is_refused() -> None:
         next(simulator.pings(np.zeros((1, 7, 6))))
     with pytest.raises(MitsonarError, match="one for each pose"):
         next(simulator.pings(np.zeros((2, 6)), time_s=[0.0]))
-    with pytest.raises(MitsonarError, match="mirrors are of still scenes"):
-        Simulator(wall(), COHERENT, mirrors={"wall": (0.5, 0.0)})

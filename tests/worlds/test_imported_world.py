@@ -181,6 +181,15 @@ def test_includes_in_a_circle_and_links_out_of_the_folder_are_refused(tmp_path: 
         imported_world(tmp_path / "harbour.sdf")
 
 
+def test_files_that_include_each_other_many_times_are_refused(tmp_path: Path) -> None:
+    for number in range(12):
+        inner = "".join(f"<include><uri>{number + 1}.sdf</uri><name>m{k}</name></include>" for k in range(10))
+        (tmp_path / f"{number}.sdf").write_text(f'<sdf version="1.9"><model name="m">{inner}</model></sdf>')
+    (tmp_path / "12.sdf").write_text('<sdf version="1.9"><model name="m"/></sdf>')
+    with pytest.raises(MitsonarError, match=r"more than 10,000 models"):
+        imported_world(tmp_path / "0.sdf")
+
+
 def test_models_elsewhere_need_the_search_path(tmp_path: Path) -> None:
     for folder in ("worlds", "models"):
         (tmp_path / folder).mkdir()

@@ -52,6 +52,14 @@ def test_stages_with_y_up_stand_upright_and_collision_shapes_may_be_hidden(tmp_p
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), 0.02, rtol=1e-6)
 
 
+def test_modules_beside_a_stage_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_usd(tmp_path)
+    (tmp_path / "json.py").write_text("open('ran', 'w').close()")
+    monkeypatch.chdir(tmp_path)
+    assert len(imported_world("stage.usda").meshes) == 2
+    assert not Path("ran").exists()
+
+
 @pytest.mark.thorough
 def test_a_prim_in_its_own_axes_holds_what_lies_below_it(tmp_path: Path) -> None:
     make_usd(tmp_path)

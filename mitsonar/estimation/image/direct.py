@@ -34,7 +34,7 @@ from mitsonar.estimation.image.direct_registration import Fit, Held, is_resolved
 from mitsonar.estimation.image.direct_relief import registered_over_relief
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.prior_gate import prior_rejection
-from mitsonar.geometry.attitude import Attitude, attitude_of
+from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
@@ -55,7 +55,11 @@ MODEL = 1.1
 With it they are 0.9 and 0.7 times the covariance on rocky fields without and with high noise."""
 
 FAR_MODEL = 3.0
-"""Squared errors over the covariance of the residuals where heights of blocks are estimated, measured on rocky fields."""
+"""Squared errors over the covariance of the residuals where heights of blocks are estimated, measured on rocky fields with
+cells of :data:`FAR_CELL`. Relief errs alike over an area of ground, whatever number of cells it fills."""
+
+FAR_CELL = 2.4e-5
+"""Area of those cells, as part of the squared height: 4.7 mm by 0.3 deg at 4.4 m, from 2.13 m."""
 
 SPECKLE_MODEL = 2.0
 """The same besides where beams and pulse spread: speckle is alike in neighbouring cells.
@@ -226,7 +230,10 @@ class Direct:
         found = registered_over_relief(task.images, task.frames, task.attitude, np.array(near))
         if found is None:
             return replace(rejected("nothing in the frames to match"), about={"start": named})
-        return self._judged(task, start, *found, FAR_MODEL, {"start": named})
+        # far motions match the ground between rocks, too: rocks look different from elsewhere
+        std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m))
+        unsure = replace(task, attitude=replace(task.attitude, height_std_m=std))
+        return self._judged(unsure, start, *found, _far_model(task.frames, task.attitude.height_m), {"start": named})
 
     def _judged(
         self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, model: float, about: dict[str, object]
@@ -240,9 +247,19 @@ class Direct:
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
         if fit.excess != UNMEASURED:
             about["stands_out"] = stands_out(fit.independent, fit.excess)
-        if task.attitude.by_echoes and self.relief_m is None:
-            about["height_std_m"] = task.attitude.height_std_m
+        if task.attitude.first is not None:
+            told_m = task.attitude.first.height_m  # over ground that rises the motion has another one
+            about |= {"height_m": told_m, "height_std_m": STD_MEASURED * told_m}
         return Estimate(motion, covariance, not reason, reason, about)
+
+
+def _far_model(frames: SonarFrames, height_m: float) -> float:
+    """Return :data:`FAR_MODEL`, times the number of cells that share the area of one of its own."""
+    if frames.sonar.beam_pattern != "box":
+        return FAR_MODEL  # where beams and pulse spread, SPECKLE_MODEL counts cells that are alike
+    bin_m, beam_rad = (float(np.median(np.diff(axis))) for axis in (frames.range_m, frames.bearing_rad))
+    area = bin_m * beam_rad * float(frames.range_m[[0, -1]].mean()) / height_m**2
+    return FAR_MODEL * max(1.0, FAR_CELL / area)
 
 
 def is_far(motion: Motion, height_m: float) -> bool:

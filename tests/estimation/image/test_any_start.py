@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.image import direct
 from mitsonar.estimation.image.direct import Direct, is_far
 from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.estimation.prior_gate import prior_rejection
+from mitsonar.geometry.attitude import attitude_of
+from mitsonar.geometry.echo_heights import FirstEchoes
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.motion_prior import MotionPrior
@@ -172,3 +177,40 @@ def test_sums_over_blocks_and_values_on_cells() -> None:
     cells = on_cells(middles, (12, 8), (4, 2))
     plane = np.add.outer(np.arange(12.0), 2.0 * np.arange(8))
     assert np.allclose(cells[2:10, 1:7], plane[2:10, 1:7], atol=1e-4)
+
+
+# ---------------------------------------------------------------- certainty over relief
+
+
+@pytest.mark.usefixtures("variant")
+def test_far_covariances_know_the_relief_of_the_first_echoes(far: SonarFrames, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Contrast 0.1 m above the first echoes adds 0.1 m to the height's standard deviation: variances add, motions stay."""
+    covariances, motion = [], []
+    for tops_m in (0.0, 0.05, 0.1):
+        told = replace(attitude_of(far, "direct", None, None), first=FirstEchoes(2.2, tops_m, False))
+        monkeypatch.setattr(direct, "attitude_of", lambda *_, told=told: told)
+        found = Direct().estimate(far, expected(FAR, mm=10, deg=0.3))
+        assert found.covariance is not None
+        covariances.append(found.covariance)
+        motion.append(found.motion)
+    assert motion[0] == motion[1] == motion[2]
+    np.testing.assert_allclose(covariances[2] - covariances[0], 4 * (covariances[1] - covariances[0]), rtol=1e-6)
+    assert covariances[2][1, 1] > 2 * covariances[0][1, 1]
+
+
+def test_small_cells_count_by_their_area(far: SonarFrames) -> None:
+    """The cells of a DIDSON count one by one; half as large ones count half, larger ones and those of spread beams whole."""
+    height_m = 2.13
+    coarse = direct._far_model(far, height_m)
+    assert coarse == pytest.approx(direct.FAR_MODEL, rel=0.02)
+    middles = (far.range_m[1:] + far.range_m[:-1]) / 2
+    finer = changed(far, range_m=np.sort(np.append(far.range_m, middles)), image=np.repeat(far.image, 2, axis=1)[:, 1:])
+    assert direct._far_model(finer, height_m) == pytest.approx(2 * coarse, rel=0.02)
+    assert direct._far_model(changed(far, image=far.image[:, ::2], range_m=far.range_m[::2]), height_m) == direct.FAR_MODEL
+    spread = changed(finer, sonar=far.sonar.replace(model="physical", pattern="two_way"))
+    assert direct._far_model(spread, height_m) == direct.FAR_MODEL
+
+
+def changed(frames: SonarFrames, **fields: object) -> SonarFrames:
+    """The frames with some fields replaced."""
+    return SonarFrames(**{**vars(frames), **fields})

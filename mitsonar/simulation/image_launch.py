@@ -1,0 +1,101 @@
+"""The fused launch of the models ``physical`` and ``thesis``: rays, echoes, views, sums of many pings in one kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.views import View
+from mitsonar.plugins.imaging_sonar_sensor import Fan
+from mitsonar.records.echoes import Echoes
+from mitsonar.simulation.binning import accumulate, develop, strongest
+from mitsonar.simulation.bounce_sums import BounceSums
+from mitsonar.simulation.device_arrays import DeviceArray
+from mitsonar.simulation.elevation_pattern import elevation_gain
+from mitsonar.simulation.tracing import Rays, Tracer
+from mitsonar.simulation.view_echoes import ViewEchoes, ViewTracer
+
+__all__ = ["ImageLaunch"]
+
+
+@dataclass(frozen=True)
+class ImageLaunch:
+    """Compile launches of so many pings.
+
+    Attributes:
+        tracer: of the rays.
+        views: of the images, and ``view_tracers`` of each.
+        formed: the sonar whose pattern over elevation weighs the echoes; None: none does.
+        bounces: sums the paths of several reflections; None: there is one.
+    """
+
+    tracer: Tracer
+    views: Sequence[View]
+    view_tracers: Sequence[ViewTracer]
+    formed: Sonar | None
+    bounces: BounceSums | None
+
+    def compiled(self, pings: int, labels: bool) -> tuple[Callable[..., Any], DeviceArray]:
+        """Compile the launch; also return its first input, the numbers of the rays.
+
+        It is traced once and then replayed (``dr.freeze``): a single ping costs its rays, not Python. It takes these
+        numbers, scene, rows of poses, keys of the jitter, tables of surfaces, of the views and of mirrors. It returns
+        heights, and of each view the levels, counters, truth for labels, and the levels of one reflection where labels go by
+        these.
+        """
+        tracer, bounces = self.tracer, self.bounces
+
+        @dr.freeze
+        def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any, mirrors: Any) -> Any:
+            rays = Rays(tracer.sonar, index)
+            ray, fan = tracer.rays_of(rays, rows, keys)
+            echoes = tracer.echoes(scene, ray, fan, surfaces)
+            more = None
+            if bounces is not None:
+                echoes, reflection = bounces.scattered(echoes, mirrors)
+                key = dr.gather(mi.UInt32, keys, rays.ping) if tracer.sonar.jittered else mi.UInt32(tracer.sensor.key(0))
+                lines = [dr.gather(mi.Vector4f, rows, rays.moment * 3 + axis) for axis in range(3)]
+                seen = fan, echoes, reflection
+                known = replace(tracer.surfaces, **surfaces)
+                more = bounces.sums(scene, known, rays, lines, seen, key, mirrors, pings)
+            looks = self._looks(scene, rays, fan, echoes, tables)
+            sums = [accumulate(seen, rays.ping, pings, own) for seen, own in zip(looks, self.view_tracers, strict=True)]
+            truths = [
+                self._truth(seen, rays, pings, view) if labels else None
+                for seen, view in zip(looks, self.views, strict=True)
+            ]
+            # all that reads the echoes in one kernel, before any sum is read: rays are traced once
+            dr.eval(sums, more, truths)
+            made: list[tuple[Any, ...]] = []
+            for total, own, truth in zip(sums, self.view_tracers, truths, strict=True):
+                first = develop(total, pings, own)
+                if more is None:
+                    made.append((*first, truth, None))
+                else:
+                    assert bounces is not None
+                    joined = develop(total, pings, own, (more, bounces.tracer.bits))
+                    made.append((*joined, truth, first[0] if labels else None))
+            return tracer.height_m(scene, rows), made
+
+        return launch, Rays.numbered(tracer.sonar, pings)
+
+    def _looks(self, scene: Any, rays: Rays, fan: Fan, echoes: Echoes, tables: Sequence[DeviceArray]) -> list[ViewEchoes]:
+        """Return the echoes of each view."""
+        if self.formed is not None:
+            gain = dr.square(elevation_gain(self.formed, dr.tan(fan.elevation)))
+            echoes = replace(echoes, reflectivity=echoes.reflectivity * gain)
+        return [
+            tracer.view_echoes(scene, rays, fan, echoes, table)
+            for tracer, table in zip(self.view_tracers, tables, strict=True)
+        ]
+
+    @staticmethod
+    def _truth(seen: ViewEchoes, rays: Rays, pings: int, view: View) -> tuple[DeviceArray, ...]:
+        """Return what labels are made of."""
+        best = strongest(seen, rays.ping, rays.ray, pings, view)
+        return best, seen.elevation, seen.echoes.shape_id, seen.echoes.object_id

@@ -1,0 +1,223 @@
+"""Paths without a scatterer: from transmitter to receiver directly, by planes, and by the facets of waves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
+from mitsonar.simulation.channel_tracing import ChannelTracer, EchoValues
+from mitsonar.simulation.device_arrays import DeviceArray, padded
+from mitsonar.simulation.facet_integral import facet_echoes, half_fresnel_m
+from mitsonar.simulation.image_sources import ROW, MirrorWay, mirror_ways
+from mitsonar.simulation.link_geometry import ScatteringPoints, link_table
+from mitsonar.simulation.mirror_planes import MirrorFacets
+from mitsonar.simulation.mirrored_link import PlaneRow, unfolded
+from mitsonar.simulation.nonuniform_fft import phasors
+from mitsonar.simulation.propagation_delay import delay_exact
+from mitsonar.simulation.tracing import hidden
+from mitsonar.simulation.variant import replayed
+
+__all__ = ["APART_M", "MirrorPaths"]
+
+APART_M = 1e-3
+"""A receiver nearer to the transmitter than this has no direct arrival [m]."""
+
+
+class MirrorPaths:
+    """Find the paths of one ping that no scatterer takes part in.
+
+    The pressure falls as that of a point source whose pressure at 1 m is 1: ``V / r`` for the length r of the path and the
+    product V of the reflection coefficients. Waves are summed by :mod:`mitsonar.simulation.facet_integral`.
+
+    Args:
+        tracer: of the scatterers; gives scene, instrument and mirrors.
+
+    Attributes:
+        names: of the ways: ``direct``, the names of the planes as ``surface-seabed``, the names of the waves.
+        notes: what a user should know about mirrors.
+    """
+
+    def __init__(self, tracer: ChannelTracer) -> None:
+        self.scene, self.sonar, self.registry = tracer.scene, tracer.sonar, tracer.registry
+        self.facets = tracer.flat.facets
+        lengths = range(0 if self.sonar.direct else 1, self.sonar.bounces + 1)
+        planes = tracer.flat.reflecting
+        self.ways = {length: ways for length in lengths if (ways := mirror_ways(planes(length), length))}
+        self.names = [way.name or "direct" for ways in self.ways.values() for way in ways]
+        self.names += [mirror.name for mirror in self.facets]
+        self.wavenumber = 2 * math.pi / self.sonar.wavelength_m
+        self.launches: dict[int, Callable[..., list[DeviceArray]]] = {}
+        self.shadows = _compile_shadows()
+        self.notes: list[str] = []
+
+    def trace(
+        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, wanted: Sequence[str]
+    ) -> list[EchoValues]:
+        """Return the paths of one ping at one receiver: values of an echo batch, a list entry for each of :attr:`names`.
+
+        Args:
+            pose: of the transmitter ``(6,)`` [m, rad].
+            velocity: of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
+            receiver: its index.
+            wanted: names of the values.
+        """
+        table = link_table(self.sonar, receiver, pose, velocity)
+        found = [part for length, ways in self.ways.items() for part in self._by_planes(table, receiver, length, ways)]
+        found += [self._by_facets(table, receiver, mirror) for mirror in self.facets]
+        return [{name: part[name] for name in wanted} for part in found]
+
+    def _by_planes(self, table: NDArray[np.float64], receiver: int, length: int, ways: list[MirrorWay]) -> list[EchoValues]:
+        """Return the path of each way of ``length`` planes."""
+        sent_from, heard_at = table[0:3], table[3:6]
+        image = np.array([way.images(sent_from)[-1] for way in ways])
+        rows = np.array([way.rows(sent_from, self.registry) for way in ways])
+        is_open, factor = self._open(image, heard_at, rows, length)
+        way = image - heard_at
+        distance = np.linalg.norm(way, axis=1)
+        apart = distance > APART_M
+        u = way / np.where(apart, distance, 1)[:, None]
+        # in the axes of the transmitter itself, which sends as its image does
+        departed = np.einsum("nij,ni->nj", np.array([one.turn for one in ways]), -u)
+        valid = is_open & apart
+        delay = delay_exact(np.zeros(way.T.shape), way.T, table[9:12, None], self.sonar.sound_speed)
+        amplitude = factor * self._sensitivity(table, receiver, departed, u)
+        if self.sonar.spreads:
+            amplitude = amplitude / np.where(apart, distance, 1)
+        doppler = (departed @ table[6:9] + u @ table[9:12]) / self.sonar.wavelength_m
+        return [
+            echo_values(self.sonar, delay[k : k + 1], amplitude[k : k + 1], doppler[k : k + 1], valid[k : k + 1])
+            for k in range(len(ways))
+        ]
+
+    def _sensitivity(
+        self, table: NDArray[np.float64], receiver: int, departed: NDArray[np.float64], u: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the sensitivity of transmitter and receiver together ``(n,)``, given unit directions from each."""
+        listens, sends = self.sonar.receivers[receiver].field, self.sonar.transmitter
+        heard = listens.sensitivity(*(table[12:21].reshape(3, 3) @ u.T))
+        return np.asarray(heard * sends.sensitivity(*(table[21:30].reshape(3, 3) @ departed.T)), dtype=float)
+
+    def _open(
+        self, image: NDArray[np.float64], heard_at: NDArray[np.float64], rows: NDArray[np.float64], length: int
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Return which ways nothing blocks ``(n,)``, and their reflection coefficients ``(n,)``."""
+        if length not in self.launches:
+            self.launches[length] = _compile_open(length, self.wavenumber)
+        inputs = [np.broadcast_to(heard_at, image.shape), image, rows.reshape(len(image), -1)]
+        table = np.concatenate(inputs, axis=1)
+        columns = mi.UInt32(padded(np.arange(len(image), dtype=np.uint32))), mi.Float64(padded(table.ravel()))
+        seen, factor = replayed(self.launches[length], *columns, self.scene)
+        return np.broadcast_to(np.array(seen), len(image)), np.broadcast_to(np.array(factor, dtype=float), len(image))
+
+    def _by_facets(self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets) -> EchoValues:
+        """Return the echoes of the facets of a mirror that is not flat, those of one reflection."""
+        found = facet_echoes(mirror, table[0:3], table[3:6], table[9:12], self.sonar.carrier_hz, self.sonar.sound_speed)
+        self._tell(mirror, table)
+        valid = found.lit & self._lit(mirror, table)
+        amplitude = found.amplitude * self._sensitivity(table, receiver, found.sent, found.received)
+        if not self.sonar.spreads:
+            amplitude = amplitude * found.length
+        doppler = (found.sent @ table[6:9] + found.received @ table[9:12]) / self.sonar.wavelength_m
+        return echo_values(self.sonar, found.delay, amplitude, doppler, valid)
+
+    def _lit(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which facets both transmitter and receiver see ``(facets,)``."""
+        middle = mirror.corners.mean(axis=1)
+        normal = np.cross(mirror.corners[:, 1] - mirror.corners[:, 0], mirror.corners[:, 2] - mirror.corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-30)[:, None]
+        places = (np.broadcast_to(table[start : start + 3], middle.shape) for start in (0, 3))
+        inputs = (middle, normal, *places)
+        number = mi.UInt32(padded(np.arange(len(middle), dtype=np.uint32)))
+        numbers = mi.Float(padded(np.concatenate(inputs, axis=1, dtype=np.float32).ravel()))
+        return np.broadcast_to(np.array(replayed(self.shadows, number, numbers, self.scene)), len(middle))
+
+    def _tell(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
+        """Note once where facets are too large for the integral."""
+        largest, allowed = half_fresnel_m(mirror, table[0:3], table[3:6], self.sonar.wavelength_m)
+        if largest > allowed and not self.notes:
+            self.notes.append(
+                f"the facets of the mirror {mirror.name} are {largest:.2g} m long where its echo comes from, more than half "
+                f"the Fresnel radius, {allowed:.2g} m: they shine as a polyhedron; give it a finer mesh"
+            )
+
+
+def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceArray]]:
+    """Record the launch that follows ways by ``length`` planes from a receiver to the transmitter."""
+
+    @dr.freeze
+    def launch(number: mi.UInt32, table: mi.Float64, scene: mi.Scene) -> list[DeviceArray]:
+        columns = _columns(mi.Float64, table, number, 6 + (ROW + 1) * length)
+        at = columns[:3]
+        point = ScatteringPoints(mi.Point3f(*at), at, mi.Normal3f(0, 0, 0))
+        rows = [PlaneRow.of(columns[6 + (ROW + 1) * k : 6 + (ROW + 1) * (k + 1)]) for k in range(length)]
+        seen, factor = unfolded(scene, point, columns[3:6], rows, wavenumber, mi.Bool(True))
+        dr.eval(seen, factor)
+        return [seen, factor]
+
+    return launch
+
+
+def _columns(kind: Any, table: DeviceArray, number: mi.UInt32, count: int) -> list[DeviceArray]:
+    """Return the columns of a table of ``count`` of them.
+
+    One array, since a frozen launch is recorded anew for each alignment of each of its inputs.
+    """
+    return [dr.gather(kind, table, number * count + k) for k in range(count)]
+
+
+def _compile_shadows() -> Callable[..., DeviceArray]:
+    """Record the launch that tests which facets two places see."""
+
+    @dr.freeze
+    def launch(number: mi.UInt32, table: mi.Float, scene: mi.Scene) -> DeviceArray:
+        columns = _columns(mi.Float, table, number, 12)
+        at, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:6])
+        seen = mi.Bool(True)
+        for start in (6, 9):
+            place = mi.Point3f(*columns[start : start + 3])
+            way = at - place
+            distance = dr.norm(way)
+            seen = seen & ~hidden(scene, at, normal, way / distance, distance, seen)
+        dr.eval(seen)
+        return seen
+
+    return launch
+
+
+def echo_values(
+    sonar: ChannelSonar,
+    delay: NDArray[np.float64],
+    amplitude: NDArray[np.inexact],
+    doppler: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+) -> EchoValues:
+    """Return echoes in NumPy as :class:`~mitsonar.simulation.link_geometry.EchoBatch` has them on the device.
+
+    Args:
+        sonar: the instrument.
+        delay: ``(n,)`` [s].
+        amplitude: real or complex, before the carrier's phase ``(n,)``.
+        doppler: ``(n,)`` [Hz].
+        valid: which echoes there are ``(n,)``; those of amplitude 0 are none.
+    """
+    valid = valid & (np.abs(amplitude) > 0)
+    beyond = valid & (delay > 2 * sonar.range_max / sonar.sound_speed)
+    turn, strength = phasors(delay, amplitude, sonar, PADDING)
+    return {
+        "delay": delay,
+        "amplitude": np.abs(amplitude),
+        "phase": np.angle(amplitude),
+        "doppler": doppler,
+        "counts": valid & ~beyond,
+        "beyond": beyond,
+        "turn": turn,
+        "real": strength.real,
+        "imag": strength.imag,
+    }

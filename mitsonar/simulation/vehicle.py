@@ -1,0 +1,192 @@
+"""A vehicle with several sonars, hydrophones and cameras along one path, in one scene at the same times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, Union
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.config.vehicle_recipe import SensorKeys, check_sensor_name, load_vehicle_recipe
+from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar, sonar_from
+from mitsonar.instruments.named_sounders import load_sounder
+from mitsonar.instruments.sounder import Sounder
+from mitsonar.motion.moving_bodies import Moving, MovingBodies
+from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.records.echogram import Echogram
+from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.soundings import Soundings
+from mitsonar.simulation.channel import ChannelSimulator
+from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.moving_files import Said, motions_of
+from mitsonar.simulation.sounding import SounderSimulator
+from mitsonar.simulation.variant import ensure_variant
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["Mounted", "Record", "VehicleFile", "VehicleSimulator", "load_vehicle", "sensors_in"]
+
+Instrument: TypeAlias = Union[Sonar, Sounder, ChannelSonar, "mi.Sensor"]
+"""What is mounted; a sensor of Mitsuba is a camera."""
+
+Record: TypeAlias = SonarFrames | Echogram | Soundings | ImpulseResponses | NDArray[np.uint8]
+"""What a sensor brings back; of a camera pictures ``(frames, height, width)``, in colour with a last axis of 3."""
+
+MIDDLE = Pose(0, 0, 0)
+
+FARTHEST_M = 100.0
+"""Largest distance of a sensor from its vehicle [m]: beyond, the scene shows another place than the path begins at."""
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A sensor and its pose in the vehicle's axes (starboard, forward, up)."""
+
+    instrument: Instrument
+    mount: Pose = MIDDLE
+
+    def path(self, vehicle: Trajectory) -> Trajectory:
+        """Return the path of the sensor for that of the vehicle."""
+        return Trajectory(mounted(vehicle.poses, self.mount), vehicle.time_s)
+
+
+class VehicleFile(NamedTuple):
+    """Sensors of a vehicle by name, and what its file says of bodies that move."""
+
+    sensors: dict[str, Mounted]
+    said: list[Said]
+
+
+class VehicleSimulator:
+    """Simulates all sensors of a vehicle, each for itself: sonars do not hear each other.
+
+    Args:
+        scene: a Mitsuba scene.
+        sensors: by name; default: the scene's own, see :func:`sensors_in`.
+        moving: trajectories of bodies, as of :class:`mitsonar.Simulator`; ``vehicle`` stands for the path.
+
+    Raises:
+        MitsonarError: a scene without sensors.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, sensors: Mapping[str, Mounted] | None = None, *, moving: Moving | None = None
+    ) -> None:
+        self.scene, self._sensors = scene, sensors
+        self.moving = motions_of(scene) if moving is None else moving
+
+    def sensors(self, vehicle: Trajectory) -> Mapping[str, Mounted]:
+        """Return the sensors by name; those of the scene stand in it as at the path's first pose."""
+        return sensors_in(self.scene, Pose(*vehicle.poses[0])) if self._sensors is None else self._sensors
+
+    def bodies(self, vehicle: Trajectory) -> MovingBodies:
+        """Return the bodies that move while the vehicle flies a path.
+
+        Raises:
+            MitsonarError: a body moves and a sensor's records are of still scenes.
+        """
+        found = MovingBodies.of(self.moving, vehicle=vehicle)
+        listens = [name for name, one in self.sensors(vehicle).items() if isinstance(one.instrument, ChannelSonar)]
+        if len(found) and listens:
+            raise MitsonarError(
+                f"impulse responses are of still scenes: {found.shapes[0]} moves and {listens[0]} listens; leave one out"
+            )
+        return found
+
+    def render(self, vehicle: Trajectory, *, labels: bool = False) -> dict[str, Record]:
+        """Render all sensors into memory: frames, soundings, responses, pictures by the names of the sensors.
+
+        Args:
+            vehicle: poses and times; each sensor pings at each of these, a head that turns sweeps as often as it can.
+            labels: per-pixel truth of imaging sonars as well.
+        """
+        bodies = self.bodies(vehicle)
+        return {name: self._record(one, vehicle, bodies, labels) for name, one in self.sensors(vehicle).items()}
+
+    def _record(self, one: Mounted, vehicle: Trajectory, bodies: MovingBodies, labels: bool) -> Record:
+        path, instrument = one.path(vehicle), one.instrument
+        if isinstance(instrument, Sonar):
+            return Simulator(self.scene, instrument, moving=bodies).render(path, labels=labels)
+        if isinstance(instrument, Sounder):
+            sounder = SounderSimulator(self.scene, instrument, moving=bodies)
+            return sounder.echogram(path) if instrument.kind == "sidescan" else sounder.soundings(path)
+        if isinstance(instrument, ChannelSonar):
+            return ChannelSimulator(self.scene, instrument).responses(path)
+        from mitsonar.simulation.camera import CameraSimulator
+
+        return np.stack(list(CameraSimulator(self.scene, instrument, moving=bodies).pictures(path.poses, path.time_s)))
+
+
+def sensors_in(scene: mi.Scene, vehicle: Pose) -> dict[str, Mounted]:
+    """Return the sensors of a scene by id, mounted as the scene shows them on a vehicle at a pose.
+
+    Raises:
+        MitsonarError: no sensors; two of one id; a sensor that is far from the vehicle, or scaled.
+    """
+    from mitsonar.plugins.channel_sonar_sensor import is_channel_sonar
+    from mitsonar.plugins.imaging_sonar_sensor import is_imaging_sonar
+
+    found: dict[str, Mounted] = {}
+    for number, sensor in enumerate(scene.sensors()):
+        name = sensor.id() or f"sensor{number}"
+        check_sensor_name(name)
+        if name in found:
+            raise MitsonarError(f"two sensors of the scene have the id {name}: give each its own")
+        place = pose_from_to_world(np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4))
+        away = math.dist(place[:3], vehicle[:3])
+        if away > FARTHEST_M:
+            raise MitsonarError(
+                f"the sensor {name} is {away:.3g} m from the path's first pose: the scene must show the vehicle there; move "
+                "the sensors, or the path"
+            )
+        own: Any = sensor
+        sonar = is_imaging_sonar(sensor) or is_channel_sonar(sensor)
+        found[name] = Mounted(own.sonar if sonar else sensor, mount_between(vehicle, place))
+    if not found:
+        raise MitsonarError("the scene has no sensors: add some, or give a vehicle's file")
+    return found
+
+
+def load_vehicle(file: str | Path) -> VehicleFile:
+    """Read the sensors of a vehicle and the motions of bodies from a YAML file; paths are relative to its folder.
+
+    Raises:
+        MitsonarError: unreadable, wrong keys, unknown presets.
+    """
+    recipe, folder = load_vehicle_recipe(file), Path(file).parent
+    sensors = {}
+    for name, keys in recipe.sensors.items():
+        sensors[name] = Mounted(_instrument(keys, folder, name), Pose.from_degrees(keys.mount))
+    return VehicleFile(sensors, [Said(name, motion, [folder]) for name, motion in recipe.moving.items()])
+
+
+def _instrument(keys: SensorKeys, folder: Path, name: str) -> Instrument:
+    """Return the instrument that the keys of a sensor say."""
+    if isinstance(keys.sonar, dict):
+        return sonar_from({"name": name, **keys.sonar})
+    if keys.sonar is not None:
+        return load_sonar(_file(keys.sonar, folder))
+    if keys.instrument is not None:
+        return load_sounder(_file(keys.instrument, folder))
+    if keys.hydrophones is not None:
+        return ChannelSonar.create(**{"name": name, **keys.hydrophones})
+    assert keys.camera is not None
+    ensure_variant()
+    from mitsonar.simulation.camera import camera_of
+
+    return camera_of(keys.camera.fov_deg, keys.camera.width, keys.camera.height, keys.camera.samples)
+
+
+def _file(name: str, folder: Path) -> str:
+    """Return the path of a YAML file beside the vehicle's, or a name as it is."""
+    return str(folder / name) if name.lower().endswith((".yaml", ".yml")) else name

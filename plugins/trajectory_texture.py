@@ -1,0 +1,58 @@
+"""The texture ``trajectory``, by which a shape of a scene says where it moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from mitsonar.plugins.hashed_texture import number_of_property
+
+__all__ = ["MOTION", "TrajectoryTexture"]
+
+MOTION = "motion"
+"""Name of the texture in a shape."""
+
+
+class TrajectoryTexture(mi.Texture):
+    """The path of the shape that holds it, under the name ``motion``. It has no colour; sonars and cameras follow it.
+
+    Properties: ``filename``: a TUM or CSV file, several as ``school/*.tum`` (the shape in several places), or ``vehicle``:
+    the path that is flown; ``frame`` [mitsonar]: convention of the file, or ros-enu or ned; ``meshes``: PLY files of a mesh
+    that deforms, ``fish/*.ply``, as many vertices each as the shape; ``rate_hz`` [10]: meshes a second; ``loop`` [true].
+    Paths are relative to the folder of the scene's file. At pose 0 the shape lies where the scene has it
+    (docs/guides/moving.md). Mitsuba alone renders the shape there.
+
+    .. code-block:: xml
+
+        <shape type="ply" id="fish">
+            <string name="filename" value="fish.ply"/>
+            <texture type="trajectory" name="motion"><string name="filename" value="fish.tum"/></texture>
+        </shape>
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.fields: dict[str, Any] = {"rate_hz": number_of_property(props, "rate_hz", 10.0)}
+        self.fields |= {"loop": bool(props.get("loop", True)), "frame": str(props.get("frame", "mitsonar"))}
+        for name, key in (("filename", "path"), ("meshes", "meshes")):
+            if name in props:
+                self.fields[key] = str(props[name])
+        self.folders = [Path(str(folder)) for folder in _resolver()]
+
+    def to_string(self) -> str:
+        """Return one line for Mitsuba's logs."""
+        return f"Trajectory[{self.fields}]"
+
+    def mean(self) -> Any:
+        """Return 0: it has no colour."""
+        return mi.Float(0)
+
+
+def _resolver() -> Any:
+    resolver: Any = mi.file_resolver  # its types lack the paths
+    return resolver()
+
+
+mi.register_texture("trajectory", TrajectoryTexture)

@@ -1,0 +1,58 @@
+"""What a network's covariances know of the height: closed forms by the geometry at two heights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import lit_plane
+
+from mitsonar.datasets.ground_nodes import ground_at
+from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.geometry.attitude import STD_MEASURED, Attitude
+from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.composition import Motion
+
+pytest.importorskip("torch")
+image_network = pytest.importorskip("mitsonar.estimation.learned.image_network")
+
+pytestmark = [pytest.mark.learn, pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]
+
+HEIGHT_M, PITCH_RAD = 2.5, np.radians(35)
+SONAR = Sonar(range_bins=256)
+MOTION = Motion(0.02, -0.012, np.radians(0.4))
+
+
+def test_other_heights_explain_the_same_shifts_by_other_motions() -> None:
+    """Shifts from one height, solved at heights 1 % lower and higher, by least squares over all nodes."""
+    low, here, high = (
+        ground_at(SONAR.range_m, SONAR.bearing_rad, "azimuth", part * HEIGHT_M, PITCH_RAD) for part in (0.99, 1.0, 1.01)
+    )
+    shifts = np.tensordot(np.array(MOTION), here["derivative"], axes=(0, 1)).ravel()
+    lower, higher = (
+        np.linalg.lstsq(np.moveaxis(one["derivative"], 1, -1).reshape(-1, 3), shifts, rcond=None)[0] for one in (low, high)
+    )
+    found = image_network._by_height(image_network._batch(here), MOTION)
+    np.testing.assert_allclose(found, (higher - lower) / 0.02, rtol=0.02, atol=1e-5)
+    assert found[1] / MOTION.forward > 0.2, "a sonar that looks down by 35 deg scales forward motions by the height"
+
+
+def test_heights_less_certain_than_in_training_join_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Variances add: what is beyond training is twice as much at the root of 7 times its standard deviation as at twice."""
+    frames, _, _ = lit_plane(Sonar(), HEIGHT_M, PITCH_RAD)
+    frames = replace(frames, image=np.stack([frames.image[0], np.roll(frames.image[0], -3, axis=0)]))
+    found = []
+    for part in (1.0, 2.0, 7**0.5):
+        told = Attitude(HEIGHT_M, part * STD_MEASURED * HEIGHT_M, PITCH_RAD)
+        monkeypatch.setattr(image_network, "attitude_of", lambda *_, told=told: told)
+        found.append(create_estimator("corrnet").estimate(frames))
+    as_trained, twice, more = (one.covariance for one in found)
+    assert as_trained is not None
+    assert twice is not None
+    assert more is not None
+    assert found[0].motion == found[1].motion == found[2].motion
+    np.testing.assert_allclose(more - as_trained, 2 * (twice - as_trained), rtol=1e-6)
+    assert np.linalg.matrix_rank(twice - as_trained, tol=1e-6 * np.abs(twice - as_trained).max()) == 1
+    by_forward = abs(found[0].motion.forward) * 0.2 * STD_MEASURED
+    assert twice[1, 1] - as_trained[1, 1] > 3 * by_forward**2
