@@ -17,6 +17,7 @@ __all__ = [
     "WRAPPERS",
     "by_vertex",
     "constant_on_facets",
+    "is_black",
     "kinds_and_textures",
     "one_number",
     "reflectances_of",
@@ -95,6 +96,14 @@ def constant_on_facets(texture: mi.Object) -> bool:
     """Return whether a texture has one value on each facet."""
     name = texture.class_name()
     return name == "UniformSpectrum" or (name == "MeshAttribute" and 'name = "face_' in str(texture))
+
+
+def is_black(bsdf: mi.BSDF) -> bool:
+    """Return whether a BSDF is diffuse and reflects nothing anywhere."""
+    kinds, textures = kinds_and_textures(bsdf)
+    if kinds != {"SmoothDiffuse"} or any(texture.class_name() != "UniformSpectrum" for texture in textures):
+        return False
+    return float(reflectivity_at(bsdf, dr.zeros(mi.SurfaceInteraction3f))[0]) == 0
 
 
 def by_vertex(texture: mi.Object) -> bool:

@@ -12,15 +12,16 @@ from typing import Literal, Self, TypeVar
 from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
 
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
-from mitsonar.config.recipe_parts import Flight, Mount, ReceiverSpec, RecipePart, Recorded, Scenes, Split
+from mitsonar.config.recipe_parts import Flight, MirrorKeys, Mount, ReceiverSpec, RecipePart, Recorded, Scenes, Split
 from mitsonar.errors import MitsonarError, complaint, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.mirror_rules import check_channel_mirrors, check_image_mirrors
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
 from mitsonar.io.provenance import digest
 from mitsonar.worlds.families import create_family
-from mitsonar.worlds.world import Family
+from mitsonar.worlds.world import BuiltFamily, Family
 
 __all__ = [
     "Flight",
@@ -35,6 +36,9 @@ __all__ = [
 ]
 
 _Made = TypeVar("_Made", bound=RecipePart)
+
+ADDED = ("recorded", "mirrors", "bodies")
+"""Keys that are not written where they are null or empty."""
 
 
 class Recipe(RecipePart):
@@ -70,11 +74,17 @@ class Recipe(RecipePart):
     )
     split: Split = Field(default_factory=Split, description="which frames are for what")
     recorded: Recorded | None = Field(None, description="where frames come from that no scene was rendered for")
+    mirrors: MirrorKeys = Field(
+        None, description="shapes that reflect as mirrors: [reflection, rms height in m] by their ids, or materials"
+    )
+    bodies: list[str] = Field(
+        default_factory=list, max_length=10_000, description="bodies that move, whose poses and velocities are stored"
+    )
 
     @model_serializer(mode="wrap")
     def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
-        """Leave ``recorded`` out where frames are rendered: stores and checkpoints keep the digests of their recipes."""
-        return {key: value for key, value in handler(self).items() if key != "recorded" or value is not None}
+        """Leave out what later versions added where it is not used: stores and checkpoints keep their digests."""
+        return {key: value for key, value in handler(self).items() if key not in ADDED or value}
 
     @model_validator(mode="before")
     @classmethod
@@ -106,6 +116,9 @@ class Recipe(RecipePart):
             raise ValueError(f"with flight.kind runs each scene has {len(self.flight.runs)} sequences, one a run")
         if not all(family.half_m > 0 for family in families):
             raise ValueError("a scene must have a size")
+        surfaces = [one.surface_m for one in families if isinstance(one, BuiltFamily) and one.surface_m is not None]
+        if surfaces and high >= min(surfaces):
+            raise ValueError(f"flight height_m must stay below the world's surface_m, {min(surfaces):g} m: got {high:g} m")
         return self
 
     def _check_recorded(self) -> None:
@@ -120,9 +133,11 @@ class Recipe(RecipePart):
             )
         if self.recorded is None:
             return
-        if self.world or self.channel is not None or self.receivers or self.segments or self.store != "images":
+        other = self.world or self.channel is not None or self.receivers or self.segments or self.mirrors or self.bodies
+        if other or self.store != "images":
             raise MitsonarError(
-                "recorded frames are images of one sonar: leave out world, channel, receivers, segments and store"
+                "recorded frames are images of one sonar: leave out world, channel, receivers, segments, mirrors, bodies "
+                "and store"
             )
         if len(self.scenes) != len(self.recorded.sources) or any(group.count != 1 for group in self.scenes):
             raise MitsonarError("each source of recorded frames is one scene")
@@ -144,6 +159,10 @@ class Recipe(RecipePart):
             raise MitsonarError("labels are pixels: store images or both with them")
         if any(view.sonar.ping_groups > 1 for view in self.views):
             raise MitsonarError("a ping of a data set has one pose: leave out ping_groups, or set it to 1")
+        if len(set(self.bodies)) < len(self.bodies):
+            raise MitsonarError(f"bodies are named once each: got {shortened(self.bodies)}")
+        if self.recorded is None:
+            check_image_mirrors(self.instrument, self.views, bool(self.mirrors))
 
     def _check_responses(self) -> None:
         """Check the keys of responses.
@@ -151,7 +170,7 @@ class Recipe(RecipePart):
         Raises:
             MitsonarError: a key of the instrument is not valid, or a key belongs to images.
         """
-        self.channel_sonar  # noqa: B018
+        check_channel_mirrors(self.channel_sonar, bool(self.mirrors), "give the recipe the key mirrors")
         plain = {
             "mount": Mount(),
             "receivers": [],
@@ -160,6 +179,7 @@ class Recipe(RecipePart):
             "store": "images",
             "pixel": "uint8",
             "gain": None,
+            "bodies": [],
         }
         other = [name for name, value in plain.items() if getattr(self, name) != value]
         other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []

@@ -3,24 +3,44 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from mitsonar.config.recipe_keys import Keys
 from mitsonar.errors import shortened
 from mitsonar.motion.pose import Pose
 from mitsonar.worlds.world import Interval
 
-__all__ = ["Flight", "Mount", "ReceiverSpec", "RecipePart", "Recorded", "RecordedSource", "Scenes", "Split"]
+__all__ = ["Flight", "MirrorKeys", "Mount", "ReceiverSpec", "RecipePart", "Recorded", "RecordedSource", "Scenes", "Split"]
 
 
 class RecipePart(BaseModel):
     """Keys of a recipe that are checked; unknown ones are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _as_mirrors(given: object) -> object:
+    if given is None or given == "materials":
+        return given
+    fits = isinstance(given, dict) and len(given) > 0
+    for part in given.values() if isinstance(given, dict) else ():
+        two = isinstance(part, list | tuple) and len(part) == 2
+        fits &= two and all(isinstance(value, int | float) and not isinstance(value, bool) for value in part)
+        fits = fits and -1 <= part[0] <= 1 and 0 <= part[1] <= 1
+    if not fits:
+        raise ValueError(
+            "give [reflection, rms height in m] by the ids of shapes, reflections in -1..1 and rms heights in 0..1, or the "
+            f"word materials: got {shortened(given)}"
+        )
+    return given
+
+
+MirrorKeys: TypeAlias = Annotated[dict[str, tuple[float, float]] | Literal["materials"] | None, BeforeValidator(_as_mirrors)]
+"""Reflection coefficient of pressures and rms height [m] by the ids of shapes, or ``materials``; None: no mirrors."""
 
 
 class Scenes(RecipePart):

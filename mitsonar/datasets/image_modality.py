@@ -31,6 +31,11 @@ TEXTS = {
     "shadow": "{}: 0 not in shadow, 1 dark with sound or echoes beyond, 2 dark with all sound intercepted before",
 }
 
+OF_BODIES = {
+    "body_pose": "of the recipe's bodies, in its order: x, y, z [m], pitch, roll, heading [rad]",
+    "body_velocity": "of the recipe's bodies in the world's axes: of the origin [m/s], rotation vector a second [rad/s]",
+}
+
 PER_FRAME = {
     "height_m": StoredArray(
         np.dtype(np.float64), "height of the sonar over what is straight below it [m]; nan where nothing is"
@@ -65,6 +70,9 @@ class ImageModality:
             shape: tuple[int, ...] = (view.sonar.range_bins, *(() if sums else (len(view.bearing_rad),)))
             dims = ("range", *(() if sums else (f"beam{self.recipe.suffix(view_name)}",)))
             table[name] = self._stored(kind, view_name, shape, dims)
+        if self.recipe.bodies:
+            shape, dims = (len(self.recipe.bodies), 6), ("body", "six")
+            table |= {name: StoredArray(np.dtype(np.float64), about, shape, dims) for name, about in OF_BODIES.items()}
         return table | PER_FRAME
 
     @property

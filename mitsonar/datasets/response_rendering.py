@@ -7,7 +7,7 @@ import numpy as np
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene
-from mitsonar.datasets.scene_rendering import loaded_world
+from mitsonar.datasets.scene_rendering import loaded_world, refuse_worlds
 from mitsonar.simulation.channel import ChannelSimulator
 
 __all__ = ["ResponseRenderer"]
@@ -22,11 +22,12 @@ class ResponseRenderer:
     """
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
-        self.simulator = ChannelSimulator(loaded_world(recipe, scene), recipe.channel_sonar)
+        self.simulator = ChannelSimulator(loaded_world(recipe, scene), recipe.channel_sonar, mirrors=recipe.mirrors)
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
-        """Return no numbers: responses have no gain."""
+        """Return no numbers: responses have no gain. Mirrors are looked for in the worlds."""
+        refuse_worlds(recipe)
         return {}
 
     def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:

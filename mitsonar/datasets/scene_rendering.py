@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
-from mitsonar.datasets.plan import Scene, scenes_of, sequences_of
-from mitsonar.errors import MitsonarError
+from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
@@ -26,7 +26,9 @@ from mitsonar.simulation.variant import release_memory
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_small_worlds"]
+    from mitsonar.simulation.moving_scene import SceneMotion
+
+__all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_worlds"]
 
 FRAMES_A_SCENE = 10_000_000
 """A ping's number is its scene's number times this, plus its position in the scene: jitter does not depend on the size of
@@ -43,12 +45,14 @@ class SceneRenderer:
 
     def __init__(self, recipe: Recipe, scene: Scene) -> None:
         self.recipe, self.scene = recipe, scene
-        self.simulator = Simulator(loaded_world(recipe, scene), instrument_in(recipe, scene), views=recipe.views)
+        world, sonar = loaded_world(recipe, scene), instrument_in(recipe, scene)
+        self.simulator = Simulator(world, sonar, views=recipe.views, mirrors=recipe.mirrors)
+        self.bodies = body_places(recipe, self.simulator.motion)
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
         """Compute the gain of the data set and its inverse; see :func:`calibrate`."""
-        refuse_small_worlds(recipe)
+        refuse_worlds(recipe)
         gain = calibrate(recipe)
         return {"gain": gain, "level_scale": 1 / gain}
 
@@ -57,7 +61,7 @@ class SceneRenderer:
 
         Bodies that the scene's file moves are where they are at frame / ``frame_rate_hz``.
         """
-        time_s = (first + np.arange(len(poses))) / self.simulator.sonar.frame_rate_hz
+        time_s = self._time_s(first, len(poses))
         number = self.scene.number * FRAMES_A_SCENE + first
         return self.simulator.render_views(poses, first=number, labels=labels, time_s=time_s)
 
@@ -73,7 +77,17 @@ class SceneRenderer:
         for batch in self.render_views(poses, first, labels=bool(self.recipe.labels)):
             start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
             self._fill({name: array[start : start + len(batch[0])] for name, array in values.items()}, batch, gain)
+        if self.bodies:
+            states = self.simulator.bodies(self._time_s(first, len(poses)))
+            assert states.poses is not None
+            assert states.velocities is not None
+            values["body_pose"][:] = states.poses[:, self.bodies]
+            values["body_velocity"][:] = states.velocities[:, self.bodies]
         return values
+
+    def _time_s(self, first: int, frames: int) -> NDArray[np.float64]:
+        """Return the times of frames of the scene, of which its moving bodies are functions ``(frames,)`` [s]."""
+        return np.asarray((first + np.arange(frames)) / self.simulator.sonar.frame_rate_hz, dtype=np.float64)
 
     def recorded(self, planned: dict[str, Values], first: int, about: Fields) -> dict[str, Values]:
         """Render frames at the poses of the plan; see :class:`~mitsonar.datasets.modality.Renderer`."""
@@ -111,6 +125,20 @@ def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
     return sonar.replace(seed=int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0]))
 
 
+def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:
+    """Return the places of the recipe's bodies among those that move in a scene.
+
+    Raises:
+        MitsonarError: a body that does not move there.
+    """
+    known = () if motion is None else motion.bodies.names
+    for name in recipe.bodies:
+        if name not in known:
+            there = nearest_names(name, known) if known else "nothing moves there"
+            raise MitsonarError(f"bodies: no body {shortened(name)} moves in the scene: {there}")
+    return [known.index(name) for name in recipe.bodies]
+
+
 def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
     """Build a scene's world in a temporary folder, and load it.
 
@@ -126,15 +154,28 @@ def loaded_world(recipe: Recipe, scene: Scene) -> mi.Scene:
         return loaded
 
 
-def refuse_small_worlds(recipe: Recipe) -> None:
-    """Refuse scenes of the user's own that are smaller than the recipe says, before anything is rendered.
+def refuse_worlds(recipe: Recipe) -> None:
+    """Refuse scenes of the user's own that are smaller than the recipe says, and worlds without the mirrors that it names.
+
+    Nothing is rendered yet. Of each group of scenes one world is looked at.
 
     Raises:
-        MitsonarError: one is smaller than its ``size_m``, or cannot be loaded.
+        MitsonarError: one is smaller than its ``size_m``, lacks a mirror or a body that moves, or cannot be loaded.
     """
-    own = {repr(recipe.family(group)): group for group in range(len(recipe.scenes)) if not recipe.family(group).seeded}
-    for group in own.values():
-        loaded_world(recipe, Scene(0, group, 0, 1))
+    from mitsonar.simulation.mirror_parts import mirror_of
+    from mitsonar.simulation.moving_scene import motion_in
+
+    families = [recipe.family(group) for group in range(len(recipe.scenes))]
+    every = bool(recipe.mirrors or recipe.bodies)
+    looked_at = {repr(family): group for group, family in enumerate(families) if every or not family.seeded}
+    for group in looked_at.values():
+        world = loaded_world(recipe, Scene(0, group, world_seed(recipe.seed, 0), 1))
+        body_places(recipe, motion_in(world, None) if recipe.bodies else None)
+        if mirror_of(world, recipe.mirrors) is None and recipe.mirrors:
+            raise MitsonarError(
+                f"mirrors: no shape of the worlds of scenes.{group} reflects: got {recipe.mirrors}; give [reflection, rms "
+                "height in m] by the ids of shapes, or shapes of materials that have both"
+            )
     release_memory()
 
 

@@ -22,7 +22,9 @@ from mitsonar.simulation.bounce_walk import Arrival, Vertex, Walk, at_most_one
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.mirror_parts import Mirroring, mirror_of, smooth_share
+from mitsonar.simulation.moving_tracing import MovingSurfaces
 from mitsonar.simulation.reflections import overlap
+from mitsonar.simulation.second_mirrors import SecondMirrors
 from mitsonar.simulation.view_echoes import ViewEchoes, WholeTracer, fraction_bits
 
 if TYPE_CHECKING:
@@ -62,6 +64,7 @@ class BounceSums:
         # the last surface may be near and the path long: R^g / nearest^2 against the R^(g - 2) of one reflection
         spread = max(1.0, traced.range_max / self.nearest) ** min(traced.gain_exponent, 2)
         self.tracer.bits = fraction_bits(traced, traced.rays, MOST_OF_A_RAY * spread)
+        self.second = SecondMirrors.of(scene, found, self.wavenumber) if sonar.bounces > 2 else None
         self.tables_of_mirrors: LaunchTables | None = None
         if found is not None:
             lawless = [float(shape.bsdf() is None or material_of(shape) is None) for shape in scene.shapes()]
@@ -121,9 +124,9 @@ class BounceSums:
         )
         origin = mi.Point3f(*(line.w for line in lines))
         table, width = None if mirrors is None else mirrors["parts"], (echoes.far_m - echoes.near_m) * 0.25
-        walk = Walk(
-            scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, fan.below, fan.above, fan.aside, width
-        )
+        moment: DeviceArray = mi.Float(rays.moment) if isinstance(surfaces, MovingSurfaces) else None
+        cell = fan.below, fan.above, fan.aside, width
+        walk = Walk(scene, surfaces, table, self.sonar.bounces, self.wavenumber, origin, *cell, moment, self.second)
         sums: mi.UInt64 | None = None
         for arrival in walk.arrivals(begin, rays.ray, keys):
             for heard in self._heard(arrival, echoes, fan, lines, rays):

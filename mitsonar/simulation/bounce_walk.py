@@ -8,7 +8,7 @@ integral over all directions. Each further surface P of reflectivity C that the 
 
 with the angle and the range of P from the sonar: the source lights P straight, and the ray's cell dOmega hears it. The range
 is half of the path. A path and its reverse have one length. What begins at a mirror is not drawn from its other end, so the
-caller adds the reverse. Rays to P by one mirror and back by the same are a third kind, of three reflections.
+caller adds the reverse. Rays to P by one mirror and back by the same or another one are further kinds, of three.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from mitsonar.simulation.bistatic import half_path_rate
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.mirror_parts import parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.reflections import going_on, lambert_direction, reflected
+from mitsonar.simulation.second_mirrors import SecondMirrors
 from mitsonar.simulation.tracing import hidden
 
 __all__ = ["Arrival", "Vertex", "Walk", "at_most_one"]
@@ -106,6 +107,8 @@ class Walk:
         origin: of the sonar [m].
         below, above, aside: elevations of the edges and bearing of the middle of each ray's cell, relative to the ray [rad].
         width: half-length of the path's range interval by way of rough surfaces [m].
+        moment: number of the moment of each ray in a scene that moves; None: a still scene.
+        second: planes for ways back by another mirror; None: there are no such ways.
     """
 
     scene: mi.Scene
@@ -118,6 +121,8 @@ class Walk:
     above: DeviceArray
     aside: DeviceArray
     width: DeviceArray
+    moment: DeviceArray = None
+    second: SecondMirrors | None = None
 
     def arrivals(self, begin: Vertex, ray: DeviceArray, key: DeviceArray) -> Iterator[Arrival]:
         """Yield the arrivals of two reflections, then those of three.
@@ -132,6 +137,7 @@ class Walk:
             now = self._next(now, ray, key + (DRAWS + number))
             if number == 2 and self.bounces > 2 and self.mirrors is not None:
                 yield self._back_again(now)
+                yield from self._by_others(begin, now)
             yield self._straight(now)
 
     def _next(self, now: Vertex, ray: DeviceArray, key: DeviceArray) -> Vertex:
@@ -142,7 +148,10 @@ class Walk:
         gain = now.gain * dr.select(mirror, dr.square(now.reflection), now.reflectivity * dr.pi)
         begin = going_on(now.place, d, now.n)
         active = now.valid & (gain > 0)
-        hit = self.surfaces.hit(self.scene, mi.Ray3f(now.place + d * begin, d), active)
+        onward = mi.Ray3f(now.place + d * begin, d)
+        if self.moment is not None:
+            onward.time = self.moment
+        hit = self.surfaces.hit(self.scene, onward, active)
         reflection: DeviceArray = mi.Float(0)
         if self.mirrors is not None:
             part, roughness_m = parts_at(self.mirrors, hit)
@@ -171,7 +180,7 @@ class Walk:
         u = way / distance
         toward = dr.dot(now.n, u)
         lit = now.valid & (now.reflectivity > 0) & (toward * dr.dot(now.n, now.d) > 0)
-        lit &= ~hidden(self.scene, mi.Point3f(now.place), now.n, u, distance, lit)
+        lit &= ~hidden(self.scene, mi.Point3f(now.place), now.n, u, distance, lit, self.moment)
         half = (now.length + distance) * 0.5
         low, high = self._edges(now, u, half)
         cosine = dr.abs(toward)
@@ -205,6 +214,30 @@ class Walk:
             pure=now.pure,
             same=True,
         )
+
+    def _by_others(self, first: Vertex, now: Vertex) -> Iterator[Arrival]:
+        """Yield what left by one mirror and arrives by another. The reverse is that of the ray to the other mirror."""
+        if self.second is None:
+            return
+        met = now.valid & now.pure & (now.reflectivity > 0)
+        point, mirror = (now.place, now.n), (first.place, first.n)
+        for way in self.second.ways(self.scene, self.origin, point, mirror, met, self.moment):
+            half = (now.length + way.distance) * 0.5
+            toward = dr.dot(now.n, way.u)
+            cosine = dr.abs(toward)
+            low, high = self._edges(now, way.u, half)
+            yield Arrival(
+                active=met & way.is_open & (toward * dr.dot(now.n, now.d) > 0),
+                reflectivity=now.reflectivity * now.gain * dr.square(way.factor),
+                cosine=dr.select(cosine < 1, cosine, 1),
+                distance=way.distance,
+                range_m=half,
+                low_m=low,
+                high_m=high,
+                toward=reflected(way.u, mi.Vector3f(way.mirror.normal)),
+                reverse=mi.Bool(False),
+                pure=mi.Bool(True),
+            )
 
     def _edges(self, now: Vertex, u: DeviceArray, half: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Return half the path by way of a cell's lower and upper edge, on the tangent plane; ``u`` from the other end."""

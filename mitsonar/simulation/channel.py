@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
+from mitsonar.instruments.mirror_rules import check_channel_mirrors
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.simulation.nonuniform_fft import phasor_sums, phasors
@@ -30,6 +31,12 @@ __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impul
 FOR_PATHS = ("counts", "beyond", "delay", "amplitude", "phase", "doppler")
 FOR_RESPONSES = ("counts", "beyond", "turn", "real", "imag")
 """Fields of :class:`~mitsonar.simulation.link_geometry.EchoBatch` that a launch returns."""
+
+LACKING = (
+    'give reflection and rms height by the ids of shapes, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with '
+    "a material that has both"
+)
+"""What to do where the instrument needs mirrors."""
 
 PINGS_AT_A_TIME = 16
 """Pings whose echoes wait in memory for their transforms: 50 bytes an echo and receiver."""
@@ -130,7 +137,7 @@ class ChannelSimulator:
         refuse_motion(scene, "impulse responses")
 
         parts = mirror_of(scene, mirrors) if mirrors else None
-        _check_mirrors(sonar, parts is not None)
+        check_channel_mirrors(sonar, parts is not None, LACKING)
         self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer, parts)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
         self.ways = tuple([way.name for way in self.tracer.ways] + self.without_scatterer.names)
@@ -351,21 +358,6 @@ def _taps(sonar: ChannelSonar, spectrum: NDArray[np.complex128], padding: int) -
     band = np.zeros(length_, np.complex128)
     np.add.at(band, number % length_, spectrum * sonar.raised_cosine(number * sonar.frequency_step_hz / padding))
     return np.asarray(np.fft.ifft(band)[: sonar.taps])
-
-
-def _check_mirrors(sonar: ChannelSonar, any_mirror: bool) -> None:
-    """Refuse several bounces without mirrors, and mirrors in the model ``rays``.
-
-    Raises:
-        MitsonarError: they do not fit.
-    """
-    if sonar.bounces > 1 and not any_mirror:
-        raise MitsonarError(
-            f"bounces {sonar.bounces} need mirrors, and the scene has none: give reflection and rms height by the ids of "
-            'shapes, mirrors={"surface": (-1.0, 0.0)}, or "materials" (--mirrors) with a material that has both'
-        )
-    if any_mirror and sonar.model == "rays":
-        raise MitsonarError("mirrors are of the model scatterers: got the model rays; leave them out, or choose scatterers")
 
 
 def _checked(velocity: ArrayLike | None, pings: int, sound_speed: float) -> NDArray[np.float64]:

@@ -116,7 +116,7 @@ class ChannelTracer:
         key = (receiver, wanted, len(way.out.planes), len(way.back.planes))
         if key not in self.launches:
             self.launches[key] = self._compile(*key)
-        table = mi.Float64(self._table(pose, velocity, receiver, way))
+        table = mi.Float64(padded(self._table(pose, velocity, receiver, way)))
         launch, inputs = self.launches[key], (mi.UInt32(padded(asked)), self.scene, table)
         received = replayed(launch, *inputs, self.source.tables(receiver))
         return {name: np.broadcast_to(np.array(values), len(asked)) for name, values in zip(wanted, received, strict=True)}

@@ -86,11 +86,12 @@ class CoherentImager:
         parts = mirror_of(scene, mirrors)
         self.tracers = {side: CoherentTracer(scene, sonar, self.former, parts, side, motion) for side in self.sides}
         self.tracer = self.tracers[self.sides[0]]
-        self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts)
+        self.glints = None if parts is None else MirrorTracer(scene, sonar, self.former, parts, motion=motion)
         several = parts is not None and sonar.bounces > 1
-        self.ghosts = GhostTracer(self.tracer) if several else None
+        self.ghosts = GhostTracer(self.tracer, parts) if several else None
         self.diffuse = DiffuseField(self.tracer) if sonar.bounces > 1 else None
-        self.corners = CornerTracer(scene, sonar, self.former, parts) if parts is not None and several else None
+        cornered = parts if several else None
+        self.corners = None if cornered is None else CornerTracer(scene, sonar, self.former, cornered, motion=motion)
         self.notes = [*self.tracer.surfaces.notes, *point_notes(sonar), *loss_notes(sonar)]
 
     def image(self, pose: NDArray[np.float64], ping: int, time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
@@ -129,10 +130,10 @@ class CoherentImager:
         """
         field, counts = (self.tracer if side is None else self.tracers[side]).field(pose, time_s)
         if self.glints is not None:
-            self.glints.add(pose, field)
+            self.glints.add(pose, field, time_s)
         for further in (self.ghosts, self.corners, self.diffuse):
             if further is not None:
-                further.add(pose, field)
+                further.add(pose, field, time_s)
         image = self.former.beams(field) * self._loss[:, None]
         if self.sonar.crosstalk_db is not None:
             image = image + np.float32(10 ** (self.sonar.crosstalk_db / 20)) * image.sum(axis=1, keepdims=True)
@@ -325,14 +326,9 @@ def coherent_imager(
     """Return what renders pings of the model ``coherent``; None for other models.
 
     Raises:
-        MitsonarError: receivers elsewhere, cones, or portions with mirrors; mirrors in other models.
+        MitsonarError: receivers elsewhere, cones, or portions with mirrors.
     """
     if sonar.model != "coherent":
-        if mirrors and sonar.bounces == 1:
-            raise MitsonarError(
-                f"the model {sonar.model} has no mirrors: give the sonar model coherent"
-                + (", or bounces 2" if sonar.model == "physical" else "")
-            )
         return None
     return CoherentImager(scene, sonar, mirrors, views, motion)
 

@@ -26,7 +26,7 @@ from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain
 from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point, pick
 from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
-from mitsonar.simulation.moving_scene import MovingScene, SceneMotion
+from mitsonar.simulation.moving_scene import SceneMotion, scene_at
 from mitsonar.simulation.moving_tracing import MovingSurfaces, surfaces_of
 from mitsonar.simulation.variant import replayed
 
@@ -118,10 +118,10 @@ class CoherentTracer:
 
     def field(self, pose: NDArray[np.float64], time_s: float = 0.0) -> tuple[NDArray[np.complex64], FieldCounts]:
         """Return the field of one ping ``(sines, ranges)`` at a pose ``(6,)`` [m, rad] and a time [s], and its counts."""
-        scene: mi.Scene | MovingScene = self.scene
+        scene = scene_at(self.scene, self.motion, time_s)
         lines = to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64)
         if self.motion is not None:
-            scene, lines = self.motion.at(time_s), self.motion.sonar_lines(pose, time_s)
+            lines = self.motion.sonar_lines(pose, time_s)
         rows = mi.Float64(lines.ravel().tolist())
         inputs = self.index, scene, rows, self.surfaces.arrays(), self.patches, self.mirrors
         real, imag, counts = replayed(self.launch, *inputs)
@@ -138,13 +138,14 @@ class CoherentTracer:
             ray, surfaces = mi.Ray3f(rays.origin, rays.d), replace(self.surfaces, **tables)
             if isinstance(surfaces, MovingSurfaces):  # all that follows is in the axes of the body that is hit
                 hit, body = surfaces.hit_in_body(scene, ray)
-                hit = replace(hit, shape_id=surfaces.own_lattice(scene, hit, body))
                 lines = [[dr.gather(mi.Float64, rows, body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
                 rays = FanRays(self.fan, self.sonar, index, lines, self.side)
             else:
                 hit = surfaces.hit(scene, ray)
             if mirrors is not None:
                 hit = without_mirror_part(mirrors, hit, rays.d, 2 * math.pi / self.wavelength)
+            if isinstance(surfaces, MovingSurfaces):  # last: mirrors are known by their shapes
+                hit = replace(hit, shape_id=surfaces.own_lattice(scene, hit, body))
             return self._sums(rays, hit, patches)
 
         return launch

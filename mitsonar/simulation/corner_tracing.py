@@ -79,7 +79,7 @@ class CornerTracer(MirrorTracer):
     ) -> Iterator[tuple[MirroredRays, LastMirror]]:
         """Yield rays at their second mirror, at their third, and what these send back."""
         surfaces = replace(self.surfaces, **tables)
-        now = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1))
+        now = MirroredRays(rays, surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d)), mi.Float(1), mi.UInt32(0))
         for _ in range(2, self.sonar.bounces + 1):
             now = mirrored_on(scene, surfaces, now, table, self.wavenumber)
             yield now, self._last(scene, rays, now, table)

@@ -103,7 +103,8 @@ def jittered(simulator: Simulator) -> Simulator:
     """Return a simulator with rays that are jittered within their cells; the given one where it is so already."""
     if simulator.sonar.jittered:
         return simulator
-    return Simulator(simulator.tracer.scene, simulator.sonar.replace(jitter=True), views=simulator.views)
+    sonar = simulator.sonar.replace(jitter=True)
+    return Simulator(simulator.tracer.scene, sonar, views=simulator.views, mirrors=simulator.mirrors)
 
 
 def step_for(sonar: Sonar, part: float = STEP) -> Motion:

@@ -22,13 +22,19 @@ LaunchTables: TypeAlias = dict[str, DeviceArray]
 MOST_LANES = 64
 """More than a processor computes side by side."""
 
+ALIGNED_BYTES = 64
+"""Boundary that memory begins on for a launch: that of Dr.Jit's own arrays, or a multiple of it."""
+
 
 def padded(values: NDArray[Any]) -> NDArray[Any]:
     """Return a copy of values ``(n,)`` behind whose end memory goes on, for a launch over all of them.
 
     Dr.Jit 1.5 borrows the memory of NumPy and reads whole packets of 16 values: past the end of an array of another length.
-    Where no memory follows, the process dies.
+    Where no memory follows, the process dies. The copy begins on a boundary of :data:`ALIGNED_BYTES`: a frozen launch is
+    recorded anew where an input lies otherwise than before.
     """
-    room = np.zeros(len(values) + MOST_LANES, dtype=values.dtype)
-    room[: len(values)] = values
-    return room[: len(values)]
+    room = np.zeros(len(values) + MOST_LANES + ALIGNED_BYTES // values.itemsize, dtype=values.dtype)
+    first = -room.ctypes.data % ALIGNED_BYTES // values.itemsize
+    kept = room[first : first + len(values)]
+    kept[:] = values
+    return kept

@@ -29,6 +29,7 @@ from mitsonar.simulation.coherent_tracing import ADD, CoherentTracer, FanRays
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.mirror_parts import parts_at, smooth_share, without_mirror_part
+from mitsonar.simulation.moving_scene import scene_at
 from mitsonar.simulation.reflections import overlap
 from mitsonar.simulation.variant import replayed
 
@@ -63,9 +64,9 @@ class DiffuseField:
         self.bits = 62 - math.ceil(math.log2(loudest * fan.rays))
         self.launch = self._compile()
 
-    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64]) -> None:
-        """Add these paths of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` [m, rad]."""
-        energy = self.energy(pose)
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
+        """Add these paths of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` and a time [s]."""
+        energy = self.energy(pose, time_s)
         if not energy.any():
             return
         smooth = uniform_filter(energy, SMOOTHED, mode="nearest")
@@ -75,11 +76,12 @@ class DiffuseField:
         made = (grain * amplitude[:, None, :, None]).reshape(self._grain.shape)
         field += made[: field.shape[0], : field.shape[1]]
 
-    def energy(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    def energy(self, pose: NDArray[np.float64], time_s: float = 0.0) -> NDArray[np.float64]:
         """Return the energies of one ping in coarse cells ``self.shape``, relative to the source's at 1 m."""
         direct = self.direct
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
-        sums = replayed(self.launch, direct.index, direct.scene, rows, direct.surfaces.arrays(), direct.mirrors)
+        scene = scene_at(direct.scene, direct.motion, time_s)
+        sums = replayed(self.launch, direct.index, scene, rows, direct.surfaces.arrays(), direct.mirrors)
         return np.array(sums, copy=False).reshape(self.shape).astype(np.float64) * 2.0**-self.bits
 
     @cached_property

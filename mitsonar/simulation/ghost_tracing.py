@@ -7,9 +7,9 @@ R + R', there and back the other way round, of amplitude
 
     V exp(-2 k^2 h^2 cos^2) zeta sqrt(C cos cos' dA) / (R R')
 
-By the same mirror both ways it gives one of length 2 R', of three reflections. Points, weights and grid are those of one
-reflection, so ghosts carry the speckle of what they are ghosts of. Whether the sonar sees a point straight is tested once a
-ray, at the point that the ray meets.
+By the same mirror both ways it gives one of length 2 R', of three reflections, and by another mirror back one of R' + R''.
+Points, weights and grid are those of one reflection, so ghosts carry the speckle of what they are ghosts of. Whether the
+sonar sees a point straight is tested once a ray, at the point that the ray meets.
 """
 
 from __future__ import annotations
@@ -30,8 +30,11 @@ from mitsonar.simulation.coherent_tracing import CoherentTracer, FanRays, add_wa
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.hashed_points import HashedPoints, Point
-from mitsonar.simulation.mirror_parts import parts_at, smooth_share, without_mirror_part
+from mitsonar.simulation.mirror_parts import Mirrors, parts_at, smooth_share, without_mirror_part
+from mitsonar.simulation.moving_scene import scene_at
+from mitsonar.simulation.moving_tracing import MovingSurfaces
 from mitsonar.simulation.reflections import going_on, mirrored_lines, overlap
+from mitsonar.simulation.second_mirrors import SecondMirrors
 from mitsonar.simulation.tracing import hidden
 from mitsonar.simulation.variant import replayed
 
@@ -49,11 +52,13 @@ class MirroredRays:
         rays: as they are seen from the image of the sonar.
         hit: where they end now, ``t`` from that image [m].
         gain: amplitude that the mirrors have left.
+        body: number of the body that they meet; 0: what stands still.
     """
 
     rays: FanRays
     hit: Hit
     gain: DeviceArray
+    body: DeviceArray
 
 
 class GhostTracer:
@@ -61,39 +66,45 @@ class GhostTracer:
 
     Args:
         tracer: of one reflection, with mirrors.
+        mirrors: of the scene, for ways by one of them there and another back; default: no such ways.
     """
 
-    def __init__(self, tracer: CoherentTracer) -> None:
+    def __init__(self, tracer: CoherentTracer, mirrors: Mirrors | None = None) -> None:
         self.direct, self.sonar, self.former = tracer, tracer.sonar, tracer.former
         self.wavenumber = 2 * math.pi / tracer.wavelength
         self.nearest = max(tracer.former.first_range, tracer.sonar.bin_m)
         self.last = self.former.first_range + (self.former.ranges - 1) * self.former.range_step
-        self.bits = tracer.bits - int(math.log2(PATHS))
+        self.second = SecondMirrors.of(tracer.scene, mirrors, self.wavenumber) if self.sonar.bounces > 2 else None
+        more = 0 if self.second is None else len(self.second.mirrors)
+        self.bits = tracer.bits - math.ceil(math.log2(PATHS + more))
         self.launch = self._compile()
 
-    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64]) -> None:
-        """Add the ghosts of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` [m, rad]."""
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
+        """Add the ghosts of one ping to its field ``(sines, ranges)``, in place, at a pose ``(6,)`` and a time [s]."""
         direct = self.direct
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
-        inputs = direct.index, direct.scene, rows, direct.surfaces.arrays(), direct.patches, direct.mirrors
+        scene = scene_at(direct.scene, direct.motion, time_s)
+        bodies = None if direct.motion is None else mi.Float64(direct.motion.body_lines(time_s).ravel().tolist())
+        inputs = direct.index, scene, rows, direct.surfaces.arrays(), direct.patches, direct.mirrors, bodies
         real, imag = replayed(self.launch, *inputs)
         field.real += np.array(real, copy=False).reshape(field.shape)
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 
     def _compile(self) -> Callable[..., Any]:
         @dr.freeze
-        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
+        def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any, bodies: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.direct.fan, self.sonar, index, lines)
             surfaces = replace(self.direct.surfaces, **tables)
             hit = surfaces.hit(scene, mi.Ray3f(rays.origin, rays.d))
-            now = MirroredRays(rays, hit, mi.Float(1))
+            now = MirroredRays(rays, hit, mi.Float(1), mi.UInt32(0))
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))
             for number in range(2, self.sonar.bounces + 1):
+                first = rays.origin + rays.d * now.hit.t, now.hit.n
                 now = mirrored_on(scene, surfaces, now, mirrors, self.wavenumber)
-                self._sum(
-                    scene, rays, now, mirrors, patches, (sums[0], sums[1]), retro=number == 2 and self.sonar.bounces > 2
-                )
+                retro = number == 2 and self.sonar.bounces > 2
+                own = first if retro else None
+                self._sum(scene, rays, now, mirrors, patches, (sums[0], sums[1]), first=own, bodies=bodies)
             dr.eval(sums)
             return tuple(mi.Float(mi.Float64(mi.Int64(part)) * 2.0**-self.bits) for part in sums)
 
@@ -101,16 +112,20 @@ class GhostTracer:
 
     def _sum(
         self,
-        scene: mi.Scene,
+        scene: DeviceArray,
         rays: FanRays,
         now: MirroredRays,
         mirrors: mi.Float,
         patches: mi.Float,
         sums: tuple[mi.UInt64, mi.UInt64],
         *,
-        retro: bool,
+        first: tuple[DeviceArray, DeviceArray] | None,
+        bodies: mi.Float64 | None,
     ) -> None:
-        """Sum the points that rays behind mirrors look through."""
+        """Sum the points that rays behind mirrors look through.
+
+        ``first`` is place and normal of the only mirror so far, where the way back may be by mirrors as well.
+        """
         hit = without_mirror_part(mirrors, now.hit, now.rays.d, self.wavenumber)
         place: DeviceArray = now.rays.origin + now.rays.d * hit.t
         way: DeviceArray = place - rays.origin
@@ -120,9 +135,23 @@ class GhostTracer:
         straight = matt & (dr.dot(hit.n, u) * dr.dot(hit.n, now.rays.d) > 0)
         straight &= self._within((hit.t + distance) * 0.5, now)
         straight &= ~hidden(scene, mi.Point3f(place), hit.n, u, distance, straight)
-        back = matt & self._within(hit.t, now) if retro else mi.Bool(False)
+        back = matt & self._within(hit.t, now) if first is not None else mi.Bool(False)
+        ways: list[tuple[FanRays, DeviceArray, DeviceArray]] = []
+        if first is not None and self.second is not None:
+            for way in self.second.ways(scene, rays.origin, (place, hit.n), first, matt):
+                beyond = rays.from_lines(mirrored_lines(rays.lines, way.mirror.normal, way.mirror.place))
+                facing = dr.dot(hit.n, way.u) * dr.dot(hit.n, now.rays.d) > 0
+                ways.append((beyond, way.factor, way.is_open & facing & self._within((hit.t + way.distance) * 0.5, now)))
+        if bodies is not None:  # all that follows is in the axes of the body that is hit
+            assert isinstance(self.direct.surfaces, MovingSurfaces)
+            turn = [[dr.gather(mi.Float64, bodies, now.body * 12 + (4 * i + j)) for j in range(4)] for i in range(3)]
+            rays, now = in_body(turn, rays), replace(now, rays=in_body(turn, now.rays))
+            ways = [(in_body(turn, beyond), factor, is_open) for beyond, factor, is_open in ways]
+            normal = [mi.Float(row[0]) * hit.n.x + mi.Float(row[1]) * hit.n.y + mi.Float(row[2]) * hit.n.z for row in turn]
+            lattice = self.direct.surfaces.own_lattice(scene, hit, now.body)
+            hit, place = replace(hit, n=mi.Normal3f(*normal), shape_id=lattice), now.rays.origin + now.rays.d * hit.t
         points = HashedPoints(
-            replace(hit, valid=straight | back),
+            replace(hit, valid=straight | back | _any_of(ways)),
             place,
             *now.rays.steps_on(hit),
             pitch=self.direct.pitch,
@@ -133,7 +162,9 @@ class GhostTracer:
         def step(number: mi.Int32) -> tuple[mi.Int32]:
             point = points.point(number, patches, self.direct.patch_entries)
             held = number < points.count
-            self._deposit((rays, now), points, point, sums, (held & straight, held & back if retro else None))
+            self._deposit((rays, now), points, point, sums, (held & straight, held & back if first is not None else None))
+            for beyond, factor, is_open in ways:
+                self._deposit_by((now, beyond, factor), points, point, sums, held & is_open)
             return (number + 1,)
 
         begin = mi.Int32(0) + dr.zeros(mi.Int32, self.direct.fan.rays)
@@ -178,6 +209,27 @@ class GhostTracer:
             wave = (there.range_m, *self._turned(there.range_m, point))
             self._add(sums, there.sine, level * gain, wave, active[1] & there.mine)
 
+    def _deposit_by(
+        self,
+        way: tuple[MirroredRays, FanRays, DeviceArray],
+        points: HashedPoints,
+        point: Point,
+        sums: tuple[mi.UInt64, mi.UInt64],
+        active: DeviceArray,
+    ) -> None:
+        """Add the path of one point of each ray that leaves by another mirror; its reverse is another ray's."""
+        now, beyond, factor = way
+        there, other = now.rays.seen(points, point), beyond.seen(points, point)
+        half = (there.range_m + other.range_m) * 0.5
+        level = points.strength * point.amplitude * now.gain * factor * dr.sqrt(there.cosine * other.cosine)
+        level /= self._clear(there.range_m) * self._clear(other.range_m)
+        level *= elevation_gain_of_ends(self.sonar, there.tangent, other.tangent)
+        sine = there.sine
+        if self.sonar.beam_pattern == "two_way":
+            level *= overlap(self.sonar, there.sine - other.sine)
+            sine = (there.sine + other.sine) * 0.5
+        self._add(sums, sine, level, (half, *self._turned(half, point)), active & there.mine & other.ahead)
+
     def _clear(self, range_m: DeviceArray) -> DeviceArray:
         """Return ranges for spreading, which is held constant nearer than the window or one bin."""
         near = mi.Float(range_m)
@@ -202,8 +254,16 @@ class GhostTracer:
         add_waves(self.former, self.bits, sums, (sine, half, level, cos, sin), active)
 
 
+def _any_of(ways: list[tuple[FanRays, DeviceArray, DeviceArray]]) -> DeviceArray:
+    """Return which rays have an open way by another mirror."""
+    found = mi.Bool(False)
+    for _, _, is_open in ways:
+        found |= is_open
+    return found
+
+
 def mirrored_on(
-    scene: mi.Scene, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
+    scene: DeviceArray, surfaces: Surfaces, now: MirroredRays, mirrors: mi.Float, wavenumber: float
 ) -> MirroredRays:
     """Follow rays that meet mirrors to the next surface; others end.
 
@@ -220,7 +280,25 @@ def mirrored_on(
     place: DeviceArray = rays.origin + rays.d * hit.t
     beyond = rays.from_lines(mirrored_lines(rays.lines, hit.n, place))
     begin = going_on(place, beyond.d, hit.n)
-    found = surfaces.hit(scene, mi.Ray3f(mi.Point3f(place + beyond.d * begin), beyond.d), active)
+    onward, body = mi.Ray3f(mi.Point3f(place + beyond.d * begin), beyond.d), mi.UInt32(0)
+    if isinstance(surfaces, MovingSurfaces):
+        found, body = surfaces.hit_and_body(scene, onward, active)
+    else:
+        found = surfaces.hit(scene, onward, active)
     length = dr.norm(place - beyond.origin) + begin + found.t
     gain = now.gain * reflection * smooth_share(roughness_m, dr.dot(hit.n, rays.d), wavenumber)
-    return MirroredRays(beyond, replace(found, t=length, valid=found.valid & active), gain)
+    return MirroredRays(beyond, replace(found, t=length, valid=found.valid & active), gain, body)
+
+
+def in_body(turn: list[list[DeviceArray]], rays: FanRays) -> FanRays:
+    """Return rays in the axes of bodies.
+
+    Args:
+        turn: three rows of what turns the world's axes to those of each ray's body, in double precision.
+        rays: in the world.
+    """
+    lines = rays.lines
+    carried = [[sum(row[k] * lines[k][column] for k in range(3)) for column in range(4)] for row in turn]
+    for row, line in zip(turn, carried, strict=True):
+        line[3] += row[3]
+    return rays.from_lines(carried)

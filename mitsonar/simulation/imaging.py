@@ -51,9 +51,10 @@ class Simulator:
 
     Attributes:
         gain: of the closed loop that :meth:`step` renders; None before its first ping.
+        mirrors: as given.
 
     Raises:
-        MitsonarError: no sonar given and none in the scene.
+        MitsonarError: no sonar given and none in the scene; mirrors that move.
     """
 
     def __init__(
@@ -73,9 +74,11 @@ class Simulator:
         from mitsonar.simulation.coherent_imaging import coherent_imager
         from mitsonar.simulation.expected_former import expected_former
         from mitsonar.simulation.image_launch import ImageLaunch
+        from mitsonar.simulation.mirror_parts import refuse_moving_mirrors
         from mitsonar.simulation.moving_scene import motion_in
         from mitsonar.simulation.moving_tracing import tracer_of
         from mitsonar.simulation.scene import sonar_in
+        from mitsonar.simulation.second_mirrors import second_notes
         from mitsonar.simulation.view_tracers import view_tracers
 
         if sonar is None:
@@ -85,9 +88,11 @@ class Simulator:
                     "the scene has no sensor of type imaging_sonar: add one, or name a sonar (--sonar didson300)"
                 )
             sonar = found[0]
-        self.sonar = sonar
+        self.sonar, self.mirrors = sonar, mirrors
         self.motion = motion_in(scene, moving)
         check_timed(sonar, self.motion, views, mirrors)
+        if self.motion is not None:
+            refuse_moving_mirrors(scene, mirrors, self.motion.bodies.shapes)
         one, self.grouped = sonar_of_one_ping(sonar) or sonar, None
         if one is not sonar:
             bodies: Moving | MovingBodies = self.motion.bodies if self.motion else {}
@@ -100,6 +105,7 @@ class Simulator:
         self.tracer = tracer_of(scene, traced, self.motion)
         self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
         self.notes = [*self.notes, *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ())]
+        self.notes += second_notes(scene, mirrors) if sonar.bounces > 2 else []
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
         cells = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.views)

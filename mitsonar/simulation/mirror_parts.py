@@ -7,7 +7,7 @@ of :mod:`mitsonar.acoustics.backscatter`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
@@ -91,6 +91,26 @@ def _of_materials(scene: mi.Scene, asked: str) -> dict[str, MirrorPart]:
         if own is not None:
             found[shape.id()] = own.material
     return found
+
+
+def refuse_moving_mirrors(scene: mi.Scene, mirrors: Mirroring, moving: Collection[str]) -> None:
+    """Refuse mirrors that move: images of the sonar are of planes that stand still.
+
+    Args:
+        scene: any.
+        mirrors: as of :func:`mirror_of`.
+        moving: ids of the shapes that move.
+
+    Raises:
+        MitsonarError: a mirror moves.
+    """
+    found = mirror_of(scene, mirrors)
+    for shape, reflection in zip(scene.shapes(), [] if found is None else found.reflection, strict=found is not None):
+        if reflection != 0 and shape.id() in moving:
+            raise MitsonarError(
+                f"mirrors stand still: got {shape.id()}, which moves; name the mirrors by the ids of still shapes, or leave "
+                "its trajectory out"
+            )
 
 
 def parts_at(table: mi.Float, hit: Hit) -> tuple[DeviceArray, DeviceArray]:

@@ -22,6 +22,9 @@ MOST_FACETS = 2_000_000
 STEEPEST, HIGHEST = 0.5, 0.1
 """A mesh is a plane with waves where no facet leans by more than 60 deg, and rms heights stay below a part of its size."""
 
+FLAT = ("Rectangle", "Disk")
+"""Mitsuba's shapes that are flat."""
+
 SAME_PLANE = 2e-6
 """Facets are on one plane where normals and offsets (as a part of the mesh's size) differ by less."""
 
@@ -119,7 +122,7 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             continue
         name = shape.id()
         kind = shape.class_name()
-        if not isinstance(shape, mi.Mesh) and kind not in ("Rectangle", "Disk"):
+        if not isinstance(shape, mi.Mesh) and kind not in FLAT:
             found.notes.append(
                 f"shape {name} ({kind.lower()}) is curved and mirrors nothing in impulse responses: give it as a mesh"
             )
@@ -137,6 +140,18 @@ def flat_mirrors(scene: mi.Scene, mirrors: Mirrors | None) -> FlatMirrors:
             found.facets.append(MirrorFacets(name, corners, *part))
             mean = _mean_plane(name, place, corners, *part)
             found.means.extend([] if mean is None else [mean])
+    return found
+
+
+def mirror_planes(scene: mi.Scene, mirrors: Mirrors | None) -> list[MirrorPlane]:
+    """Return the planes of a scene's flat mirrors; mirrors that are not flat have none."""
+    found = []
+    for place, shape in enumerate(scene.shapes() if mirrors is not None else []):
+        assert mirrors is not None
+        part = float(mirrors.reflection[place]), float(mirrors.roughness_m[place])
+        if part[0] != 0 and (isinstance(shape, mi.Mesh) or shape.class_name() in FLAT):
+            planes = _planes(_triangles(shape)) or []
+            found += [MirrorPlane(shape.id(), place, normal, offset, *part) for normal, offset in planes]
     return found
 
 

@@ -42,6 +42,8 @@ from mitsonar.simulation.beam_former import BeamFormer, CommonFan
 from mitsonar.simulation.coherent_tracing import STRIP, FanRays, add_waves, elevation_gain
 from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.mirror_parts import Mirrors, parts_at, smooth_share
+from mitsonar.simulation.moving_scene import SceneMotion, scene_at
+from mitsonar.simulation.moving_tracing import surfaces_of
 from mitsonar.simulation.variant import replayed
 
 __all__ = ["LEVEL_PART", "NEIGHBOURS", "FinerRays", "MirrorTracer", "facing_share", "rows_of", "sinc"]
@@ -79,12 +81,23 @@ class MirrorTracer:
         former: gives the grid.
         mirrors: of the scene's shapes.
         finest: parts that a ray's cell is divided into each way, at most.
+        motion: of bodies of the scene, which may hide mirrors; default: all stands still.
     """
 
-    def __init__(self, scene: mi.Scene, sonar: Sonar, former: BeamFormer, mirrors: Mirrors, *, finest: int = FINEST) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sonar: Sonar,
+        former: BeamFormer,
+        mirrors: Mirrors,
+        *,
+        finest: int = FINEST,
+        motion: SceneMotion | None = None,
+    ) -> None:
         assert sonar.frequency_hz is not None
         self.scene, self.sonar, self.former, self.finest = scene, sonar, former, finest
-        self.fan, self.surfaces, self.table = CommonFan.of(sonar), Surfaces.of(scene), mirrors.table()
+        self.motion, self.fan, self.table = motion, CommonFan.of(sonar), mirrors.table()
+        self.surfaces = Surfaces.of(scene) if motion is None else surfaces_of(scene, sonar, motion)
         self.wavelength = sonar.sound_speed / sonar.frequency_hz
         self.wavenumber = 2 * math.pi / self.wavelength
         self.last = former.first_range + (former.ranges - 1) * former.range_step
@@ -103,25 +116,27 @@ class MirrorTracer:
         self.add(pose, field)
         return field
 
-    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64]) -> None:
+    def add(self, pose: NDArray[np.float64], field: NDArray[np.complex64], time_s: float = 0.0) -> None:
         """Add the mirrors' echoes of one ping to its field, in place.
 
         Args:
             pose: of the sonar ``(6,)`` [m, rad].
             field: on the grid ``(sines, ranges)``.
+            time_s: when bodies that move are where they are [s].
 
         Warns:
             MitsonarWarning: once, where cells exceed half the Fresnel radius and no finer ones were traced.
         """
         rows = mi.Float64(to_world_matrices(pose.reshape(1, 6))[0, :3].astype(np.float64).ravel().tolist())
-        wanted = np.array(replayed(self.survey, self.index, self.scene, rows, self.surfaces.arrays(), self.table))
+        scene = scene_at(self.scene, self.motion, time_s)
+        wanted = np.array(replayed(self.survey, self.index, scene, rows, self.surfaces.arrays(), self.table))
         cell = np.flatnonzero(wanted)
         if not len(cell):
             return
         parts = self._parts(np.abs(wanted[cell]))
         self._tell(wanted[cell], parts)
         inputs = tuple(mi.UInt32(padded(part)) for part in _expanded(cell, parts))
-        real, imag = replayed(self.launch, inputs, self.scene, rows, self.surfaces.arrays(), self.table)
+        real, imag = replayed(self.launch, inputs, scene, rows, self.surfaces.arrays(), self.table)
         field.real += np.array(real, copy=False).reshape(field.shape)
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 

@@ -53,6 +53,7 @@ def unfolded(
     rows: list[PlaneRow],
     wavenumber: float,
     active: DeviceArray,
+    moment: DeviceArray = None,
 ) -> tuple[DeviceArray, DeviceArray]:
     """Follow ways from points back to a transducer by its mirrors.
 
@@ -63,6 +64,7 @@ def unfolded(
         rows: the mirrors in the order from the transducer on.
         wavenumber: [rad/m].
         active: ways to follow.
+        moment: number of the moment of each way in a scene that moves; default: 0, or a still scene.
 
     Returns:
         Which ways are open: each leg meets its mirror first, and the last one the transducer. And the product of the
@@ -80,7 +82,7 @@ def unfolded(
         foot = [a + (b - a) * part for a, b in zip(at, far, strict=True)]
         way = [b - a for a, b in zip(at, foot, strict=True)]
         u = mi.Vector3f(*(axis / length(way) for axis in way))
-        active = active & _meets(scene, mi.Point3f(*at) + u * slab, normal, u, row, active)
+        active = active & _meets(scene, mi.Point3f(*at) + u * slab, normal, u, row, active, moment)
         normal = mi.Normal3f(*row.normal)
         facing: DeviceArray = mi.Vector3f(*row.normal)
         cosine = dr.abs(dr.dot(facing, u))
@@ -90,15 +92,24 @@ def unfolded(
     last = [a - b for a, b in zip(at, far, strict=True)]
     distance = length(last)
     u = mi.Vector3f(*(axis / distance for axis in last))
-    return active & ~hidden(scene, mi.Point3f(*at) - u * slab, normal, u, mi.Float(distance) - slab, active), factor
+    start = mi.Point3f(*at) - u * slab
+    return active & ~hidden(scene, start, normal, u, mi.Float(distance) - slab, active, moment), factor
 
 
 def _meets(
-    scene: mi.Scene, at: DeviceArray, normal: DeviceArray, u: DeviceArray, row: PlaneRow, active: DeviceArray
+    scene: mi.Scene,
+    at: DeviceArray,
+    normal: DeviceArray,
+    u: DeviceArray,
+    row: PlaneRow,
+    active: DeviceArray,
+    moment: DeviceArray = None,
 ) -> DeviceArray:
     """Test whether rays from points meet a mirror's plane before anything else."""
     off = (1 + dr.abs(at.x) + dr.abs(at.y) + dr.abs(at.z)) * OFF_SURFACE
     ray = mi.Ray3f(at + normal * dr.select(dr.dot(normal, u) > 0, off, -off), u)
+    if moment is not None:
+        ray.time = moment
     found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)  # type: ignore[call-overload]
     index: DeviceArray = dr.reinterpret_array(mi.UInt32, found.shape)
     met = ray.o + u * found.t

@@ -21,7 +21,7 @@ from mitsonar.simulation.deforming_mesh import DeformingMesh
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.moving_files import motions_of
 
-__all__ = ["MovingScene", "SceneMotion", "carried_back", "motion_in", "scene_of"]
+__all__ = ["MovingScene", "SceneMotion", "carried_back", "motion_in", "scene_at", "scene_of"]
 
 
 @dataclass
@@ -47,6 +47,11 @@ class MovingScene:
     ) -> mi.PreliminaryIntersection3f:
         """Trace rays to the nearest surface; ``shape`` and ``prim_uv`` are of the body's own axes."""
         return self.find(ray, active)[0]
+
+    def ray_test(self, ray: mi.Ray3f, coherent: DeviceArray = True, active: DeviceArray = True) -> DeviceArray:
+        """Test whether anything lies on rays before their ``maxt``."""
+        found, _ = self.find(ray, active)
+        return found.is_valid() & (found.t < ray.maxt)
 
     def find(self, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[mi.PreliminaryIntersection3f, DeviceArray]:
         """Trace rays to the nearest surface; return what they meet and the number of the body, 0 for still shapes."""
@@ -193,6 +198,10 @@ class SceneMotion:
         rows = self.bodies.from_world(time_s)[0]
         return np.concatenate([own[None, :3], rows @ own])
 
+    def body_lines(self, time_s: float) -> NDArray[np.float64]:
+        """Return three rows of what turns the world's axes to its own, and to each body's ``(1 + bodies, 3, 4)``."""
+        return np.concatenate([np.eye(4)[None, :3], self.bodies.from_world(time_s)[0]])
+
     @cached_property
     def first_objects(self) -> int:
         """Return the number below that of the first body's object: the largest that a mesh of the scene gives."""
@@ -214,6 +223,11 @@ def motion_in(scene: mi.Scene, moving: Moving | MovingBodies | None) -> SceneMot
     if not moving:
         return None
     return SceneMotion(scene, moving if isinstance(moving, MovingBodies) else MovingBodies.of(moving))
+
+
+def scene_at(scene: mi.Scene, motion: SceneMotion | None, time_s: float) -> mi.Scene | MovingScene:
+    """Return a scene as it is at a time [s]; itself where nothing moves."""
+    return scene if motion is None else motion.at(time_s)
 
 
 def scene_of(shapes: list[mi.Shape]) -> mi.Scene:

@@ -55,8 +55,12 @@ class MovingSurfaces(Surfaces):
     def hit(self, scene: mi.Scene | MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> Hit:
         """Trace rays to the nearest surface; directions are of the world."""
         assert isinstance(scene, MovingScene)
+        return self.hit_and_body(scene, ray, active)[0]
+
+    def hit_and_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
+        """Trace rays to the nearest surface; return the hit in the axes of the world, and the number of the body."""
         hit, body = self.hit_in_body(scene, ray, active)
-        return replace(hit, n=carried_back(scene.lines(mi.UInt32(ray.time), body), hit.n))
+        return replace(hit, n=carried_back(scene.lines(mi.UInt32(ray.time), body), hit.n)), body
 
     def hit_in_body(self, scene: MovingScene, ray: mi.Ray3f, active: DeviceArray = True) -> tuple[Hit, DeviceArray]:
         """Trace rays to the nearest surface; return the hit in the axes of its body, and the number of the body."""

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.mirror_rules import check_image_mirrors
 from mitsonar.instruments.ping_groups import group_of_beams, one_beam, scans, turned_heads
 from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.binning import Counts
@@ -82,16 +83,10 @@ def check_timed(sonar: Sonar, moving: object, views: Sequence[View] | None, mirr
     """Refuse what has no bodies that move, and no groups of beams.
 
     Raises:
-        MitsonarError: receivers elsewhere or portions; bodies that move, with mirrors or several reflections.
+        MitsonarError: receivers elsewhere or portions; mirrors in a model without them.
     """
     what = "bodies that move" if moving else "ping groups" if sonar.ping_groups > 1 else ""
-    if moving and (mirrors or sonar.bounces > 1):
-        other = "mirrors" if mirrors else "bounces"
-        raise MitsonarError(f"{other} are of still scenes: leave {other} or bodies that move out")
-    if sonar.bounces > 1 and any(not isinstance(view, Whole) for view in views or ()):
-        raise MitsonarError(
-            "receivers elsewhere and portions hear one reflection: leave bounces out, or render the whole view"
-        )
+    check_image_mirrors(sonar, views, bool(mirrors))
     if what and any(not isinstance(view, Whole) for view in views or ()):
         raise MitsonarError(f"receivers elsewhere and portions have no {what}: render the whole view")
 

@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
-from mitsonar.plugins.bsdf_reflectance import reflectances_of, reflectivity_at
+from mitsonar.plugins.bsdf_reflectance import is_black, reflectances_of, reflectivity_at
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.simulation.device_arrays import DeviceArray
@@ -112,7 +112,7 @@ class Scatterers:
         """
         parts, closed, shapes = [], [], []
         for number, shape in enumerate(scene.shapes()):
-            if shape.bsdf() is not None and number not in (smooth or ()):
+            if shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
                 parts.append(_in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number))
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))

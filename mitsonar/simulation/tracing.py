@@ -154,7 +154,13 @@ def free_way(scene: DeviceArray, ray: mi.Ray3f) -> DeviceArray:
 
 
 def hidden(
-    scene: mi.Scene, point: DeviceArray, normal: DeviceArray, u: DeviceArray, distance: DeviceArray, active: DeviceArray
+    scene: mi.Scene,
+    point: DeviceArray,
+    normal: DeviceArray,
+    u: DeviceArray,
+    distance: DeviceArray,
+    active: DeviceArray,
+    moment: DeviceArray = None,
 ) -> DeviceArray:
     """Test whether a surface blocks the line between points of a surface and a receiver.
 
@@ -165,10 +171,13 @@ def hidden(
         u: unit direction from the receiver to the point.
         distance: from the receiver to the point [m].
         active: points to test.
+        moment: number of the moment of each ray in a scene that moves; default: 0, or a still scene.
     """
     size = dr.select(dr.abs(point.x) > dr.abs(point.y), dr.abs(point.x), dr.abs(point.y)) + dr.abs(point.z)
     off = (1 + size) * OFF_SURFACE
     begin = point + normal * dr.select(dr.dot(normal, u) > 0, -off, off)
     ray = mi.Ray3f(begin, -u)
     ray.maxt = distance * (1 - mi.math.ShadowEpsilon)
+    if moment is not None:
+        ray.time = moment
     return scene.ray_test(ray, True, active)  # type: ignore[call-overload]  # the stubs want mi.Bool for coherent

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.worlds.shapes import cylinder, place, slab
 from mitsonar.worlds.world import (
+    BuiltFamily,
     Counts,
-    Family,
     Floor,
     Interval,
     Mesh,
@@ -28,7 +28,7 @@ STEP_M = 5e-6
 """Height difference of objects that overlap [m]: of two at one height the ray tracer would hit either at random."""
 
 
-class FlatObjects(Family):
+class FlatObjects(BuiltFamily):
     """Almost flat objects on a seabed (Almanza-Medina, 5.4.1), anywhere on it, each of one reflectivity."""
 
     size_m: float = Field(50.0, gt=0, le=10_000, description="edge of the square field [m]")
@@ -71,6 +71,7 @@ class FlatObjects(Family):
             meshes=meshes,
             stand=Standpoint((0, -3.5, 2.5), (0, -3.5 + 2.5 / np.tan(np.radians(35)), 0)),
             floor=Floor(self.half_m, Floor.cells(self.seabed_cells, self.seabed_reflectivity, seed)),
+            surface=self.surface,
         )
 
 

@@ -12,7 +12,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from mitsonar.worlds.shapes import place, slab
-from mitsonar.worlds.world import Family, Floor, Mesh, Standpoint, World
+from mitsonar.worlds.world import BuiltFamily, Floor, Mesh, Standpoint, World
 
 __all__ = ["Pattern"]
 
@@ -23,7 +23,7 @@ T = np.array([(-1, 0.5), (0, 0.5), (1, 0.5), (0, -0.5)])
 """Centres of the blocks, in steps: three across, one below the middle."""
 
 
-class Pattern(Family):
+class Pattern(BuiltFamily):
     """The test field of Almanza-Medina, 2.3.
 
     The seed draws the three random seabeds. The other three are pictures: generated stand-ins for Almanza-Medina's
@@ -63,6 +63,7 @@ class Pattern(Family):
             meshes=meshes,
             stand=Standpoint((-2.5, -4.85, 2.5), (-2.5, -4.85 + 2.5 / np.tan(np.radians(35)), 0)),
             floor=Floor(self.half_m, self._seabed(seed)),
+            surface=self.surface,
             pictures=self._pictures(),
         )
 

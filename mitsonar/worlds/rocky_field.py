@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from mitsonar.worlds.perlin_noise import perlin_reflectivity
 from mitsonar.worlds.shapes import box, capsule, cylinder, place
 from mitsonar.worlds.world import (
+    BuiltFamily,
     Counts,
-    Family,
     Floor,
     Interval,
     Mesh,
@@ -36,7 +36,7 @@ class _Kind(NamedTuple):
     a_side: int | None
 
 
-class RockyField(Family):
+class RockyField(BuiltFamily):
     """Rocks on a flat seabed (Almanza-Medina, 3.2.1).
 
     Each kind of rock has its own square grid. Each rock is displaced at random within its grid step, and has its own height,
@@ -83,6 +83,7 @@ class RockyField(Family):
             meshes=meshes,
             stand=Standpoint((0, -3.5, 2.5), (0, -3.5 + 2.5 / np.tan(np.radians(35)), 0)),
             floor=Floor(self.half_m, Floor.cells(self.seabed_cells, self.seabed_reflectivity, seed)),
+            surface=self.surface,
         )
 
     def _rocks(self, kind: _Kind, a_side: int, first_id: int, rng: np.random.Generator) -> Mesh:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from mitsonar.worlds.perlin_noise import perlin_reflectivity
 from mitsonar.worlds.shapes import Copies, cylinder, place
 from mitsonar.worlds.world import (
+    BuiltFamily,
     Counts,
-    Family,
     Floor,
     Interval,
     Mesh,
@@ -25,7 +25,7 @@ from mitsonar.worlds.world import (
 __all__ = ["ShipHull"]
 
 
-class ShipHull(Family):
+class ShipHull(BuiltFamily):
     """The bottom of a ship, laid flat (Almanza-Medina, 3.2.2).
 
     It has groups of elliptical tubes side by side, and sacrificial anodes. The anodes are elliptical too, with their
@@ -70,6 +70,7 @@ class ShipHull(Family):
             meshes=meshes,
             stand=Standpoint((0, -3, 0.32), (0, -3 + 0.32 / np.tan(np.radians(4)), 0), window=(1.5, 5.0)),
             floor=Floor(self.half_m, Floor.cells(self.plate_cells, self.plate_reflectivity, seed), name="plate"),
+            surface=self.surface,
         )
 
     def _tubes(self, rng: np.random.Generator) -> Copies:

@@ -11,11 +11,14 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Counts", "Family", "Floor", "Interval", "Mesh", "Standpoint", "World", "draw", "shifted_grid", "stream", "whole"]
+__all__ = [
+    *("BuiltFamily", "Counts", "Family", "Floor", "Interval", "Mesh", "Standpoint", "World", "draw", "shifted_grid"),
+    *("stream", "whole"),
+]
 
 
 def _rising(pair: tuple[float, float]) -> tuple[float, float]:
@@ -36,6 +39,10 @@ def _counting(pair: tuple[int, int]) -> tuple[int, int]:
 
 Counts = Annotated[tuple[int, int], AfterValidator(_counting)]
 """Lowest and highest number of objects; the number is drawn from both and all between."""
+
+
+SURFACE_MARGIN_M = 25.0
+"""What a sea surface reaches beyond the world [m]."""
 
 
 class Family(BaseModel):
@@ -216,6 +223,23 @@ class Floor:
     </shape>"""
 
 
+class BuiltFamily(Family):
+    """A family whose worlds are built, below a flat sea surface where one is asked for."""
+
+    surface_m: float | None = Field(
+        None, gt=0, le=12_000, description="height of a flat sea surface, shape surface, over z = 0 [m]; without: none"
+    )
+    surface_reflectivity: float = Field(0.0, ge=0, le=1, description="what the surface scatters; a mirror loses the rest")
+
+    @property
+    def surface(self) -> Floor | None:
+        """Return the sea surface, if there is one; it reaches beyond the world, whose border it mirrors as well."""
+        if self.surface_m is None:
+            return None
+        texture = f'<spectrum name="reflectance" value="{self.surface_reflectivity!r}"/>'
+        return Floor(self.half_m + SURFACE_MARGIN_M, texture, self.surface_m, "surface")
+
+
 @dataclass(frozen=True)
 class Standpoint:
     """The sonar in a world: its position, the point on its axis, its window of ranges [m], and its preset."""
@@ -247,6 +271,7 @@ class World:
         meshes: of the world.
         stand: the sonar in it.
         floor: below the meshes, if any.
+        surface: of the sea above them, if any; the last shape.
         pictures: files to copy into the world's folder, by their name there.
         content: files to write into the world's folder, by their name there.
     """
@@ -255,6 +280,7 @@ class World:
     meshes: list[Mesh]
     stand: Standpoint
     floor: Floor | None = None
+    surface: Floor | None = None
     pictures: dict[str, Path] = field(default_factory=dict)
     content: dict[str, bytes] = field(default_factory=dict)
 
@@ -272,6 +298,7 @@ class World:
     def xml(self) -> str:
         """Return the XML of the Mitsuba scene."""
         shapes: Iterable[Floor | Mesh] = [*([self.floor] if self.floor else []), *self.meshes]
+        shapes = [*shapes, *([self.surface] if self.surface else [])]
         about = escape(self.about).replace("--", "- -")
         return f"""<?xml version="1.0" encoding="utf-8"?>
 <!-- {about} -->

@@ -138,6 +138,16 @@ def test_a_scene_of_one_s_own(tmp_path: Path) -> None:
         ({"segments": ["q1"], "receivers": [{"name": "a"}]}, "exclude each other"),
         ({"receivers": [{"name": "a", "starboard_m": 0.5}]}, "jittered columns"),
         ({"receivers": [{"name": "a b"}]}, "a name is letters"),
+        ({"mirrors": {"surface": 3}}, "give [reflection, rms height in m] by the ids of shapes"),
+        ({"mirrors": {"surface": [-1.5, 0]}, "sonar": {**TINY["sonar"], "model": "coherent"}}, "reflections in -1..1"),
+        ({"mirrors": {"surface": [-1, float("nan")]}}, "rms heights in 0..1"),
+        ({"mirrors": {"surface": [True, 0]}}, "give [reflection"),
+        ({"mirrors": {}}, "give [reflection"),
+        ({"mirrors": "material"}, "or the word materials: got 'material'"),
+        ({"mirrors": {"surface": [-1, 0]}}, "the model thesis has no mirrors"),
+        ({"mirrors": "materials", "sonar": {**TINY["sonar"], "model": "physical"}}, "or bounces 2"),
+        ({"world": {**TINY["world"], "surface_m": 2.5}}, "stay below the world's surface_m, 2.5 m: got 2.5 m"),
+        ({"world": {**TINY["world"], "surface_m": -1}}, "surface_m"),
         ({"labels": ["depth"]}, "labels"),
         ({"labels": ["shadow"], "store": "vectors"}, "labels are pixels"),
         ({"sonar": {"ping_groups": 8}}, "one pose"),
@@ -186,3 +196,23 @@ def test_files_that_are_no_recipes(tmp_path: Path) -> None:
         load_recipe("rocky")
     with pytest.raises(MitsonarError, match="not a group"):
         load_recipe("rocky-field", {"seed.world": 3, "scenes.count": 3})
+
+
+def test_keys_of_later_versions_leave_recipes_as_they_were() -> None:
+    """Stores and checkpoints hold these digests and compare these keys: from before there were mirrors."""
+    assert load_recipe("rocky-field").digest() == "2b77fcb199249550"
+    assert load_recipe("rocky-field-coherent").digest() == "cd80394a96e45d3c"
+    plain = load_recipe("rocky-field-coherent")
+    assert not {"mirrors", "recorded"} & set(plain.model_dump(mode="json"))
+    mirrored = load_recipe("rocky-field-coherent", {"mirrors": {"surface": [-1, 0]}, "world.surface_m": 10})
+    assert mirrored.model_dump(mode="json")["mirrors"] == {"surface": [-1, 0]}
+    assert mirrored.digest() != plain.digest()
+
+
+def test_mirrors_of_responses_fit_the_instrument() -> None:
+    from helpers import impulse_recipe
+
+    with pytest.raises(MitsonarError, match=r"bounces 2 need mirrors, .* give the recipe the key mirrors"):
+        impulse_recipe(channel={"bounces": 2})
+    with pytest.raises(MitsonarError, match="mirrors are of the model scatterers"):
+        impulse_recipe(channel={"model": "rays"}, mirrors={"surface": [-1, 0]})

@@ -12,7 +12,6 @@ from helpers import Array, diffuse, essence, floor, plate, scene, sphere
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.views import Segment
-from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:
@@ -171,8 +170,6 @@ def test_what_has_one_reflection_refuses_more() -> None:
     several = SONAR.replace(bounces=2)
     with pytest.raises(MitsonarError, match="portions hear one reflection"):
         Simulator(loaded, several, views=[Segment(several, "port")])
-    with pytest.raises(MitsonarError, match="bounces are of still scenes"):
-        Simulator(loaded, several, moving={"ball": Trajectory(np.zeros((1, 6)), np.zeros(1))})
     with pytest.raises(MitsonarError, match="has no mirrors: give the sonar model coherent, or bounces 2"):
         Simulator(loaded, SONAR, mirrors={"top": (1.0, 0.0)})
     with pytest.raises(MitsonarError, match="give frequency_hz"):

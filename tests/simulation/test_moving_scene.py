@@ -140,11 +140,6 @@ def test_scenes_with_instances_are_refused() -> None:
         Simulator(load_scene("objects"), SONAR, moving={"sand": fixed(Pose(0, 0, 0))})
 
 
-def test_mirrors_are_refused() -> None:
-    with pytest.raises(MitsonarError, match="mirrors are of still scenes"):
-        Simulator(separate(wall=floor()), COHERENT, moving={"wall": along(5)}, mirrors={"wall": (0.5, 0.0)})
-
-
 def test_poses_of_bodies_are_kept(tmp_path: Any) -> None:
     from mitsonar.records.sonar_frames import SonarFrames
 

@@ -23,7 +23,7 @@ from mitsonar.worlds.pattern import Pattern
 from mitsonar.worlds.perlin_noise import perlin_reflectivity
 from mitsonar.worlds.rocky_field import RockyField
 from mitsonar.worlds.ship_hull import ShipHull
-from mitsonar.worlds.world import Mesh, stream, whole
+from mitsonar.worlds.world import BuiltFamily, Mesh, stream, whole
 
 P = 1e-5
 """Smallest p-value. Seeds are fixed, so a right distribution fails never or always; one seed in 100,000 fails."""
@@ -89,6 +89,19 @@ def test_bytes_do_not_change_with_machine_or_version(name: str, wanted: str) -> 
     world = create_family(name, **SMALL[name]).build(7)
     content = world.xml().encode() + b"".join(mesh.ply() for mesh in world.meshes)
     assert hashlib.sha256(content).hexdigest()[:16] == wanted
+
+
+@pytest.mark.parametrize("name", sorted(name for name, family in FAMILIES.items() if issubclass(family, BuiltFamily)))
+def test_a_sea_surface_is_one_shape_more(name: str, tmp_path: Path) -> None:
+    """All else stays; it lies flat at its height, and reaches beyond the world."""
+    plain, covered = (create_family(name, **SMALL[name], **more).build(7) for more in ({}, {"surface_m": 4.5}))
+    content = covered.xml().replace(covered.surface.xml() if covered.surface else "", "")
+    assert content.split() == plain.xml().split()
+    loaded = load_scene(covered.write(tmp_path / "world"))
+    surface = loaded.shapes()[place_of(loaded, "surface")]
+    low, high = (np.array(end, dtype=float).ravel() for end in (surface.bbox().min, surface.bbox().max))
+    np.testing.assert_allclose((low[2], high[2]), 4.5, rtol=1e-6)
+    assert high[0] > create_family(name, **SMALL[name]).half_m + 20
 
 
 def test_a_folder_that_holds_something_is_kept(tmp_path: Path) -> None:

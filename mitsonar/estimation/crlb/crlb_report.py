@@ -56,7 +56,7 @@ def bounds_of_subject(
         for name, value in changes:
             sonar, poses = varied(sonar, poses, heights, name, value)
             heights = np.full_like(heights, value) if name == "height_m" else heights
-        simulator = Simulator(place.scene, sonar, views=subject.views(sonar))
+        simulator = Simulator(place.scene, sonar, views=subject.views(sonar), mirrors=subject.mirrors)
         gain = gain if gain is not None else _gain(simulator, poses)
         for bounds in bounds_at(simulator, poses, noise, gain, pings=pings):
             for key, found in bounds.items():

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.config.recipe_parts import MirrorKeys
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore
@@ -51,6 +52,7 @@ class Subject:
         places: one after another, so that only one scene is in memory.
         poses: in all of them.
         gain: constant; None: set on the frames.
+        mirrors: of all scenes.
     """
 
     sonar: Sonar
@@ -58,6 +60,7 @@ class Subject:
     places: Callable[[], Iterator[Place]]
     poses: int
     gain: float | None
+    mirrors: MirrorKeys = None
 
 
 def subject_of_scene(
@@ -123,7 +126,8 @@ def subject_of_data(
         return recipe.views if recipe.receivers else _views(other, recipe.segments)
 
     own = recipe.instrument if seed is None else recipe.instrument.replace(seed=seed)
-    return Subject(own, views, places, len(chosen), float(store.about["gain"]) if gain is None else gain)
+    gain = float(store.about["gain"]) if gain is None else gain
+    return Subject(own, views, places, len(chosen), gain, recipe.mirrors)
 
 
 def _views(sonar: Sonar, segments: list[str]) -> list[View]:

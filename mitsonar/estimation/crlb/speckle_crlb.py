@@ -79,7 +79,8 @@ class SpeckleBounds:
         self.sonar, self.gain = simulator.sonar, gain
         self.imager = simulator.coherent
         self.halves = self.imager, self.imager.of_quality(OTHER_RAYS[self.sonar.quality])
-        self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar))
+        mirrors = simulator.mirrors if self.sonar.bounces > 1 else None  # one reflection has no expected level of a mirror
+        self.expected = Simulator(simulator.tracer.scene, expected_sonar(self.sonar), mirrors=mirrors)
         noise, volume = self.imager.noise_powers()
         self.noise = np.broadcast_to((noise + volume)[:, None], (self.sonar.range_bins, self.sonar.beams))
         beams = self.imager.beam_correlations()
