@@ -341,7 +341,7 @@ def run_trajectory(job: Job, out: Path) -> Result:
     for name, series in smoothed(found, frames.time_s).items():
         path = path_of(series.motions, start, series.time_s)
         path.save_tum(out / f"{job.name}-{name}.tum")
-        row["paths"][name] = path_errors(path, true, series, start)
+        row["paths"][name] = path_errors(path, true, None if series.covariances is None else pose_covariances(series, start))
     row["paths"] |= mapped_paths(job, frames, found)
     if job.method == "direct":
         frames.save(out / f"{job.name}-frames.npz")
@@ -360,23 +360,19 @@ def smoothed(found: list[Estimate], time_s: Array) -> dict[str, MotionSeries]:
 def mapped_paths(job: Job, frames: SonarFrames, found: list[Estimate]) -> dict[str, dict[str, float]]:
     """Return the errors with a local map, and with a gyroscope beside it."""
     assert frames.poses is not None
-    true, start = Trajectory(frames.poses, frames.time_s), Pose(*frames.poses[0])
+    true = Trajectory(frames.poses, frames.time_s)
     pipeline = partial(odometry, frames, create_estimator(job.method), known=dict(enumerate(found)), local_map=True)
     ways = {"map": pipeline(), "map, gyroscope": pipeline(sensors=simulated_sensors(true, GYRO, seed=0))}
-    return {name: path_errors(way.path, true, way.series, start) for name, way in ways.items()}
+    return {name: path_errors(way.path, true, way.pose_covariances) for name, way in ways.items()}
 
 
-def path_errors(path: Trajectory, true: Trajectory, series: MotionSeries, start: Pose) -> dict[str, float]:
-    """Compute the errors of a path for the table."""
+def path_errors(path: Trajectory, true: Trajectory, covariances: Array | None) -> dict[str, float]:
+    """Compute the errors of a path for the table; covariances are those of its poses ``(frames, 3, 3)``."""
     errors = assess(path, true)
     length = min(1.0, 0.5 * errors.path_m)
     metre = assess(path, true, delta=length, unit="metres")
     off = path.poses[-1, :2] - true.poses[-1, :2]
-    estimated_end = (
-        {}
-        if series.covariances is None
-        else {"told_mm": 1e3 * float(np.sqrt(np.trace(pose_covariances(series, start)[-1, :2, :2])))}
-    )
+    estimated_end = {} if covariances is None else {"told_mm": 1e3 * float(np.sqrt(np.trace(covariances[-1, :2, :2])))}
     return estimated_end | {
         "path_m": errors.path_m,
         "estimated_path_m": errors.estimated_path_m,

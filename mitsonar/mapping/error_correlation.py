@@ -58,4 +58,24 @@ class ErrorCorrelation:
         # a sonar at rest sees the same ground for good: errors stay, but the graph needs some change
         onward = np.exp(-np.maximum(between / (self.length * reach_m), 1e-6))
         lever = np.array([1.0, 1.0, 1.0 / reach_m])
-        return CorrelatedErrors(self.share, onward, self.slope * np.outer(lever, 1 / lever))
+        slope_std = self.slope * np.outer(lever, 1 / lever)
+        return CorrelatedErrors(self.share, onward, slope_std, _spread(moved, onward))
+
+
+def _spread(moved: Array, onward: Array) -> Array:
+    """Spread each motion over those that see the same ground, so that their sum stays ``(n, 3)``.
+
+    A slope over measured motions would take an error that two components share for an error in proportion.
+    """
+    total = _alike(np.ones((len(moved), 1)), onward)
+    return _alike(moved / total, onward)
+
+
+def _alike(values: Array, onward: Array) -> Array:
+    """Sum values ``(n, k)`` with weights that are the correlations of their motions."""
+    before, after = values.copy(), values.copy()
+    for k, stays in enumerate(onward):
+        before[k + 1] += stays * before[k]
+    for k in range(len(onward) - 1, -1, -1):
+        after[k] += onward[k] * after[k + 1]
+    return np.asarray(before + after - values)

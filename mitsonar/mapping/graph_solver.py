@@ -266,7 +266,7 @@ def _add_correlated(rows: _Rows, edges: PoseEdges, correlated: CorrelatedErrors,
     whitening = edges.whitening * own
     by_first, by_second = motion_derivatives(poses, edges.first, edges.second)
     common = np.broadcast_to(np.sqrt(correlated.share) * own * np.eye(3), (count, 3, 3))
-    by_slopes = whitening @ correlated.by_slopes(edges.motions)
+    by_slopes = whitening @ correlated.by_slopes()
     off = _residuals(edges, poses) * own + (common @ wander[..., None])[..., 0] + by_slopes @ slopes
     number, begin = np.arange(count), poses.size
     rows.add(

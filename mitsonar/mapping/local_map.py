@@ -287,7 +287,14 @@ def _adjust(state: _Map) -> None:
     landmarks.refine(number, new.points, new.point_covariance, new.faults)
     state.lean = new.poses[-1, 2:5] - state.told[-1]
     state.poses[first:] = list(new.poses[first - oldest :])
-    state.drift[-1] = new.last_covariance / (last - first)
+    state.drift[-1] = _of_one(new.last_covariance, np.array(state.poses[first - 1 :]))
+
+
+def _of_one(whole: Array, poses: Array) -> Array:
+    """Return the covariance of each of the motions between poses ``(k, 6)``, alike ones that add up to that of the last."""
+    lever = (poses[-1, :2] - poses[:-1, :2]).mean(axis=0)
+    back = np.array([[1, 0, -lever[1]], [0, 1, lever[0]], [0, 0, 1]])
+    return np.asarray(back @ whole @ back.T / (len(poses) - 1))
 
 
 def _relief(frames: SonarFrames, pose: Array, before: float) -> float:
@@ -350,6 +357,4 @@ def _decided(estimate: Estimate, motion: Array, reason: str, drift: Array, pose:
         return replace(estimate, about=about)
     turn = np.eye(3)
     turn[:2, :2] = level_turn(float(pose[5]))
-    # its parts beside the diagonal are those of a whole window, in which a turn displaces the end: not of one motion
-    covariance = np.diag(np.diagonal(turn @ drift @ turn.T))
-    return Estimate(Motion(*motion.tolist()), covariance, True, "", {"map": USED})
+    return Estimate(Motion(*motion.tolist()), turn @ drift @ turn.T, True, "", {"map": USED})

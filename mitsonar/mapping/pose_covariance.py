@@ -96,7 +96,7 @@ def _correlated(series: MotionSeries, correlated: CorrelatedErrors, alone: NDArr
     variance, axes = np.linalg.eigh(series.covariances)
     root = axes * np.sqrt(np.maximum(variance, 0))[:, None] @ axes.swapaxes(1, 2)
     wander = np.sqrt(correlated.share) * root
-    by_shared = np.concatenate([wander, correlated.by_slopes(series.motions)], axis=2)
+    by_shared = np.concatenate([wander, correlated.by_slopes()], axis=2)
     own = (1 - correlated.share) * series.covariances
     if alone is not None:
         by_shared[alone], own[alone] = 0.0, series.covariances[alone]

@@ -84,18 +84,19 @@ class CorrelatedErrors(NamedTuple):
         onward: correlation of that part from each motion to the next ``(motions - 1,)``, 0 to below 1.
         slope_std: standard deviation of the slope of each component's error (rows) over each of the motion (columns), the
             same slopes for all motions ``(3, 3)``.
+        sloped: what the slopes are over, the motions without the errors of single ones ``(motions, 3)``.
     """
 
     share: float
     onward: Array
     slope_std: Array
+    sloped: Array
 
-    def by_slopes(self, motions: ArrayLike) -> Array:
-        """Return the derivative of errors by the nine slopes over motions ``(n, 3)``, in their stds ``(n, 3, 9)``."""
-        moved = np.asarray(motions, dtype=float)
-        table = np.zeros((len(moved), 3, 3, 3))
+    def by_slopes(self) -> Array:
+        """Return the derivative of errors by the nine slopes, in their standard deviations ``(motions, 3, 9)``."""
+        table = np.zeros((len(self.sloped), 3, 3, 3))
         for axis in range(3):
-            table[:, axis, axis] = moved * self.slope_std[axis]
+            table[:, axis, axis] = self.sloped * self.slope_std[axis]
         return table.reshape(-1, 3, 9)
 
 

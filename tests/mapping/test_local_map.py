@@ -19,7 +19,7 @@ from mitsonar.mapping import local_map
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.landmarks import ImageAxes
 from mitsonar.mapping.local_map import mapped
-from mitsonar.mapping.motion_series import path_of
+from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.odometry import odometry, series_of
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.motion.composition import Motion, motions
@@ -113,6 +113,17 @@ def test_heave_that_no_sensor_tells_is_estimated(monkeypatch: pytest.MonkeyPatch
         found = mapped(blind, np.arange(FRAMES), wrong_estimates())
         errors.append(abs(sum(one.motion.forward for one in found) - STEP_M * (FRAMES - 1)))
     assert errors[0] < 0.5 * errors[1], "heave changes the length of the path where it is not estimated"
+
+
+def test_a_window_s_covariance_is_shared_among_motions_that_add_up_to_it() -> None:
+    """Twenty alike motions ahead that turn about the ground: they come back, but for how levers scatter about their mean."""
+    count, step = 20, 0.05
+    one = np.array([[1.2e-5, 0.0, -3.4e-6], [0.0, 4e-8, 0.0], [-3.4e-6, 0.0, 1e-6]])
+    series = MotionSeries(np.tile([0.0, step, 0.0], (count, 1)), np.arange(count + 1.0), np.tile(one, (count, 1, 1)))
+    whole = pose_covariances(series, Pose(0, 0, 0))[-1]
+    poses = path_of(series.motions, Pose(0, 0, 0), series.time_s).poses
+    scatter = np.diag([one[2, 2] * step**2 * (count**2 - 1) / 12, 0, 0])
+    np.testing.assert_allclose(local_map._of_one(whole, poses), one + scatter, rtol=1e-9, atol=1e-18)
 
 
 def test_the_answer_is_a_function_of_frames_and_estimates() -> None:

@@ -330,3 +330,48 @@ def test_errors_of_the_map_say_nothing_of_those_of_two_frames() -> None:
     alike = graph(measured, lambda series: series, start)
     off, before = (abs(one.path.poses[-1, 0] - true.poses[-1, 0]) for one in (apart, alike))
     assert off < before / 2
+
+
+# ---------------------------------------------------------------- correlated errors by least squares
+
+
+def by_least_squares(model: ErrorCorrelation, covariance: Array, moved: Array, yaw_errors: Array, gyro_std: float) -> Array:
+    """What yaw errors, known but for a gyroscope's noise, tell of the errors of motions along a straight line ``(n, 3)``."""
+    count, slope = len(moved), model.of(moved, REACH_M).slope_std
+    way = np.cumsum(np.hypot(moved[:, 0], moved[:, 1]))
+    alike = model.share * np.exp(-np.abs(way[:, None] - way) / (model.length * REACH_M)) + (1 - model.share) * np.eye(count)
+    joint = np.einsum("kl,ab->kalb", alike, covariance)
+    joint += np.einsum("kl,ab->kalb", np.ones((count, count)), np.diag((slope * moved[0] * slope * moved[0]).sum(axis=1)))
+    of_yaw = joint[:, 2, :, 2] + gyro_std**2 * np.eye(count)
+    return np.asarray(np.einsum("kal,l->ka", joint[:, :, :, 2], np.linalg.solve(of_yaw, yaw_errors)))
+
+
+@pytest.mark.parametrize("direction", [(0.012, 0.0), (0.0, 0.012)], ids=["sideways", "forward"])
+def test_a_gyroscope_mends_what_errors_share_with_the_yaw_as_least_squares_do(direction: tuple[float, float]) -> None:
+    """Motions that turn about the ground ahead, with errors of single ones a tenth of the motion, as those of a map."""
+    count, gyro_std, model, rng = 400, 6e-5, ErrorCorrelation(), np.random.default_rng(5)
+    moved = np.tile([*direction, 0.0], (count, 1))
+    covariance = np.array([[1.5e-6, 0, -4e-7], [0, 1e-7, 0], [-4e-7, 0, 1.3e-7]])
+    single = np.diff(1e-3 * rng.normal(size=count + 1))  # poses are registered one by one: these errors do not add up
+    errors = np.outer(single + 7e-5, [1.0, 0.0, -1 / 3.4])
+    gyro = PoseEdges.chain(np.zeros((count, 3)), np.tile(np.diag([10.0, 10.0, gyro_std]) ** 2, (count, 1, 1)))
+    gyro.motions[:, 2] = gyro_std * rng.normal(size=count)
+    measured = moved + errors
+    chain = PoseEdges.chain(measured, np.tile(covariance, (count, 1, 1)))
+    graph = PoseGraph(composed(measured), chain, gyro, correlated=model.of(measured, REACH_M))
+    expected = composed(measured - by_least_squares(model, covariance, moved, measured[:, 2] - gyro.motions[:, 2], gyro_std))
+    found = solved(graph)
+    np.testing.assert_allclose(found.poses[-1, :2], expected[-1, :2], atol=1e-3)
+    assert np.hypot(*(found.poses - composed(moved))[-1, :2]) < 5e-3
+
+
+def test_what_slopes_are_over_adds_up_to_the_path() -> None:
+    """A start from rest, a corner on the spot and errors of single motions: the sums and the corner stay, the errors go."""
+    rng = np.random.default_rng(6)
+    steady = np.concatenate([np.zeros((300, 3)), np.tile([0.0, 0.01, 0.0], (300, 1))])
+    moved = np.concatenate([steady, [[0.0, 0.0, np.pi / 2]], np.tile([0.01, 0.0, 0.0], (300, 1))])
+    noisy = moved + 1e-3 * rng.normal(size=moved.shape)
+    sloped = ErrorCorrelation().of(noisy, REACH_M).sloped
+    np.testing.assert_allclose(sloped.sum(axis=0), noisy.sum(axis=0), atol=1e-12)
+    assert np.abs(sloped[440:460] - moved[440:460])[:, :2].max() < 4e-4
+    assert sloped[600, 2] == pytest.approx(np.pi / 2, rel=0.15)
