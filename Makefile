@@ -5,6 +5,9 @@ VENV ?= .venv
 PIP = $(VENV)/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt
 SOURCES = pyproject.toml constraints.txt
 
+# compiled modules are kept: the tests start Python some hundred times
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-all docs coverage lint bench bench-quick clean system
 
 demo: $(VENV)/.installed

@@ -30,6 +30,7 @@ def test_python_runs(tmp_path: Path) -> None:
             exec(compile(code, "README.md", "exec"), {"__name__": "__readme__"})
 
 
+@pytest.mark.thorough
 def test_commands_run_in_order(tmp_path: Path, mitsonar: Command) -> None:
     """Later commands read what earlier ones made; all share a process, which saves their start."""
     assert len(COMMANDS) >= 4

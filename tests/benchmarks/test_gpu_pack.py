@@ -212,6 +212,7 @@ def asked_of(tmp_path: Path, seconds: float) -> run.Asked:
     return run.Asked(tmp_path, 1.0, "cpu", time.monotonic() + seconds)
 
 
+@pytest.mark.thorough
 def test_a_command_is_stopped_in_time_and_says_why(tmp_path: Path) -> None:
     assert run.command(asked_of(tmp_path, 60), "ok", ["-c", "print('well')"])
     assert "well" in (tmp_path / "logs" / "ok.log").read_text()

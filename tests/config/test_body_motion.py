@@ -48,7 +48,7 @@ def test_mistakes_of_motions(tmp_path: Path, text: str, said: str) -> None:
     ("text", "said"),
     [
         ("sensors: {}", "sensors"),
-        ("- a", "must hold the keys sensors"),
+        ("- a", "must hold the key sensors, and moving where bodies move"),
         ("sensors: {a: {sonar: didson300, camera: {}}}", "a sensor is one of .*got sonar and camera"),
         ("sensors: {a: {mount: [0, 0, 0, 0, 0, 0]}}", "got none"),
         ("sensors: {a: {camera: {fov: 3}}}", "sensor a: unknown sensor key camera.fov: did you mean fov_deg"),

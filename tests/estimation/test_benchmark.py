@@ -112,6 +112,7 @@ def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
     assert {"heave 5 mm", "jitter", "as told"} < set(VARIATIONS)
 
 
+@pytest.mark.thorough
 def test_rendered_again_unchanged_is_what_is_stored(pairs: SonarPairs) -> None:
     """World, gain, jitter, noise: bit for bit."""
     numbers = [1, 5, 9]

@@ -309,6 +309,7 @@ def test_floors_of_measured_scenes_take_a_material_on_demand(name: str) -> None:
     assert [one.material.name for one in asked if type(one).__name__ == "AcousticMaterial"] == ["gravel"]
 
 
+@pytest.mark.thorough
 def test_no_material_is_a_diffuse_surface() -> None:
     noise = {"type": "cell_noise", "cells": 50}
     got = reflectivity(scene(f=floor(made_of("none", reflectance=noise), 3)), down(900, 0.9))
