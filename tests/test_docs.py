@@ -27,9 +27,6 @@ DOCS = ROOT / "docs"
 BLOCK = re.compile(r"(?:<!-- notest: *(?P<reason>[^\n]*?) *-->\n)?```(?P<kind>sh|python|xml)\n(?P<text>.*?)```", re.DOTALL)
 USES = re.compile(r"<!-- uses: *(.+?) *-->")
 
-QUICK = ("guides/scenes.md",)
-"""Pages that `make test` runs; the others are marked `docs`."""
-
 WITH_TORCH = ("guides/data-sets.md", "guides/networks.md")
 
 SMALL_SCENES = "scenes=[{count: 2, sequences: 6}]"
@@ -129,7 +126,7 @@ def run_xml(text: str) -> None:
 
 def marked(page: str) -> object:
     """The page as a parameter, with its markers."""
-    marks = ([] if page in QUICK else [pytest.mark.docs]) + ([pytest.mark.learn] if page in WITH_TORCH else [])
+    marks = [pytest.mark.docs] + ([pytest.mark.learn] if page in WITH_TORCH else [])
     return pytest.param(page, marks=marks)
 
 

@@ -7,6 +7,7 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
 from helpers import Command
 
 ROOT = Path(__file__).parent.parent

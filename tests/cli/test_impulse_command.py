@@ -178,6 +178,7 @@ SEA = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.thorough
 def test_a_sea_surface_is_a_mirror_of_ones_own_scene(mitsonar: Command, tmp_path: Path) -> None:
     """`world sea-surface`, then its material (--mirrors) or numbers of one's own (--mirror) give the same bits."""
     made = mitsonar("world", "sea-surface", "--wind-m-s", 2, "--size-m", 8, "--step-m", 0.1, "-o", tmp_path / "sea")

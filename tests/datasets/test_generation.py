@@ -373,6 +373,7 @@ def test_shards_of_a_lost_worker_are_handed_out_again() -> None:
 
 
 @pytest.mark.e2e
+@pytest.mark.thorough
 def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     done = by_itself(*command(tmp_path, "--workers", 2))
     assert done.returncode == 0, done.stderr
@@ -870,6 +871,7 @@ def test_worlds_from_the_command_line(mitsonar: Command, tmp_path: Path) -> None
         assert words in helped.replace("\n", " "), helped
 
 
+@pytest.mark.thorough
 def test_sheets_of_vectors_and_views(tmp_path: Path) -> None:
     recipe = tiny_recipe(scenes=[{"count": 1, "sequences": 10}], **VARIANTS["segments"] | {"store": "vectors"})
     make_dataset(recipe, str(tmp_path / "data.zarr"))

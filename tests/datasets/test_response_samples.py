@@ -379,6 +379,7 @@ def test_the_wrong_kind_of_data_set_is_one_sentence(made: Path) -> None:
         SonarPairs(made)
 
 
+@pytest.mark.thorough
 def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Path, tmp_path: Path) -> None:
     """RMSE in the table against the estimator asked by hand."""
     pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")

@@ -88,6 +88,7 @@ class Echoing:
         return Estimate(Motion(0.0, 0.02, 0.0), about={"height_m": 2 + time / 10, "height_std_m": 0.04, "correlation": 1.0})
 
 
+@pytest.mark.thorough
 def test_a_resumed_run_has_the_same_profile(source: FrameSource, tmp_path: Path) -> None:
     run_odometry(source, "echoing", Echoing(), tmp_path / "run")
     table = (tmp_path / "run/height_profile.csv").read_bytes()

@@ -104,6 +104,7 @@ def test_the_map_takes_out_what_pairs_of_frames_get_wrong() -> None:
     assert 1e-4 < np.sqrt(covariance[0, 0]) < 0.02
 
 
+@pytest.mark.thorough
 def test_heave_that_no_sensor_tells_is_estimated(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = run(0.012)
     blind = FrameSource.of(replace(frames, poses=None)).with_geometry(pitch_rad=np.radians(35))

@@ -256,7 +256,7 @@ MOTIONS = {
 }
 
 
-ESSENCE = ("side 5 mm", "forward 2 mm", "yaw 0.1 deg")
+ESSENCE = ("forward 2 mm",)
 SHIFTS = np.arange(14)[:, None] * np.array([0.7, 0.2, 0, 0, 0, 0])
 CELLS = np.ix_(np.arange(24, 168, 8), np.arange(4, 44, 3))
 """Bins and beams that are compared."""

@@ -29,6 +29,7 @@ def basin(variant: str) -> mi.Scene:
 
 
 @pytest.mark.parametrize(("pattern", "bounces"), essence([("two_way", 2), ("two_way", 3), ("receive", 3)], ("receive", 3)))
+@pytest.mark.thorough
 def test_the_mean_is_that_of_the_model_physical(basin: mi.Scene, pattern: str, bounces: int) -> None:
     """Sums over all beams in six parts of the range: 12 % each, 4 % of all."""
     from mitsonar.simulation.coherent_imaging import CoherentImager

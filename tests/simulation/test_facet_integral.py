@@ -68,6 +68,7 @@ def test_facets_may_be_of_any_size_below_the_fresnel_radius() -> None:
     assert abs(coarse / fine - 1) < 0.02
 
 
+@pytest.mark.thorough
 def test_the_mean_field_of_random_heights_falls_as_rayleigh_says() -> None:
     """Independent plane heights of rms h move the phase: their mean is exp(-2 k^2 h^2 cos^2), as the roughness gives it."""
     height, rng = 0.006, np.random.default_rng(3)

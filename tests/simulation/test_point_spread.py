@@ -163,6 +163,7 @@ QUICK = (("DIDSON", 2.0), ("ARIS", 3.0))
         for at in (2.0, 3.0, 4.4, 12.0)
     ],
 )
+@pytest.mark.thorough
 def test_focus_against_exact_ways_to_the_elements(name: str, focus_m: float) -> None:
     """Near field of a lens: the level in each beam relative to the top in focus, 0.5 dB down to -30 dB, blurred or not."""
     loaded, fields, place = one_point()

@@ -330,6 +330,7 @@ def test_without_torch_the_extra_is_named(run: Path) -> None:
     assert "pip install 'mitsonar[learn]'" in said
 
 
+@pytest.mark.thorough
 def test_odometry_and_compare_take_checkpoints(
     mitsonar: Command, checkpoint: Checkpoint, made: Path, run: Path, tmp_path: Path
 ) -> None:

@@ -620,6 +620,7 @@ def run_command(*words: object) -> Any:
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
+@pytest.mark.thorough
 def test_the_command_line_trains_stops_in_time_and_goes_on(made: Path, tmp_path: Path) -> None:
     """Its own sentences, and nothing of Lightning's."""
     told, out = tmp_path / "mine.yaml", tmp_path / "run"

@@ -72,6 +72,7 @@ def test_of_a_ship_it_sees_a_part_from_nearby_and_says_so(tmp_path: Path) -> Non
     assert world.stand.window[1] <= REACH[world.stand.preset]
 
 
+@pytest.mark.thorough
 def test_the_printed_command_shows_the_object(mitsonar: Command, tmp_path: Path) -> None:
     """In the guide's own scene, some pixels are far brighter than the ground, and none is at the maximum for noise."""
     (tmp_path / "w.sdf").write_text(f'<sdf version="1.9"><world name="w">{GROUND}{WALL}{ROV}</world></sdf>')

@@ -113,6 +113,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(options: dict[str, Any], sai
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.thorough
 def test_images_have_ghosts_where_the_flat_surface_says_and_waves_take_a_part(tmp_path: Path) -> None:
     """A ball of 5 cm, 0.8 m below: one way by the surface half the way round, both ways the image's range; within 5 mm."""
     import mitsuba as mi

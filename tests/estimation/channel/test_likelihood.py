@@ -297,6 +297,7 @@ def test_pings_too_far_apart_are_refused_at_once(name: str) -> None:
         create_estimator(name).estimate(replace(good, time_s=good.time_s[0] + np.array([0.0, 10.0])))
 
 
+@pytest.mark.thorough
 def test_parts_of_a_band_hold_all_of_it_and_tell_independently() -> None:
     """Echoes in each part of the whole's response are those that the part would hear; two parts have nothing in common."""
     wide = SONAR.replace(bandwidth_hz=9600.0, sampling_hz=16000.0)

@@ -154,6 +154,7 @@ def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("noise_db", essence([-90.0, -75.0], -90.0))
+@pytest.mark.thorough
 def test_an_oracle_of_the_scatterers_reaches_the_grain_bound(noise_db: float) -> None:
     """At a high and at a low ratio of echo to noise."""
     value = grain_oracle(limits(noise_db, even=True), 12)
