@@ -178,6 +178,7 @@ def test_import_sets_no_variant_and_loads_no_renderer() -> None:
     """)
 
 
+@pytest.mark.thorough
 def test_public_names_are_all_there() -> None:
     run_python("""
         import mitsonar

@@ -84,6 +84,7 @@ def in_common(a: Path, b: Path) -> tuple[NDArray[np.float32], NDArray[np.float32
     return canvas[0][both], canvas[1][both]
 
 
+@pytest.mark.thorough
 def test_a_rendered_run_becomes_its_path_and_its_map(mitsonar: Command, rendered: Path, tmp_path: Path) -> None:
     out = tmp_path / "odometry"
     done = mitsonar("odometry", rendered, "-o", out, "--estimator", "direct")
@@ -145,6 +146,7 @@ def test_sensors_and_loops_make_a_graph(mitsonar: Command, drawn: Path, tmp_path
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "no", "--loops", "--smooth", "kalman"), "smooth", "exclude")
 
 
+@pytest.mark.thorough
 def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) -> None:
     """Height and pitch given on the command line lead to the motions that frames with both tell."""
     path = sway(8)
@@ -341,6 +343,7 @@ def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Comman
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "y", "--frame", "nde"), "unknown frame 'nde'", "did you mean ned?")
 
 
+@pytest.mark.thorough
 def test_a_local_map_resumes_to_the_same_bits(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     done = mitsonar("odometry", drawn, "--map", "-o", whole)

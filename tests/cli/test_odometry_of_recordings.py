@@ -31,6 +31,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.thorough
 def test_the_path_of_a_recording_is_that_of_its_sonar(recording: Path, mitsonar: Command, tmp_path: Path) -> None:
     done = mitsonar("odometry", recording, "-o", tmp_path / "path", "--height", 2.5, "--pitch-deg", 35, "--closure", 8)
     assert done.returncode == 0, done.stderr

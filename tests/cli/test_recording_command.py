@@ -74,7 +74,7 @@ def test_show_and_video(mitsonar: Command, places: dict[str, Path], tmp_path: Pa
     assert (tmp_path / "a.mp4").stat().st_size > 1000
 
 
-@pytest.mark.parametrize("kind", ["npz", "zarr", "mcap"])
+@pytest.mark.parametrize("kind", essence(["npz", "zarr", "mcap"], "mcap"))
 def test_frames_survive_folder_and_mcap_in_any_order(
     mitsonar: Command, places: dict[str, Path], frames: SonarFrames, tmp_path: Path, kind: str
 ) -> None:
@@ -106,6 +106,7 @@ def test_labels_of_a_run_become_points(mitsonar: Command, places: dict[str, Path
     assert recording_at(places[kind]).part().read([1, 4]).elevation_rad == pytest.approx(-0.6)
 
 
+@pytest.mark.thorough
 def test_frames_become_an_aris_file(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
     refused(mitsonar("recording", "convert", places["mcap"], "-o", tmp_path / "a.aris"), "--beams 96")
     done = mitsonar("recording", "convert", places["mcap"], "-o", tmp_path / "a.aris", "--beams", 96)

@@ -549,6 +549,7 @@ def test_wrong_labels_are_found(made: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.e2e
+@pytest.mark.thorough
 def test_a_second_writer_is_told_and_changes_nothing(made: Path, tmp_path: Path) -> None:
     url = tmp_path / "tiny.zarr"
     script = f"""
@@ -783,6 +784,7 @@ def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: 
     refused(by_itself(*arguments), "cannot list s3://bucket/tiny.zarr", "endpoint")
 
 
+@pytest.mark.thorough
 def test_a_writer_that_was_taken_over_stops(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a long stall another has gone on: this one must neither write on nor take the lock back."""
     monkeypatch.setattr("mitsonar.io.storage.HEARTBEAT_S", 0.05)

@@ -335,6 +335,7 @@ def test_stores_are_read_without_a_renderer(made: Path) -> None:
 # ---------------------------------------------------------------- rendered
 
 
+@pytest.mark.thorough
 def test_rendered_samples_are_those_of_a_store_of_their_worlds(tmp_path: Path) -> None:
     """Two routes, bit for bit, jitter included: through a store on disk, and straight from the renderer."""
     recipe = tiny_recipe(scenes=[{"count": 2, "sequences": 6}], sonar__jitter=True)

@@ -218,6 +218,7 @@ def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[
 
 
 @pytest.mark.learn
+@pytest.mark.thorough
 def test_a_network_is_trained_on_it_and_evaluated(places: dict[str, Path], tmp_path: Path) -> None:
     pytest.importorskip("torch")
     from mitsonar.config.training_recipe import training_recipe_from

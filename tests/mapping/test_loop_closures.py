@@ -250,6 +250,7 @@ def test_a_compass_tells_the_first_heading_where_nothing_else_does(round_trip: t
     assert np.degrees(np.sqrt(found.graph.covariances[0, 2, 2])) < 1
 
 
+@pytest.mark.thorough
 def test_a_run_s_folder_keeps_registrations_and_resumes_to_the_same_bits(
     round_trip: tuple[SonarFrames, Drifting], tmp_path: Path
 ) -> None:

@@ -310,6 +310,7 @@ def test_order_does_not_matter() -> None:
         np.testing.assert_allclose(other.std[both], maps[0].std[both], atol=5e-5)
 
 
+@pytest.mark.thorough
 def test_illumination_is_taken_out() -> None:
     """A fall-off that moves with the sonar: without it, the ground is the same from everywhere and near and far alike."""
     poses = [looking(0, x=0.12 * k, y=0.1 * k) for k in range(20)]
@@ -508,6 +509,7 @@ def test_geotiff_says_where_its_cells_are(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*")), "no part is left"
 
 
+@pytest.mark.thorough
 def test_figures_are_written(tmp_path: Path) -> None:
     mosaic = small_mosaic()
     path = Trajectory.between(looking(0, x=5, y=-7), looking(20, x=5.5, y=-7), 30, 10)

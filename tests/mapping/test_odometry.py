@@ -165,6 +165,7 @@ def test_errors_over_relief_are_alike_and_those_over_even_ground_are_not() -> No
     assert odometry(over_ground(sway(16)), Direct(), smooth="kalman").correlated is None
 
 
+@pytest.mark.thorough
 def test_workers_change_no_bit() -> None:
     frames = over_ground(sway(3 * PAIRS_A_BATCH), noise=0.05)
     one, two = (odometry(frames, Direct(), workers=workers) for workers in (1, 2))

@@ -288,6 +288,7 @@ def test_render_reads_and_writes_the_convention_that_is_named(variant: str, mits
     )
 
 
+@pytest.mark.thorough
 def test_the_figure_of_the_documentation_is_drawn(tmp_path: Path) -> None:
     script = Path(__file__).parents[2] / "docs" / "draw_conventions.py"
     done = subprocess.run([sys.executable, script, "--quick", "--out", tmp_path / "a.png"], check=False, capture_output=True)

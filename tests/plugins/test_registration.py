@@ -126,6 +126,7 @@ def test_order_of_imports_and_variants(order: str) -> None:
     run_python(textwrap.dedent(SCENE) + textwrap.dedent(ORDERS[order]))
 
 
+@pytest.mark.thorough
 def test_a_scene_outlives_a_change_of_variant_and_back() -> None:
     """A scene loaded before still renders the same, and its sonar is still found."""
     run_python(textwrap.dedent(SCENE) + textwrap.dedent(KEPT))

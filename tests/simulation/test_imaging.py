@@ -321,6 +321,7 @@ def test_a_replayed_launch_gives_what_a_new_one_gives(flat: mi.Scene) -> None:
     np.testing.assert_array_equal(replayed.height_m, new.height_m)
 
 
+@pytest.mark.thorough
 def test_python_may_collect_garbage_at_any_time() -> None:
     """One simulator after another: freeing the arrays of the first while a launch of the second is recorded would end the
     process, for Dr.Jit cannot record it."""

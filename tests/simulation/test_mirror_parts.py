@@ -186,6 +186,7 @@ def test_a_material_gives_its_mirror_part() -> None:
     assert abs(echo(source) / echo(tracer(loaded, target=(1.0, 0.0)))) == pytest.approx(wanted, rel=2e-3)
 
 
+@pytest.mark.thorough
 def test_without_mirrors_the_bits_are_the_same() -> None:
     loaded = scene(ground=floor(diffuse(0.5)), behind=sphere([0, -5, 2.5], 0.3))
     pose = np.array([0, 0, 2.5, math.radians(35), 0, 0])

@@ -83,6 +83,7 @@ def test_hydrophones_and_bodies_that_move_are_refused(tank: Path) -> None:
         VehicleSimulator(load_scene(tank), sensors, moving={"fish": FISH}).render(PATH)
 
 
+@pytest.mark.thorough
 def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import NOISE_MODELS
     from mitsonar.simulation.render_run import Outputs

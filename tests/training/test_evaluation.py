@@ -463,6 +463,7 @@ def test_heights_are_evaluated_in_mm(many: dict[str, Path], mitsonar: Command, t
     assert row["slope"] == pytest.approx([(-0.1 * (truth - 2.6)).sum() / ((truth - 2.6) ** 2).sum()], rel=1e-4)
 
 
+@pytest.mark.thorough
 def test_data_that_do_not_fit_are_refused(
     mitsonar: Command, many: dict[str, Path], run: Path, checkpoint: Checkpoint, made: Path, tmp_path: Path
 ) -> None:

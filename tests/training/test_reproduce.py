@@ -313,6 +313,7 @@ def told(out: Path) -> dict[str, Any]:
 
 
 @pytest.mark.e2e
+@pytest.mark.thorough
 def test_a_table_from_nothing(whole: Path) -> None:
     rows = told(whole)
     assert set(rows) == set(ROWS)
@@ -340,6 +341,7 @@ def test_a_table_from_nothing(whole: Path) -> None:
     assert (whole / "table-3.6.png").stat().st_size > 10_000
 
 
+@pytest.mark.thorough
 def test_unseen_scenes_are_evaluated_as_the_network_says(whole: Path) -> None:
     """RMSE in the table against the network asked by hand."""
     (url,) = (path for path in (whole / "data").iterdir() if "unseen" in path.name)
@@ -402,6 +404,7 @@ def test_killed_and_called_again_it_reaches_the_same_table(
         assert all(torch.equal(mine[key], others[key]) for key in others)
 
 
+@pytest.mark.thorough
 def test_what_is_done_is_not_done_again(whole: Path) -> None:
     before = told(whole)
     runs = {path: path.stat().st_mtime_ns for path in (whole / "runs").rglob("*") if path.is_file()}

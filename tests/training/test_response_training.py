@@ -187,6 +187,7 @@ def test_a_broken_training_goes_on_to_the_same_bits(made: Path, run: Path, tmp_p
     assert Checkpoint.load(tmp_path / "run").digest == Checkpoint.load(run).digest
 
 
+@pytest.mark.thorough
 def test_errors_are_told_beside_no_motion(mitsonar: Command, made: Path, run: Path) -> None:
     report = evaluate(Checkpoint.load(run), made, noise=["none", "0 dB"])
     assert [table["noise"] for table in report["tables"]] == ["none", "0 dB"]

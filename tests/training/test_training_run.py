@@ -213,6 +213,7 @@ def test_order_belongs_to_seed_and_epoch_and_is_skipped_by_index() -> None:
         assert sorted(first + second) == sorted(batch)
 
 
+@pytest.mark.thorough
 def test_of_several_noise_levels_each_sample_draws_one(made: Path) -> None:
     """Whole samples of one level, wherever they stand in a batch; another level in another epoch; all about as often."""
     words: dict[str, Any] = {"part": "all", "layout": "channels", "coordinates": "both", "cartesian_rows": 30, "seed": 3}
@@ -257,6 +258,7 @@ def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
         assert one["frames"].tolist() == samples.first[[number for _, number in planned]].tolist()
 
 
+@pytest.mark.thorough
 def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds that lie behind are not built again; what waited in the buffer is."""
     words: dict[str, Any] = {"sequences_a_world": 3, "buffer": 6, "gain": 0.02, "noise": "none"}

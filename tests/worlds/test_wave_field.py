@@ -31,6 +31,7 @@ def test_heights_have_the_variance_of_the_spectrum(spectrum: WaveSpectrum) -> No
     assert abs(each.mean() - spectrum.variance(SHORT)) < 3 * error
 
 
+@pytest.mark.thorough
 def test_a_small_patch_rides_on_long_waves() -> None:
     """On 4 m, where the peak is 88 m long, heights are Gaussian of the whole variance, and slopes those of the spectrum."""
     spectrum = pierson_moskowitz(10.0)

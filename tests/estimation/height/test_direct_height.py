@@ -256,6 +256,7 @@ class TestNetworks:
         }
         return train(training_recipe_from({**small, **words}), data, run)
 
+    @pytest.mark.thorough
     def test_a_network_tells_the_height(self, heights: Path, tmp_path: Path, mitsonar: Command) -> None:
         from mitsonar.datasets.torch_pairs import SonarPairs
         from mitsonar.estimation.height.height_network import HeightNetwork
