@@ -242,9 +242,8 @@ def read_sdf(
     reader.collect(whole, np.eye(4), ())
     for name in joints:
         if name not in reader.joint_names and not any(one.endswith(f"::{name}") for one in reader.joint_names):
-            raise MitsonarError(
-                f"{path} has no joint {shortened(name)} that moves: {nearest_names(name, reader.joint_names)}"
-            )
+            there = nearest_names(name, reader.joint_names) if reader.joint_names else "it has none"
+            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {there}")
     return reader.found
 
 

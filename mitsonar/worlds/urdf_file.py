@@ -6,14 +6,15 @@ for URDF (yourdfpy, urchin) open any path that a file names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names, shortened
 from mitsonar.worlds.model_pieces import UNCOLOURED, Piece, one_number
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.plain_xml import attribute_of, number_of, numbers_of, read_xml, refused
@@ -25,6 +26,9 @@ MOVING = ("revolute", "continuous", "prismatic")
 """Types of joints that have one value; others are read as fixed."""
 
 MOST_MIMICS = 20
+
+FULL_TURN = 6.3
+"""Angles beyond this are told [rad]."""
 
 
 def read_urdf(
@@ -119,7 +123,8 @@ def check_joint_names(path: Path, asked: Mapping[str, float], known: list[str]) 
     """
     for name, value in asked.items():
         if name not in known:
-            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {nearest_names(name, known)}"[:400])
+            there = nearest_names(name, known) if known else "it has none"
+            raise MitsonarError(f"{path} has no joint {shortened(name)} that moves: {there}"[:400])
         if not abs(value) <= 1e6:
             raise MitsonarError(f"joint {name} needs a finite number [rad, m]: got {value:g}")
 
@@ -149,6 +154,8 @@ def _value_of(path: Path, name: str, joints: dict[str, Element], asked: Mapping[
                 high = number_of(path, joint, limit.get("upper"), 0.0)
                 if not low <= value <= high:
                     raise MitsonarError(f"joint {name} must lie in {low:g}..{high:g} [rad, m]: got {value:g}")
+            if joint.get("type") == "continuous":
+                _warn_of_degrees(f"joint {name}", [value])
             return factor * value + offset
         offset += factor * number_of(path, joint, mimic.get("offset"), 0.0)
         factor *= number_of(path, joint, mimic.get("multiplier"), 1.0)
@@ -180,6 +187,14 @@ def joint_motion(path: Path, joint: Element, kind: str, axis: tuple[float, ...],
     return placed(along) if kind == "prismatic" else placed(np.zeros(3), Rotation.from_rotvec(along))
 
 
+def _warn_of_degrees(what: str, angles: Iterable[float]) -> None:
+    """Warn of angles [rad] beyond a turn: they look like degrees."""
+    largest = max(map(abs, angles))
+    if largest > FULL_TURN:
+        told = f"{what} is in radians and holds {largest:g}, more than a turn: are these degrees?"
+        warnings.warn(told, MitsonarWarning, stacklevel=2)
+
+
 def _origin(path: Path, element: Element) -> Matrix:
     """Return the pose in the child ``origin`` of an element; rpy are turns about the fixed axes x, y, z."""
     origin = element.find("origin")
@@ -187,6 +202,7 @@ def _origin(path: Path, element: Element) -> Matrix:
         return np.eye(4)
     position = numbers_of(path, element, origin.get("xyz"), 3, (0.0, 0.0, 0.0))
     rpy = numbers_of(path, element, origin.get("rpy"), 3, (0.0, 0.0, 0.0))
+    _warn_of_degrees(f"{path}, <{element.tag}>: rpy", rpy)
     return placed(position, Rotation.from_euler("xyz", rpy))
 
 

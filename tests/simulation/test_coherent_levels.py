@@ -41,6 +41,7 @@ def narrow(name: str) -> Sonar:
         model="coherent", frequency_hz=base.frequency_hz or 1e6, source_level_db=SOURCE_DB, coding="dB", coding_db=200.0,
         elevation_pattern="box", elevation_fov_deg=40.0, azimuth_fov_deg=12.0, beam_layout="even",
         beams=max(8, round(12 * base.beams / base.azimuth_fov_deg)), beam_width_deg=math.degrees(base.beam_width_rad),
+        ping_groups=1,
         noise_level_db=None, near_glow_db=0.0, volume_db=None, stripes_db=0.0, crosstalk_db=None, speckle_nu=None,
         scatterers_per_cell=12.0,
     )  # fmt: skip

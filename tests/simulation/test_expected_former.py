@@ -61,7 +61,8 @@ def test_the_sonar_equation_holds_for_every_preset(name: str) -> None:
     base = preset(name)
     places = [r for r in (1.0, 2.0, 4.4, 8.0, 20.0, 39.0) if base.range_min + 0.5 < r < base.range_max - 0.5]
     assert places
-    narrow = {"azimuth_fov_deg": 12.0, "beams": max(8, round(12 * base.beams / base.azimuth_fov_deg)), "beam_layout": "even"}
+    beams = max(8, round(12 * base.beams / base.azimuth_fov_deg))
+    narrow = {"ping_groups": 1, "azimuth_fov_deg": 12.0, "beams": beams, "beam_layout": "even"}
     sonar = base.replace(
         model="physical", frequency_hz=base.frequency_hz or 1e6, pattern="two_way", gain_exponent=0, gain_absorption=False,
         beam_width_deg=math.degrees(base.beam_width_rad), rays_per_beam=900, rays_across=16, **narrow,

@@ -66,6 +66,26 @@ def test_a_scaled_mesh_a_colour_and_a_mimic_are_read(tmp_path: Path) -> None:
         imported_world(tmp_path / "crane.urdf", joints={"shoulder": np.nan})
 
 
+def test_degrees_in_place_of_radians_are_told(tmp_path: Path) -> None:
+    box = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
+    joint = '<joint name="hinge" type="continuous"><parent link="a"/><child link="b"/><origin rpy="0 90 0"/></joint>'
+    (tmp_path / "arm.urdf").write_text(f'<robot><link name="a">{box}</link><link name="b">{box}</link>{joint}</robot>')
+    with pytest.warns(MitsonarWarning, match=r"rpy is in radians and holds 90, more than a turn"):
+        imported_world(tmp_path / "arm.urdf")
+    with (
+        pytest.warns(MitsonarWarning, match=r"rpy"),
+        pytest.warns(MitsonarWarning, match=r"joint hinge is in radians and holds 45"),
+    ):
+        imported_world(tmp_path / "arm.urdf", joints={"hinge": 45})
+
+
+def test_a_model_without_joints_says_so(tmp_path: Path) -> None:
+    box = "<visual name='v'><geometry><box><size>1 1 1</size></box></geometry></visual>"
+    (tmp_path / "box.sdf").write_text(f"<sdf version='1.7'><model name='m'><link name='l'>{box}</link></model></sdf>")
+    with pytest.raises(MitsonarError, match="no joint 'q' that moves: it has none"):
+        imported_world(tmp_path / "box.sdf", joints={"q": 1})
+
+
 def test_collision_shapes_are_read_in_place_of_visual_ones(tmp_path: Path) -> None:
     make_urdf(tmp_path)
     world = imported_world(tmp_path / "crane.urdf", collision=True)
