@@ -124,11 +124,12 @@ def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:
         motions: sideways, forward [m], yaw [rad].
         canvas: the ground that frames show; None: not known how far ahead of the sonar.
     """
-    if canvas is None:
-        return ErrorCorrelation().of(motions, DEFAULT_REACH_M)
-    # without relief errors are noise, which no two pairs share
-    law = ErrorCorrelation(share=0.0) if canvas.view.attitude.even else ErrorCorrelation()
-    return law.of(motions, canvas.reach_m)
+    return _law_over(canvas).of(motions, DEFAULT_REACH_M if canvas is None else canvas.reach_m)
+
+
+def _law_over(canvas: Canvas | None) -> ErrorCorrelation:
+    """Return the law of errors over ground: without relief errors are noise, which no two pairs share."""
+    return ErrorCorrelation(share=0.0) if canvas is not None and canvas.view.attitude.even else ErrorCorrelation()
 
 
 def graph_path(
@@ -158,9 +159,9 @@ def graph_path(
         MitsonarError: sensors that cover no frame, or motions that tell no covariance and are too few to estimate one.
     """
     canvas = None if source is None else canvas_of(source)
-    errors, reach = ErrorCorrelation(), DEFAULT_REACH_M if canvas is None else canvas.reach_m
+    errors = _law_over(canvas)
     graph = _graph(measured, bridge, start, start_known, sensors)
-    correlated = errors.of(graph.chain.motions, reach)
+    correlated = errors_along(graph.chain.motions, canvas)
     # motions left to the sensors say nothing of the errors of their neighbours
     wide = np.diagonal(graph.chain.covariances, axis1=1, axis2=2) >= UNKNOWN_STD**2
     left = np.asarray(wide.all(axis=1), dtype=bool)

@@ -33,6 +33,7 @@ from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_li
 from mitsonar.mapping.open_frames import load_frames, open_frames
 from mitsonar.mapping.open_source import usual_loop
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
+from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.pose import Pose
@@ -163,6 +164,34 @@ def test_errors_over_relief_are_alike_and_those_over_even_ground_are_not() -> No
     assert told is not None
     assert np.trace(staying[-1]) > 2 * np.trace(told[-1])
     assert odometry(over_ground(sway(16)), Direct(), smooth="kalman").correlated is None
+
+
+def test_a_gyroscope_over_even_ground_mends_the_heading_and_leaves_the_rest() -> None:
+    """Errors there are noise: what the gyroscope tells of the turns of one motion says nothing of its neighbours."""
+    count, rng = 300, np.random.default_rng(3)
+    frames, _, _ = lit_plane(Sonar(range_min=2.0, range_max=7.0), 2.5, np.radians(35))
+    poses = np.tile([0.0, 0.0, 2.5, np.radians(35), 0.0, 0.0], (count, 1))
+    poses[:, 0] = 0.02 * np.arange(count)
+    path = Trajectory(poses, np.arange(count) / 10)
+    seen = replace(
+        frames,
+        image=np.broadcast_to(frames.image[0], (count, *frames.image.shape[1:])),
+        poses=poses,
+        time_s=path.time_s,
+        height_m=poses[:, 2],
+    )
+    mixed = np.array([[1e-3, 0, -3.4e-3], [0, 1e-3, 0], [0, 0, 1e-3]])  # a turn is taken for a step aside
+    moved = motions(poses) + rng.standard_normal((count - 1, 3)) @ mixed.T
+    known = {k: Estimate(Motion(*one.tolist()), mixed @ mixed.T, True, "", {}) for k, one in enumerate(moved)}
+    gyroscope = simulated_sensors(path, SensorNoise(gyro_deg_rth=1.0), seed=0)
+    found = odometry(seen, Direct(), known=known, sensors=gyroscope)
+    off = found.path.poses[-1, :2] - poses[-1, :2]
+    assert found.pose_covariances is not None
+    told = np.sqrt(np.trace(found.pose_covariances[-1, :2, :2]))
+    slope, length = 0.006, 0.02 * (count - 1)
+    independent = np.sqrt(2 * (count - 1) * 1e-3**2 + 2 * (slope * length) ** 2)
+    assert told == pytest.approx(independent, rel=0.25)
+    assert np.hypot(*off) < 3 * told
 
 
 @pytest.mark.thorough
