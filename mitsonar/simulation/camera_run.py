@@ -62,12 +62,22 @@ def run_camera(
         return
     flown.save(run.path / "poses.tum", frame)
     (run.path / "images").mkdir(exist_ok=True)
-    done = run.count("frames_done", len(flown))
+    done = _whole(run.path, run.count("frames_done", len(flown)))
     progress(done)
     for number, picture in enumerate(simulator.pictures(flown.poses[done:], flown.time_s[done:], first=done), done):
         buffer = io.BytesIO()
         Image.fromarray(picture).save(buffer, format="PNG")
-        write_whole(run.path / "images" / f"{number:06d}.png", buffer.getvalue())
+        write_whole(_picture(run.path, number), buffer.getvalue())
         run.note(frames_done=number + 1)
         progress(1)
     run.finish()
+
+
+def _picture(folder: Path, number: int) -> Path:
+    """Return the file of a picture."""
+    return folder / "images" / f"{number:06d}.png"
+
+
+def _whole(folder: Path, done: int) -> int:
+    """Return how many of the first pictures are there: one that was deleted is made again, and those after it."""
+    return next((number for number in range(done) if not _picture(folder, number).is_file()), done)
