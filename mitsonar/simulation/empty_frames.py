@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.motion.pose import vehicle_rotation
 
-__all__ = ["NEARLY_EMPTY", "angle_hint", "empty_frames", "view_of"]
+__all__ = ["NEARLY_EMPTY", "angle_hint", "empty_frames", "percent", "view_of"]
 
 NEARLY_EMPTY = 1e-4
 """Part of the pixels below which a frame counts as empty: 5 pixels of 512 x 96."""
@@ -40,14 +40,19 @@ def empty_frames(
         check = "check the pose (x, y, z in m; pitch > 0 looks down) and the scene's units"
         text = f"no ray hit anything in {empty} frames: {check}; in frame {number} {view_of(pose)}"
         return f"{text}; {hint}" if hint else text
-    inside, nearer, farther, missed = (100 * count / sum(rays) for count in rays)
+    inside, nearer, farther, missed = (percent(count / sum(rays)) for count in rays)
     beside = f" (returns at {found[0]:.3g}..{found[1]:.3g} m)" if found else ""
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
     return (
-        f"{empty} of {frames} frames are empty, frame {number} first: {inside:.2g} % of its rays meet something within the "
-        f"window {window[0]:g}..{window[1]:g} m, {nearer:.2g} % nearer, {farther:.2g} % farther{beside}, {missed:.2g} % "
+        f"{empty} of {frames} frames are empty, frame {number} first: {inside} % of its rays meet something within the "
+        f"window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{beside}, {missed} % "
         f"nothing; {view_of(pose)}; {hint or check}"
     )
+
+
+def percent(share: float) -> str:
+    """Return a share in percent to two digits, without an exponent."""
+    return "100" if share >= 0.995 else f"{100 * share:.2g}"
 
 
 def view_of(pose: NDArray[np.float64]) -> str:

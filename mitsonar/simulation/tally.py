@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.plain_data import finite_number, whole_number
-from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames
+from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames, percent
 from mitsonar.simulation.rendered_pings import RenderedPings
 
 __all__ = ["Tally"]
@@ -88,12 +88,12 @@ class Tally:
             ends = source.window_range(poses[frame - first], frame)
             where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""
             found["window"] = (
-                f"{outside:,} of {hits:,} returns ({_percent(outside / hits)} %) lie outside the window "
+                f"{outside:,} of {hits:,} returns ({percent(outside / hits)} %) lie outside the window "
                 f"{sonar.range_min:g}..{sonar.range_max:g} m{where}: they are dropped; widen the window if they matter"
             )
         if self.saturated > 0.01 * self.pixels:
             found["saturated"] = (
-                f"{_percent(self.saturated / self.pixels)} % of pixels are at the maximum (more than 1 %): the gain, "
+                f"{percent(self.saturated / self.pixels)} % of pixels are at the maximum (more than 1 %): the gain, "
                 f"{self.gain_from}, is too high for the rest"
             )
         if self.cut:
@@ -160,8 +160,3 @@ def _up(length_m: float) -> str:
     """Return a length to two digits, rounded up."""
     step = 10.0 ** (math.floor(math.log10(length_m)) - 1)
     return f"{math.ceil(length_m / step) * step:.2g}"
-
-
-def _percent(share: float) -> str:
-    """Return a share in percent to two digits, without an exponent."""
-    return "100" if share >= 0.995 else f"{100 * share:.2g}"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import ValidationError
-
-from mitsonar.errors import MitsonarError, complaint, nearest_names, shortened
+from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.worlds.flat_objects import FlatObjects
 from mitsonar.worlds.pattern import Pattern
 from mitsonar.worlds.rocky_field import RockyField
@@ -16,15 +14,8 @@ from mitsonar.worlds.world import Family
 __all__ = ["FAMILIES", "create_family"]
 
 FAMILIES: dict[str, type[Family]] = {
-    "rocky-field": RockyField,
-    "ship-hull": ShipHull,
-    "pattern": Pattern,
-    "flat-objects": FlatObjects,
-    "sea-surface": SeaSurface,
+    family.called: family for family in (RockyField, ShipHull, Pattern, FlatObjects, SeaSurface)
 }
-
-
-SEE_SCENE = " (see docs/guides/data-sets.md, `A scene of your own`)"
 
 
 def create_family(name: str, **fields: object) -> Family:
@@ -37,13 +28,7 @@ def create_family(name: str, **fields: object) -> Family:
     Raises:
         MitsonarError: unknown name or key, or a number outside its limits.
     """
-    known: dict[str, type[Family]] = {**FAMILIES, "scene": SceneFile}
+    known: dict[str, type[Family]] = {**FAMILIES, SceneFile.called: SceneFile}
     if name not in known:
         raise MitsonarError(f"unknown world {shortened(name)}: {nearest_names(name, known)}")
-    family = known[name]
-    try:
-        return family(**fields)
-    except ValidationError as error:
-        raise MitsonarError(
-            complaint(error, family, name, SEE_SCENE if name == "scene" else f" (see `mitsonar world {name} --help`)")
-        ) from None
+    return known[name].create(**fields)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -30,6 +32,8 @@ STEP_M = 5e-6
 
 class FlatObjects(BuiltFamily):
     """Almost flat objects on a seabed (Almanza-Medina, 5.4.1), anywhere on it, each of one reflectivity."""
+
+    called: ClassVar[str] = "flat-objects"
 
     size_m: float = Field(50.0, gt=0, le=10_000, description="edge of the square field [m]")
     seabed_cells: int = Field(2048, ge=1, le=2**20, description="cells along the seabed's edge")

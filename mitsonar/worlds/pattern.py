@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,8 @@ class Pattern(BuiltFamily):
     The seed draws the three random seabeds. The other three are pictures: generated stand-ins for Almanza-Medina's
     photographs, see the README beside them.
     """
+
+    called: ClassVar[str] = "pattern"
 
     size_m: float = Field(12.0, gt=0, le=10_000, description="edge of the square seabed [m] (ours)")
     texture: Literal["gaussian", "perlin_high", "perlin_low", "photo_sand", "photo_gravel", "photo_rock"] = Field(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -42,6 +42,8 @@ class RockyField(BuiltFamily):
     Each kind of rock has its own square grid. Each rock is displaced at random within its grid step, and has its own height,
     sizes and turns. The reflectivity is Perlin's noise, one value for each face.
     """
+
+    called: ClassVar[str] = "rocky-field"
 
     size_m: float = Field(30.0, gt=0, le=10_000, description="edge of the square field [m]; Almanza-Medina has 30 and 50")
     seabed_cells: int = Field(2048, ge=1, le=2**20, description="cells along the seabed's edge")

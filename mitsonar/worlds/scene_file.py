@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ __all__ = ["SceneFile"]
 
 class SceneFile(Family):
     """A scene that exists already; the seed determines only the motion of the vehicle."""
+
+    called: ClassVar[str] = "scene"
+    described: ClassVar[str] = "docs/guides/data-sets.md, `A scene of your own`"
 
     file: str = Field(description="the XML file; in a recipe, relative to the recipe's folder")
     size_m: float = Field(gt=0, le=1e6, description="edge of the square around the origin to stay inside [m]")

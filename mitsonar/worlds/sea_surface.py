@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from mitsonar.errors import MitsonarError, complaint
+from mitsonar.errors import MitsonarError
 from mitsonar.io.whole_files import write_whole
 from mitsonar.worlds.shapes import GRID_M
 from mitsonar.worlds.wave_field import SHORTEST, Sea, wave_heights
@@ -52,6 +52,8 @@ class SeaSurface(Family):
     Waves of four steps and more are the mesh. The rms height of shorter ones is the roughness of the mirror part. The
     surface is the shape `surface`; it faces down and reflects -1. Surfaces of one seed at several times belong to one sea.
     """
+
+    called: ClassVar[str] = "sea-surface"
 
     wind_m_s: float = Field(5.0, ge=0, le=40, description="wind 10 m above the sea [m/s]; 0: a flat surface")
     spectrum: Literal["pierson-moskowitz", "jonswap"] = Field(
@@ -125,18 +127,6 @@ class SeaSurface(Family):
         held, left = self.waves.variance(shortest), self.waves.variance(0.0, shortest)
         height, peak = self.waves.significant_height_m, self.waves.peak_wavelength_m
         return SeaState(height, peak, shortest, math.sqrt(held), math.sqrt(left))
-
-    @classmethod
-    def create(cls, **fields: object) -> Self:
-        """Create a surface with these fields.
-
-        Raises:
-            MitsonarError: an unknown key, a value outside its limits, or numbers that do not fit each other.
-        """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "sea-surface")) from None
 
     def save(self, path: str | Path, seed: int = 0, time_s: float | None = None) -> None:
         """Write the surface of a seed as a PLY file, for a scene of one's own.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
@@ -31,6 +33,8 @@ class ShipHull(BuiltFamily):
     It has groups of elliptical tubes side by side, and sacrificial anodes. The anodes are elliptical too, with their
     cross-section towards the sonar. Both are attached to the plate z = 0.
     """
+
+    called: ClassVar[str] = "ship-hull"
 
     size_m: float = Field(20.0, gt=0, le=10_000, description="edge of the square plate [m] (ours)")
     plate_cells: int = Field(1024, ge=1, le=2**20, description="cells along the plate's edge")

@@ -6,14 +6,14 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, overload
+from typing import Annotated, ClassVar, Self, overload
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, complaint
 
 __all__ = [
     *("BuiltFamily", "Counts", "Family", "Floor", "Interval", "Mesh", "Standpoint", "World", "draw", "shifted_grid"),
@@ -46,9 +46,28 @@ SURFACE_MARGIN_M = 25.0
 
 
 class Family(BaseModel):
-    """A family of worlds: its options are the fields, and :meth:`build` makes a world from a seed."""
+    """A family of worlds: its options are the fields, and :meth:`build` makes a world from a seed.
+
+    :meth:`create` answers a mistake with one sentence, by the name of the family and where its options are described.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str]
+    described: ClassVar[str] = ""
+
+    @classmethod
+    def create(cls, **fields: object) -> Self:
+        """Create a family with these fields.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits, or numbers that do not fit each other.
+        """
+        try:
+            return cls(**fields)
+        except ValidationError as error:
+            described = cls.described or f"`mitsonar world {cls.called} --help`"
+            raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
 
     @property
     def half_m(self) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from mitsonar.errors import MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.simulation.empty_frames import angle_hint, view_of
+from mitsonar.simulation.empty_frames import angle_hint, empty_frames, view_of
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:
@@ -40,6 +40,11 @@ def test_frames_that_look_over_the_ground_say_so() -> None:
     assert "farther (returns at" in said
     assert "the sonar is at (0, 0, 2.5) m and looks 0.61 deg below the horizon, along (0.00, 1.00, -0.01)" in said
     assert said.endswith("its pitch, roll, heading are only 0.61, 0, 0 deg: were radians given where degrees are meant?")
+
+
+def test_all_rays_are_100_percent() -> None:
+    said = empty_frames(1, 1, (0, np.array([0, 0, 2.2, 0.4, 0, 0])), (0, 90_324, 0, 0), (80.0, 90.0), (4.1, 7.3))
+    assert "100 % nearer, 0 % farther (returns at 4.1..7.3 m)" in said
 
 
 @pytest.mark.usefixtures("variant")
