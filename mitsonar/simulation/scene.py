@@ -36,8 +36,11 @@ __all__ = [
 MOST_OBJECTS = 1_000_000
 """Objects that are named; beyond, their numbers have to do."""
 
-SPECTRUM = r"(failed to load spectrum from file \".*?\"): .*"
-"""Mitsuba's error about the file of a spectrum; what follows quotes the file, which may be any."""
+QUOTING = {
+    r"(failed to load spectrum from file \".*?\"): .*": r"\1: it must hold a wavelength and a value in each line",
+    r"(Error while loading .*? curve\(s\) from \".*?\"): .*": r"\1: it must hold x, y, z and a radius in each line",
+}
+"""Mitsuba's errors that quote the file which the scene names, and what is shown of them."""
 
 LONGEST_REASON = 600
 """Letters of Mitsuba's errors that are shown."""
@@ -112,8 +115,9 @@ def _loaded(path: Path, variant: str, parameters: dict[str, str]) -> object:
     with search_in([path.parent]):
         check_text(path, parameters, [Path(str(folder)) for folder in file_resolver()])
         state = parser.parse_file(config, str(path), **parameters)
-        check_parsed(state)
-        refuse_unread_motions(state)
+        looked_at = parser.ParserState(state)  # a copy: Mitsuba refuses properties that nothing has looked at
+        check_parsed(looked_at)
+        refuse_unread_motions(looked_at)
         parser.transform_all(config, state)
         with own_code_only(node.props.plugin_name() for node in state.nodes):
             return parser.instantiate(config, state)
@@ -172,7 +176,6 @@ def _reason(error: BaseException) -> str:
     head, _, trace = text.partition("Traceback (most recent call last):")
     shown = f"{head} {trace.strip().splitlines()[-1]}" if trace.strip() else head
     words = " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", shown).split())
-    words = re.sub(
-        r"(failed to load spectrum from file \".*?\"): .*", r"\1: it holds no pairs of wavelength and value", words
-    )
+    for pattern, instead in QUOTING.items():
+        words = re.sub(pattern, instead, words)
     return words if len(words) <= LONGEST_REASON else f"{words[:LONGEST_REASON]}..."

@@ -38,17 +38,19 @@ def pixels_of(path: Path) -> int:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(LONGEST_HEADER)
+        file.seek(max(0, size - 18))
+        tail = file.read(18)
     try:
-        wide, high, channels = _shape(head)
+        wide, high, channels = _shape(head, tail)
     except (struct.error, ValueError, IndexError):
-        raise MitsonarError(f"picture {path} is damaged: it has no size; export it again as PNG, JPEG or OpenEXR") from None
+        raise MitsonarError(f"{path} is no picture that Mitsuba reads: export it again as PNG, JPEG or OpenEXR") from None
     if min(wide, high) < 1 or wide * high > 8 * INFLATION * size:
         raise MitsonarError(f"picture {path} is damaged: {wide:,} x {high:,} pixels in {size:,} bytes; export it again")
     return wide * high * max(1, (channels + 2) // 3)
 
 
-def _shape(head: bytes) -> tuple[int, int, int]:
-    """Return width, height and channels of a picture from the beginning of its file."""
+def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
+    """Return width, height and channels of a picture from the beginning and the end of its file."""
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         wide, high = struct.unpack_from(">II", head, 16)
         return wide, high, 3
@@ -67,7 +69,9 @@ def _shape(head: bytes) -> tuple[int, int, int]:
         if found is None:
             raise ValueError
         return int(found[1]), int(found[2]), 3
-    wide, high = struct.unpack_from("<HH", head, 12)  # TGA begins with nothing that would tell it
+    if tail != b"TRUEVISION-XFILE.\0":  # TGA tells itself by its end
+        raise ValueError
+    wide, high = struct.unpack_from("<HH", head, 12)
     return wide, high, 3
 
 

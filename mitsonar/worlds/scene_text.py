@@ -43,6 +43,9 @@ LONGEST_VALUE = 2**16
 MOST_WORK = 2**31
 """Letters that Mitsuba may compare and move to replace parameters: about a second."""
 
+SEARCH = 300
+"""What a search for a parameter takes, in letters."""
+
 SKIPPED = {b"<!--": b"-->", b"<![CDATA[": b"]]>", b"<?": b"?>"}
 """Begin and end of what is no element."""
 
@@ -130,7 +133,8 @@ class _Text:
         opened: list[bytes] = []
         before, place = self.elements, content.find(b"<")
         while place >= 0:
-            skipped = next((begin for begin in SKIPPED if content.startswith(begin, place)), None)
+            marked = content[place + 1 : place + 2] in (b"!", b"?")
+            skipped = next((begin for begin in SKIPPED if marked and content.startswith(begin, place)), None)
             if skipped is not None:
                 end = content.find(SKIPPED[skipped], place + len(skipped))
                 if end < 0:
@@ -185,7 +189,7 @@ class _Text:
         return value.replace("\\$", "$")
 
     def _work(self, letters: int, path: Path) -> None:
-        self.work += letters + 100
+        self.work += letters + SEARCH
         if self.work > MOST_WORK:
             raise MitsonarError(f"{path} uses its parameters too often: write the values themselves")
 
