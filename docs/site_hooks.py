@@ -27,6 +27,7 @@ NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks")
 PAGES = {
     "benchmarks/README.md": "benchmarks.md",
     "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
     **{f"benchmarks/notebooks/{name}.ipynb": f"tutorials/{name}.md" for name in NOTEBOOKS},
 }
 """Files of the repository outside docs/ that are pages of the site, and where they are there."""

@@ -142,6 +142,8 @@ def _check_file(path: Path) -> None:
     kind = path.suffix.lower()
     if kind == ".ply":
         check_counts(path)
+    if kind == ".dae" and b"<!DOCTYPE" in path.read_bytes().replace(b"\0", b""):  # zeros: UTF-16
+        raise ValueError("it has a document type (<!DOCTYPE>), which models do not need")
     if kind in (".glb", ".gltf"):
         _check_gltf(path, size)
 

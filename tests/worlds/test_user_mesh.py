@@ -118,6 +118,7 @@ def test_many_parts_become_one_mesh_with_a_number_each(tmp_path: Path) -> None:
         ("junk.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n", "triangles|cannot read"),
         ("junk.stl", b"solid nothing\nendsolid nothing\n", "triangles|cannot read"),
         ("junk.dae", b"<COLLADA/>", "triangles|cannot read"),
+        ("entities.dae", b'<!DOCTYPE a [<!ENTITY e "ee">]><COLLADA/>', "document type"),
     ],
 )
 def test_broken_and_empty_models_are_named(name: str, content: bytes | None, words: str, tmp_path: Path) -> None:
