@@ -12,7 +12,21 @@ import typer
 
 from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
 from mitsonar.cli.flown_path import Frame
-from mitsonar.cli.frames_command import Least, Out, Picture, Polygons, To, Without, exported
+from mitsonar.cli.frames_command import (
+    LEAST_SNR_DB,
+    Classes,
+    Least,
+    LeastSnr,
+    Out,
+    Picture,
+    Polygons,
+    Shares,
+    To,
+    Without,
+    classes_of,
+    exported,
+    shares_of,
+)
 from mitsonar.cli.odometry_command import Geometry
 from mitsonar.errors import MitsonarError
 
@@ -190,7 +204,10 @@ def export(
     out: Out,
     picture: Picture = "polar",
     without: Without = None,
+    classes: Classes = "",
     least: Least = 1,
+    least_snr_db: LeastSnr = LEAST_SNR_DB,
+    split: Shares = None,
     polygons: Polygons = False,
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
 ) -> None:
@@ -199,7 +216,8 @@ def export(
 
     if not is_data_set(data):
         raise MitsonarError(f"no data set at {data}: {command_line('frames', 'export')} exports runs and recordings")
-    exported(data, to, out, picture, without or [], least, polygons, view)
+    rules = classes_of(classes, without)
+    exported(data, to, out, picture, rules, least, least_snr_db, shares_of(split), polygons, view)
 
 
 @answered

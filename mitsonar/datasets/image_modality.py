@@ -109,13 +109,13 @@ class ImageModality:
         """Return 2: estimators of images are compared on pairs."""
         return 2
 
-    def reach(self, height: float) -> NDArray[np.float64]:
+    def reach(self, height: float, pitch: float = 0.0) -> NDArray[np.float64]:
         """Compute the footprint ``(n, 2)`` [m], or that of the field of view that the flight names.
 
         Raises:
             MitsonarError: the ground is out of range.
         """
-        return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg)
+        return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg, pitch)
 
     def _stored(self, kind: str, view: str, shape: tuple[int, ...], dims: tuple[str, ...]) -> StoredArray:
         """Return an array of this kind for a view."""
@@ -205,7 +205,9 @@ def _limits(kind: str, values: Values, beams: int) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=8)
-def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None) -> NDArray[np.float64]:
+def footprint(
+    sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None, pitch: float = 0.0
+) -> NDArray[np.float64]:
     """Compute a sonar's footprint on the ground z = 0: corners ``(n, 2)``, starboard and forward of the vehicle [m].
 
     Args:
@@ -213,6 +215,7 @@ def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, fl
         mount: pose of the sonar on the vehicle.
         height: of the vehicle [m].
         fov_deg: azimuth and elevation in place of the sonar's own [deg].
+        pitch: of the vehicle [rad], > 0 down.
 
     Raises:
         MitsonarError: the ground is out of range.
@@ -221,5 +224,5 @@ def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, fl
     outer = max(math.radians(azimuth) / 2, sonar.bearing_rad[-1] + sonar.beam_width_rad / 2 if fov_deg is None else 0)
     b, e = np.meshgrid(np.linspace(-outer, outer, RAYS), np.radians(np.linspace(-elevation, elevation, RAYS)) / 2)
     local = directions(sonar.bearing, b.ravel(), e.ravel())
-    eye = mounted(Pose(0, 0, height), mount)[0]
+    eye = mounted(Pose(0, 0, height, pitch), mount)[0]
     return ground_reach(eye[:3], vehicle_rotation(eye).apply(local), sonar.range_max)

@@ -20,7 +20,7 @@ from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, to_image
-from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.scene import load_scene, shape_names_in
 from mitsonar.simulation.variant import release_memory
 
 if TYPE_CHECKING:
@@ -51,10 +51,24 @@ class SceneRenderer:
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
-        """Compute the gain of the data set and its inverse; see :func:`calibrate`."""
+        """Compute the gain of the data set and its inverse, and with labels of shapes the names of those of scene files.
+
+        See :func:`calibrate`. The names are a list for each group of scenes; it is empty for worlds that are built.
+        """
         refuse_worlds(recipe)
         gain = calibrate(recipe)
-        return {"gain": gain, "level_scale": 1 / gain}
+        found: Fields = {"gain": gain, "level_scale": 1 / gain}
+        groups = range(len(recipe.scenes))
+        if "shape_id" in recipe.labels and any(recipe.family(group).called == "scene" for group in groups):
+            known: dict[str, list[str]] = {}
+            for group in groups:
+                family = recipe.family(group)
+                if repr(family) not in known:
+                    world = Scene(0, group, world_seed(recipe.seed, 0), 1)
+                    named = family.called == "scene"
+                    known[repr(family)] = list(shape_names_in(loaded_world(recipe, world))) if named else []
+            found["shape_names"] = [known[repr(recipe.family(group))] for group in groups]
+        return found
 
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
         """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view.
@@ -118,11 +132,17 @@ class SceneRenderer:
 
 
 def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
-    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it."""
+    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it.
+
+    Where the recipe has ``noise_db``, the noise of a scene is raised.
+    """
     sonar = recipe.instrument
     if sonar.model != "coherent":
         return sonar
-    return sonar.replace(seed=int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0]))
+    seed = int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0])
+    if sonar.noise_level_db is None or not recipe.noise_db:
+        return sonar.replace(seed=seed)
+    return sonar.replace(seed=seed, noise_level_db=sonar.noise_level_db + float(recipe.noise_raised_db(scene.number)))
 
 
 def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:

@@ -99,8 +99,18 @@ def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
 
 
 def shape_names_in(scene: mi.Scene) -> tuple[str, ...]:
-    """Return the name of each shape of a scene, by the place in it that ``shape_id`` tells."""
-    return tuple(shape.id() for shape in scene.shapes())
+    """Return the name of each shape of a scene, by its place there, which is its ``shape_id``.
+
+    The name is the shape's id. Without one it is the stem of the mesh file, the id of the shape group that is placed, or
+    the type of the plugin: ``pot01``, ``cannon_parts``, ``sphere``.
+    """
+    return tuple(shape.id() or _name_without_id(shape) for shape in scene.shapes())
+
+
+def _name_without_id(shape: mi.Shape) -> str:
+    kind, text = shape.class_name(), str(shape)
+    named = re.search(r'^ +name = "([^"]+)"', text, flags=re.MULTILINE) if shape.is_mesh() or kind == "Instance" else None
+    return Path(named[1]).stem if named else kind.lower()
 
 
 def object_names_in(scene: mi.Scene) -> tuple[str, ...]:

@@ -304,6 +304,13 @@ class World:
     content: dict[str, bytes] = field(default_factory=dict)
 
     @property
+    def shape_names(self) -> tuple[str, ...]:
+        """Return the ids of the shapes, in the order of the file."""
+        flat = ([one.name] if one else [] for one in (self.floor, self.surface))
+        below, above = flat
+        return (*below, *(mesh.shape_id or mesh.name for mesh in self.meshes), *above)
+
+    @property
     def size_m(self) -> float:
         """Return the longest edge of the box around the meshes [m]."""
         vertices = np.concatenate([mesh.vertices for mesh in self.meshes])
