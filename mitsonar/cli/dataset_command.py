@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,10 +25,15 @@ from mitsonar.cli.frames_command import (
     Without,
     classes_of,
     exported,
+    numbers_of,
     shares_of,
 )
 from mitsonar.cli.odometry_command import Geometry
 from mitsonar.errors import MitsonarError
+
+if TYPE_CHECKING:
+    from mitsonar.config.data_recipe import Recipe
+    from mitsonar.datasets.generation import Made
 
 __all__ = ["datasets"]
 
@@ -38,7 +43,7 @@ Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s
 def datasets() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Make, show and check labelled data sets.", no_args_is_help=True)
-    for command in (make, info, show, check, recipes, export):
+    for command in (make, info, show, check, recipes, export, detector):
         app.command()(command)
     app.command("from-frames")(from_frames)
     return app
@@ -62,7 +67,6 @@ def make(
 ) -> None:
     """Make a data set. After a stop at any moment the same command resumes and ends with the same bytes."""
     from mitsonar.config.data_recipe import load_recipe
-    from mitsonar.datasets.generation import make_dataset
 
     described = load_recipe(recipe, changes_of(change or [], seed))
     if sequences is not None and scale is not None:
@@ -76,20 +80,86 @@ def make(
     if workers is not None and scheduler is not None:
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
+    made = _made(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
+    there = made.shards - made.made
+    say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
+    say(f"show it: {command_line('dataset', 'show', made.url)}")
+
+
+def _made(recipe: Recipe, out: str, **words: object) -> Made:
+    """Make a data set with a bar; Ctrl-C ends the process at once."""
+    from mitsonar.datasets.generation import make_dataset
+
     bar = LaterBar("rendering", "frames")
-    words = {"sequences": sequences, "workers": processes, "scheduler": scheduler, "verify": verify}
     try:
         with bar:
-            made = make_dataset(described, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
+            made = make_dataset(recipe, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
     except KeyboardInterrupt:
         say_stopped()
         sys.stdout.flush()
         os._exit(130)  # threads of Zarr and dask would complain one by one
     for sentence in made.warnings:
         warn(sentence)
-    there = made.shards - made.made
-    say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
-    say(f"show it: {command_line('dataset', 'show', made.url)}")
+    return made
+
+
+@answered
+def detector(
+    scene: Annotated[
+        str,
+        typer.Argument(metavar="SCENE|RECIPE", help="Mitsuba XML file, shipped scene, or recipe whose worlds are taken."),
+    ],
+    out: Out,
+    frames: Annotated[int, typer.Option(min=1, help="Number of pictures.")] = 300,
+    to: Annotated[str, typer.Option("--to", help="coco or yolo.")] = "coco",
+    sonar: Annotated[str | None, typer.Option(help="Preset or YAML file (default: the scene's, the recipe's).")] = None,
+    height: Annotated[
+        str | None, typer.Option(help="Least and largest height over z = 0, LOW,HIGH [m] (default: 1.5,3 over the ground).")
+    ] = None,
+    pitch: Annotated[
+        str | None, typer.Option(help="Least and largest pitch, > 0 down, LOW,HIGH [deg] (default: 10,30).")
+    ] = None,
+    noise_db: Annotated[
+        str, typer.Option("--noise-db", help="What is added to the sonar's noise, in turn [dB]: 0,6,12.")
+    ] = "",
+    classes: Classes = "",
+    picture: Picture = "polar",
+    least: Least = 9,
+    least_snr_db: LeastSnr = LEAST_SNR_DB,
+    split: Annotated[str, typer.Option("--split", help="Shares of training, validation and test.")] = "0.7,0.15,0.15",
+    polygons: Polygons = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of poses, worlds and noise.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine (default: its cores).")] = None,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: sonar.quality=draft.")
+    ] = None,
+) -> None:
+    """Render random views of a scene, with boxes, in parts for training, validation and test. The same command resumes."""
+    from mitsonar.exports.detector_set import DetectorViews, detector_recipe
+
+    if to not in ("coco", "yolo"):
+        raise MitsonarError(f"--to is coco or yolo: got {to!r}; `mitsonar dataset export` writes other layouts")
+    if out.exists():
+        raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or remove it")
+    shares = shares_of(split)
+    assert shares is not None
+    raised = tuple(numbers_of(noise_db, "--noise-db", None)) if noise_db else ()
+    views = DetectorViews(frames, _interval(height, "--height"), _interval(pitch, "--pitch"), raised, shares, seed)
+    rules = classes_of(classes, None)
+    recipe, ground, notes = detector_recipe(scene, views, sonar, changes_of(change or [], None))
+    for note in notes:
+        say(note)
+    store = f"{out}.zarr"
+    made = _made(recipe, store, workers=workers or len(os.sched_getaffinity(0)))
+    say(f"{made.frames:,} frames in {made.url}: `mitsonar dataset export` writes them again with other classes")
+    exported(store, to, out, picture, [*rules, *ground], least, least_snr_db, None, polygons, None, every_class=True)
+
+
+def _interval(text: str | None, option: str) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    low, high = numbers_of(text, option, 2)
+    return low, high
 
 
 @answered

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -12,7 +13,7 @@ from mitsonar.errors import MitsonarError
 
 __all__ = [
     *("Classes", "Least", "LeastSnr", "Out", "Picture", "Polygons", "Shares", "To", "Without"),
-    *("LEAST_SNR_DB", "classes_of", "exported", "frames", "shares_of"),
+    *("LEAST_SNR_DB", "classes_of", "exported", "frames", "numbers_of", "shares_of"),
 ]
 
 OF_RUN = 0.7, 0.15, 0.15
@@ -42,7 +43,7 @@ Shares = Annotated[
     str | None,
     typer.Option(
         "--split",
-        help="Shares of training, validation and test, 0.7,0.15,0.15 (default: the recipe's; of a run as COCO or YOLO these).",
+        help="Shares of training, validation and test, default: the recipe's; of a run 0.7,0.15,0.15.",
     ),
 ]
 Polygons = Annotated[bool, typer.Option("--polygons", help="YOLO: outlines in place of boxes.")]
@@ -98,11 +99,23 @@ def shares_of(split: str | None) -> tuple[float, float, float] | None:
     """
     if split is None:
         return None
-    try:
-        train, validation, test = (float(one) for one in split.split(","))
-    except ValueError:
-        raise MitsonarError(f"--split is three shares, 0.7,0.15,0.15 for example: got {split!r}") from None
+    train, validation, test = numbers_of(split, "--split", 3)
     return train, validation, test
+
+
+def numbers_of(text: str, option: str, count: int | None) -> list[float]:
+    """Return the numbers of an option, with commas between.
+
+    Raises:
+        MitsonarError: something else, or another count of them.
+    """
+    try:
+        numbers = [float(one) for one in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or len(numbers) != (count or len(numbers)) or not all(map(math.isfinite, numbers)):
+        raise MitsonarError(f"{option} takes {count or 'some'} numbers with commas between: got {text!r}")
+    return numbers
 
 
 def exported(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
@@ -26,6 +27,7 @@ __all__ = [
     "find_scene",
     "load_scene",
     "object_names_in",
+    "shape_boxes_in",
     "shape_names_in",
     "shipped_scenes",
     "shipped_trajectory",
@@ -111,6 +113,13 @@ def _name_without_id(shape: mi.Shape) -> str:
     kind, text = shape.class_name(), str(shape)
     named = re.search(r'^ +name = "([^"]+)"', text, flags=re.MULTILINE) if shape.is_mesh() or kind == "Instance" else None
     return Path(named[1]).stem if named else kind.lower()
+
+
+def shape_boxes_in(scene: mi.Scene) -> NDArray[np.float64]:
+    """Return the box around each shape of a scene: least and largest x, y, z ``(shapes, 2, 3)`` [m]."""
+    boxes = [(shape.bbox().min, shape.bbox().max) for shape in scene.shapes()]
+    corners = [[np.array(corner, dtype=float).ravel() for corner in box] for box in boxes]
+    return np.array(corners, dtype=np.float64).reshape(-1, 2, 3)
 
 
 def object_names_in(scene: mi.Scene) -> tuple[str, ...]:

@@ -325,7 +325,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--classes", "sand"), "GLOB=CLASS")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--classes", "*="), "no class is left")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--least", "1000"), "no object is seen", "--least")
-    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--split", "0.5,0.5"), "three shares")
+    refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--split", "0.5,0.5"), "3 numbers")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--split", "0.5,0.5,0.5"), "add up to 1")
     bare = SonarFrames(frames.image, frames.range_m, frames.bearing_rad, frames.time_s, SONAR)
     bare.save(tmp_path / "bare.npz")
