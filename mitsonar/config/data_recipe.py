@@ -39,7 +39,7 @@ __all__ = [
 
 _Made = TypeVar("_Made", bound=RecipePart)
 
-ADDED = ("recorded", "mirrors", "bodies", "noise_db")
+ADDED = ("recorded", "mirrors", "bodies", "noise_db", "visible_labels")
 """Keys that are not written where they are null or empty."""
 
 
@@ -81,6 +81,9 @@ class Recipe(RecipePart):
     )
     bodies: list[str] = Field(
         default_factory=list, max_length=10_000, description="bodies that move, whose poses and velocities are stored"
+    )
+    visible_labels: bool = Field(
+        False, description="labels of what pictures show: beyond half-power beams too, above noise and -40 dB (coherent)"
     )
     noise_db: list[Annotated[float, Field(ge=-100, le=100)]] = Field(
         default_factory=list,
@@ -171,6 +174,10 @@ class Recipe(RecipePart):
                 f"noise_db changes noise_level_db of the model coherent: the sonar is of the model {self.instrument.model} "
                 f"with noise_level_db {self.instrument.noise_level_db}; give it both, or leave noise_db out"
             )
+        if self.visible_labels and self.instrument.model != "coherent":
+            raise MitsonarError(
+                f"visible_labels is of the model coherent: got {self.instrument.model}, whose pictures show what is labelled"
+            )
         if len(set(self.bodies)) < len(self.bodies):
             raise MitsonarError(f"bodies are named once each: got {shortened(self.bodies)}")
         if self.recorded is None:
@@ -193,6 +200,7 @@ class Recipe(RecipePart):
             "gain": None,
             "bodies": [],
             "noise_db": [],
+            "visible_labels": False,
         }
         other = [name for name, value in plain.items() if getattr(self, name) != value]
         of_images = {"footprint_fov_deg": None, "pitch_deg": None}

@@ -93,7 +93,10 @@ def detector_recipe(
     fields["split"] = {**fields["split"], "train": train, "validation": validation, "test": test}
     for key, value in (changes or {}).items():
         set_key(fields, key, value)
-    return recipe_from(fields), rules, notes
+    recipe = recipe_from(fields)
+    if recipe.sonar is not None and recipe.instrument.model == "coherent" and "visible_labels" not in (changes or {}):
+        recipe = recipe_from({**fields, "visible_labels": True})
+    return recipe, rules, notes
 
 
 def _sonar_fields(name: str) -> Keys:

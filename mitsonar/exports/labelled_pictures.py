@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.sonar_losses import gain_of
+from mitsonar.acoustics.sonar_losses import noise_of
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry.scan_conversion import nearest_cells
 from mitsonar.plotting.fan_pictures import FanPictures
@@ -243,14 +243,9 @@ def _label(frames: SonarFrames, name: str, index: int) -> NDArray[np.int64]:
 
 def _noise_levels(frames: SonarFrames, raised_db: float) -> NDArray[np.float64] | None:
     """Return the mean level of the receiver's noise in each bin, relative to full scale ``(bins,)``; None if unknown."""
-    sonar = frames.sonar
-    if sonar.model != "coherent":
+    if frames.sonar.model != "coherent":
         return None
-    if sonar.noise_level_db is None:
-        return np.zeros(len(frames.range_m))
-    glow = np.maximum(0.0, sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))
-    power = 10 ** ((sonar.noise_level_db + raised_db - sonar.source_level_db + glow) / 10)
-    return np.asarray(power * gain_of(sonar) / frames.level_scale, dtype=np.float64)
+    return noise_of(frames.sonar) * 10 ** (raised_db / 10) / frames.level_scale
 
 
 def _box(mask: Mask) -> tuple[int, int, int, int]:
