@@ -129,7 +129,11 @@ def convert(
     part: PartNumber = None,
     topic: TopicName = None,
     geometry: Geometry = None,
-    picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: png or jpeg.")] = "png",
+    picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: jpeg or png.")] = "jpeg",
+    full: Annotated[
+        bool, typer.Option("--full", help="MCAP: samples bit for bit, float32 where they are, and labels (default: 8 bit).")
+    ] = False,
+    labels: Annotated[bool, typer.Option("--labels", help="MCAP: the points of the labels, where there are.")] = False,
     beams: Annotated[
         int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
     ] = None,
@@ -142,6 +146,8 @@ def convert(
 
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
+    if (full or labels) and out.suffix != ".mcap":
+        raise MitsonarError(f"--full and --labels are of MCAP files: got {out}; leave them out")
     if resume and out.suffix:
         raise MitsonarError("--resume is for folders: files are whole or absent")
     recording = _opened(file, topic, geometry)
@@ -153,7 +159,8 @@ def convert(
     made = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":
-            write_mcap(chosen.chunks(), out, picture=picture, overwrite=overwrite, progress=progress)
+            words = {"picture": picture, "full": full, "labels": labels, "overwrite": overwrite}
+            write_mcap(chosen.chunks(), out, **words, progress=progress)  # type: ignore[arg-type]
         elif out.suffix == ".aris":
             _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
         else:
