@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -96,7 +96,8 @@ def _reduced(frames: SonarFrames, full: bool, labels: bool, span_db: list[float]
     if full:
         return frames
     if not labels:
-        frames = replace(frames, **dict.fromkeys(LABELS))
+        nothing: dict[str, Any] = dict.fromkeys(LABELS)
+        frames = replace(frames, **nothing)
     if frames.image.dtype == np.uint8:
         return frames
     if frames.level != "linear":

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.errors import MitsonarError
+from mitsonar.exports.detector_set import DetectorViews, detector_recipe
 from mitsonar.exports.export_source import open_export
 from mitsonar.exports.labelled_pictures import LabelledPictures, class_rules
 from mitsonar.exports.named_exports import export_to
@@ -28,7 +29,7 @@ from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.frame_store import FrameStore
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
-from mitsonar.simulation.scene import shipped_scenes
+from mitsonar.simulation.scene import shape_names_in, shipped_scenes
 
 FRAMES, BINS, BEAMS = 5, 40, 24
 SONAR = Sonar(beams=BEAMS, range_bins=BINS, azimuth_fov_deg=60)
@@ -476,3 +477,108 @@ def test_worlds_that_lack_a_kind_are_numbered_by_names(tmp_path: Path, variant: 
     assert seen is not None
     np.testing.assert_array_equal(seen[:half], shape[:half])
     np.testing.assert_array_equal(seen[half:], np.array([0, 4, 5, -1])[shape[half:]])
+
+
+# ---------------------------------------------------------------- a detector's data set, by one command
+
+LITTLE = ("--set", "sonar.quality=draft", "--set", "sonar.beams=64", "--set", "sonar.range_bins=200", "--workers", "1")
+
+
+@pytest.mark.e2e
+@pytest.mark.thorough
+def test_one_command_makes_a_detectors_data_set(mitsonar: Command, tmp_path: Path) -> None:
+    import yaml
+
+    coco_api = pytest.importorskip("pycocotools.coco")
+    (tmp_path / "scene.xml").write_text(SCENE.replace('value="6"', 'value="7"'))
+    words = ("dataset", "detector", tmp_path / "scene.xml", "--sonar", "oculus-m750d-1200khz", "--frames", 12, *LITTLE)
+    words = (*words, "--noise-db", "0,20", "--least-snr-db", "0", "--split", "0.5,0.25,0.25")
+    done = mitsonar(*words, "--to", "yolo", "--picture", "fan", "-o", tmp_path / "yolo")
+    assert done.returncode == 0, done.stderr
+    assert "ground, without a class: seabed" in done.stdout
+    told = yaml.safe_load((tmp_path / "yolo" / "data.yaml").read_text())
+    assert told["names"] == {0: "pillar", 1: "sphere", 2: "amphora"}
+    pictures = {
+        part: {path.name for path in (tmp_path / "yolo" / told[part]).iterdir()} for part in ("train", "val", "test")
+    }
+    assert {part: len(names) for part, names in pictures.items()} == {"train": 6, "val": 3, "test": 3}
+    assert len(set().union(*pictures.values())) == 12
+    sizes = set()
+    for part, names in pictures.items():
+        for name in names:
+            sizes.add(Image.open(tmp_path / "yolo" / told[part] / name).size)
+            label = (tmp_path / "yolo" / "labels" / part / name).with_suffix(".txt")
+            rows = np.array(label.read_text().split(), float).reshape(-1, 5)
+            assert set(rows[:, 0]) <= set(told["names"])
+            assert (rows[:, 1:3] - rows[:, 3:] / 2 >= -1e-6).all()
+            assert (rows[:, 1:3] + rows[:, 3:] / 2 <= 1 + 1e-6).all()
+    assert len(sizes) == 1
+    out = tmp_path / "coco"
+    again = mitsonar(
+        "dataset", "export", tmp_path / "yolo.zarr", "--to", "coco", "--classes", "seabed=,pillar*=post", "-o", out
+    )
+    assert again.returncode == 0, again.stderr
+    coco = coco_api.COCO(str(out / "annotations" / "train.json"))
+    assert [one["name"] for one in coco.loadCats(coco.getCatIds())] == ["post", "sphere", "amphora"]
+    refused(mitsonar(*words, "--to", "yolo", "-o", tmp_path / "yolo"), "exists and is kept")
+
+
+@pytest.mark.e2e
+def test_what_a_detectors_data_set_cannot_be_made_of(mitsonar: Command, tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(SCENE)
+    bare = SCENE[: SCENE.index('<shape type="cylinder')] + "</scene>"
+    (tmp_path / "bare.xml").write_text(bare)
+    words = ("dataset", "detector", tmp_path / "scene.xml", "-o", tmp_path / "out")
+    named = (*words, "--sonar", "oculus-m750d-1200khz")
+    refused(mitsonar(*words), "no sensor of type imaging_sonar")
+    refused(mitsonar(*named, "--frames", 2), "--frames must be at least 3")
+    refused(mitsonar(*named, "--to", "kitti"), "--to is coco or yolo")
+    refused(mitsonar(*named, "--height", "0.1,2"), "--height must be at least 0.3 m")
+    refused(mitsonar(*named, "--height", "2"), "--height takes 2 numbers")
+    refused(mitsonar("dataset", "detector", tmp_path / "bare.xml", "-o", tmp_path / "out"), "its ground and no objects")
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.xml", "bare.xml"}
+
+
+def test_worlds_of_a_recipe_are_split_by_scene() -> None:
+    recipe, rules, _ = detector_recipe("rocky-field", DetectorViews(60, split=(0.5, 0.25, 0.25)), "oculus-m750d-1200khz")
+    assert (len(recipe.scenes), recipe.sequences, recipe.split.by, recipe.flight.pings) == (6, 60, "scene", 1)
+    assert rules == [("seabed", "")]
+
+
+def test_views_of_a_scene_are_clear_of_its_objects_and_drawn_in_pitch(tmp_path: Path, variant: str) -> None:
+    from mitsonar.datasets.plan import Plan
+
+    (tmp_path / "scene.xml").write_text(SCENE)
+    views = DetectorViews(60, heights=(0.6, 1.8), pitch_deg=(5, 20), noise_db=(0, 6, 12))
+    recipe, _, _ = detector_recipe(tmp_path / "scene.xml", views, "oculus-m750d-1200khz")
+    plan = Plan.of(recipe)
+    assert len(plan) == 60
+    for x, y in ((1, 1), (-2, 1)):  # the pillars, 0.4 m thick and 0.3 m more
+        assert (np.abs(plan.poses[:, :2] - (x, y)).max(axis=1) >= 0.7 - 1e-6).all()
+    pitch = np.degrees(plan.poses[:, 3])
+    assert pitch.min() >= 5
+    assert pitch.max() <= 20
+    assert np.ptp(pitch) > 10
+    assert sorted({*recipe.noise_raised_db(plan.scene)}) == [0, 6, 12]
+    assert len(np.unique(plan.poses, axis=0)) == 60
+    again, _, _ = detector_recipe(tmp_path / "scene.xml", views, "oculus-m750d-1200khz")
+    np.testing.assert_array_equal(Plan.of(again).poses, plan.poses)
+
+
+def test_visible_labels_reach_beyond_the_half_power_beam(variant: str) -> None:
+    """A sphere 9 deg above the axis of a beam that is 12 deg wide: pictures show it, and so do these labels."""
+    from helpers import floor, scene, sphere
+
+    from mitsonar.simulation.imaging import Simulator
+    from mitsonar.simulation.labels import labels_above
+
+    words: dict[str, Any] = {"azimuth_fov_deg": 30, "elevation_fov_deg": 12, "range_min": 1, "range_max": 5}
+    sonar = Sonar(beams=32, range_bins=100, model="physical", pattern="two_way", frequency_hz=9e5, quality="draft", **words)
+    world = scene(floor=floor(), ball=sphere((0, 3, 2 + 3 * np.tan(np.radians(9))), 0.15))
+    (pings,) = Simulator(world, sonar).pings(np.array([[0, 0, 2, 0, 0, 0.0]]), labels=True)
+    gain = 0.9 / float(pings.levels.max())
+    shown = labels_above(pings, gain, np.full((100, 1), 1e-4))
+    ball = shape_names_in(world).index("ball")
+    assert (shown["shape_id"] == ball).sum() > 5
+    assert (shown["shape_id"] == ball).sum() <= (pings.labels["shape_id"] == ball).sum()
+    assert shown["shadow"].shape == pings.levels.shape
