@@ -15,7 +15,7 @@ from mitsonar.config.recipe_keys import Keys, set_key
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar, named_sonars
-from mitsonar.simulation.scene import find_scene, load_scene, shape_boxes_in, shape_names_in, sonar_in
+from mitsonar.simulation.scene import covered_squares_in, find_scene, load_scene, shape_boxes_in, shape_names_in, sonar_in
 
 __all__ = ["DetectorViews", "detector_recipe"]
 
@@ -131,7 +131,7 @@ def _of_scene(name: str, views: DetectorViews, sonar: str | None) -> tuple[Keys,
     path = find_scene(name).resolve()
     loaded = load_scene(path)
     names, boxes = shape_names_in(loaded), shape_boxes_in(loaded)
-    size, ground = _ground(path, boxes)
+    size, ground = _ground(path, covered_squares_in(loaded))
     objects = [box for box, flat in zip(boxes, ground, strict=True) if not flat]
     if not objects:
         raise MitsonarError(f"{path} holds its ground and no objects: a detector needs some to find")
@@ -142,12 +142,16 @@ def _of_scene(name: str, views: DetectorViews, sonar: str | None) -> tuple[Keys,
             f"--height must be at least {top + CLEAR_M:.3g} m, {CLEAR_M:g} m over the ground of {path}: got {heights[0]:g}"
         )
     found = sonar_in(loaded)
-    if sonar is None and found is None:
+    if sonar is not None:
+        instrument, keys = load_sonar(sonar), _sonar_fields(sonar)
+    elif found is not None:
+        instrument = found[0]
+        keys = instrument.model_dump(exclude_unset=True)
+    else:
         raise MitsonarError(f"{path} has no sensor of type imaging_sonar: name a sonar, --sonar oculus-m750d-1200khz")
-    keys = _sonar_fields(sonar) if sonar is not None or found is None else found[0].model_dump(exclude_unset=True)
     left_out = list(dict.fromkeys(name for name, flat in zip(names, ground, strict=True) if flat))
     notes = [f"ground, without a class: {', '.join(left_out)}"]
-    keys, note = _within(load_sonar(sonar) if found is None or sonar is not None else found[0], keys, size)
+    keys, note = _within(instrument, keys, size)
     fields: Keys = {
         "name": path.stem,
         "about": f"views of {path.name} for a detector",
@@ -165,19 +169,18 @@ def _of_scene(name: str, views: DetectorViews, sonar: str | None) -> tuple[Keys,
     return fields, [(name, "") for name in left_out], [*notes, *note]
 
 
-def _ground(path: Path, boxes: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
+def _ground(path: Path, halves: NDArray[np.float64]) -> tuple[float, NDArray[np.bool_]]:
     """Return the edge of the square around the origin that the widest shape covers [m], and which shapes cover it.
 
     Raises:
         MitsonarError: no shape lies around the origin.
     """
-    if not len(boxes):
+    if not len(halves):
         raise MitsonarError(f"{path} holds no shapes: give a scene with a ground and objects")
-    inside = 2 * np.minimum(-boxes[:, 0, :2], boxes[:, 1, :2]).min(axis=1)
-    size = float(inside.max())
+    size = 2 * float(halves.max())
     if size <= 0:
         raise MitsonarError(f"no shape of {path} lies around the origin: its ground must, since views are drawn there")
-    return math.floor(size * 1000) / 1000, inside >= GROUND * size
+    return math.floor(size * 1000) / 1000, 2 * halves >= GROUND * size
 
 
 def _within(sonar: Sonar, keys: Keys, size: float) -> tuple[Keys, list[str]]:

@@ -178,7 +178,7 @@ class _Levels:
         """Return levels relative to full scale ``(n, bins, beams)`` float32; 0 for no echo."""
         level = 10 ** ((np.arange(256) / 255 - 1) * self.span_db / 10)
         level[0] = 0
-        return level.astype(np.float32)[self.samples(index)]
+        return np.asarray(level.astype(np.float32)[self.samples(index)], dtype=np.float32)
 
 
 def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[SonarFrames, float | None] | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "channel_sonar_in",
+    "covered_squares_in",
     "find_scene",
     "load_scene",
     "object_names_in",
@@ -120,6 +122,25 @@ def shape_boxes_in(scene: mi.Scene) -> NDArray[np.float64]:
     boxes = [(shape.bbox().min, shape.bbox().max) for shape in scene.shapes()]
     corners = [[np.array(corner, dtype=float).ravel() for corner in box] for box in boxes]
     return np.array(corners, dtype=np.float64).reshape(-1, 2, 3)
+
+
+def covered_squares_in(scene: mi.Scene) -> NDArray[np.float64]:
+    """Return half the edge of the square around the origin that each shape covers, seen from above ``(shapes,)`` [m].
+
+    Of a mesh that of its convex hull counts, of another shape that of its box; 0 where the origin is outside.
+    """
+    halves = []
+    for shape, (low, high) in zip(scene.shapes(), shape_boxes_in(scene), strict=True):
+        half = float(min(*-low[:2], *high[:2]))
+        if shape.is_mesh() and half > 0:
+            points = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)[:, :2]
+            try:
+                normals = ConvexHull(points).equations  # n x + d <= 0 inside
+            except QhullError:  # upright: it covers nothing
+                normals = np.array([[1.0, 0.0, 0.0]])
+            half = float((-normals[:, 2] / np.abs(normals[:, :2]).sum(axis=1)).min())
+        halves.append(max(0.0, half))
+    return np.array(halves, dtype=np.float64)
 
 
 def object_names_in(scene: mi.Scene) -> tuple[str, ...]:
