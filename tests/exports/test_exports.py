@@ -491,7 +491,16 @@ def test_one_command_makes_a_detectors_data_set(mitsonar: Command, tmp_path: Pat
 
     coco_api = pytest.importorskip("pycocotools.coco")
     (tmp_path / "scene.xml").write_text(SCENE.replace('value="6"', 'value="7"'))
-    words = ("dataset", "detector", tmp_path / "scene.xml", "--sonar", "oculus-m750d-1200khz", "--frames", 12, *LITTLE)
+    words: tuple[object, ...] = (
+        "dataset",
+        "detector",
+        tmp_path / "scene.xml",
+        "--sonar",
+        "oculus-m750d-1200khz",
+        "--frames",
+        12,
+        *LITTLE,
+    )
     words = (*words, "--noise-db", "0,20", "--least-snr-db", "0", "--split", "0.5,0.25,0.25")
     done = mitsonar(*words, "--to", "yolo", "--picture", "fan", "-o", tmp_path / "yolo")
     assert done.returncode == 0, done.stderr
