@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -75,8 +76,8 @@ def open_export(where: str | Path, *, view: str | None = None) -> ExportSource:
     if view is not None:
         raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
     path = Path(where)
-    if path.is_dir():
-        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+    if os.path.isdir(path):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
         path = found[0] if found else path
     if path.suffix == ".npz":
         return _in_memory(SonarFrames.load(path), str(where))

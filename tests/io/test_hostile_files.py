@@ -41,9 +41,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from mutations import changed_arrays, changed_bytes, limits, npz, outcome, with_part
 
+import mitsonar
+from mitsonar.acoustics.backscatter import material
 from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.worlds.imported_world import imported_world
+from mitsonar.worlds.user_mesh import mesh_world
 
 SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
 """Readers that take 20 ms and more a mutant."""
@@ -64,6 +68,51 @@ def refusal(read: Callable[[], Any]) -> str:
     with limits(), pytest.raises(MitsonarError) as error:
         read()
     return str(error.value)
+
+
+# ---------------------------------------------------------------- paths
+
+BY_PATH: dict[str, Callable[[str], object]] = {
+    "checkpoint": lambda path: mitsonar.load_checkpoint(path),
+    "frames": lambda path: mitsonar.load_frames(path),
+    "SonarFrames": SonarFrames.load,
+    "ImpulseResponses": ImpulseResponses.load,
+    "trajectory": lambda path: mitsonar.Trajectory.load(path),
+    "motions": lambda path: mitsonar.load_motions(path),
+    "noise": lambda path: mitsonar.load_noise(path),
+    "recipe": lambda path: mitsonar.load_recipe(path),
+    "recording": lambda path: mitsonar.open_recording(path),
+    "scene": lambda path: mitsonar.load_scene(path),
+    "sensors": lambda path: mitsonar.load_sensors(path),
+    "sonar": lambda path: mitsonar.load_sonar(path),
+    "sounder": lambda path: mitsonar.load_sounder(path),
+    "material": lambda path: material(path),
+    "mesh": lambda path: mesh_world(f"{path}.obj"),
+    "sdf": lambda path: imported_world(f"{path}.sdf"),
+    "urdf": lambda path: imported_world(f"{path}.urdf"),
+    "usd": lambda path: imported_world(f"{path}.usda"),
+}
+"""Readers that are given a path."""
+
+
+@pytest.mark.parametrize("path", ["a" * 300, f"{'a' * 300}/b.yaml", "/".join(["a" * 200] * 30)], ids=len)
+def test_a_path_that_is_too_long_is_refused(path: str, variant: str) -> None:
+    """``Path.exists`` and its kind raise on such a path, where those of ``os.path`` answer."""
+    for name, read in BY_PATH.items():
+        assert path[:20] in refusal_without_limit(lambda read=read: read(path)), name  # type: ignore[misc]
+
+
+def test_a_link_to_itself_is_refused(tmp_path: Path, variant: str) -> None:
+    for name, read in BY_PATH.items():
+        path = tmp_path / name
+        for ending in ("", ".obj", ".sdf", ".urdf", ".usda"):
+            path.with_name(name + ending).symlink_to(path.with_name(name + ending))
+        assert name in refusal_without_limit(lambda read=read, path=path: read(str(path)))  # type: ignore[misc]
+
+
+def test_a_lone_carriage_return_in_a_path_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_bytes(b"time_s,x,y,z,qx,qy,qz,qw\n0,1\r2,0,0,0,0,0,1\n")
+    assert "path.csv: it is no table of CSV" in refusal(lambda: mitsonar.Trajectory.load(tmp_path / "path.csv"))
 
 
 # ---------------------------------------------------------------- mutants
@@ -384,6 +433,18 @@ def test_a_model_that_promises_millions_of_points(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- npz
+
+
+@pytest.mark.parametrize("name", ["sonar", "about"])
+def test_text_that_is_not_unicode_is_refused(name: str, tmp_path: Path) -> None:
+    """NumPy makes a text of any numbers, and pydantic ends on it with what is no ``Exception``."""
+    responses().save(tmp_path / "responses.npz")
+    table = dict(np.load(tmp_path / "responses.npz"))
+    letters = np.atleast_1d(table[name]).view(np.uint32).copy()
+    letters[1] = 0x110000
+    table[name] = letters.view(table[name].dtype)[0]
+    np.savez(tmp_path / "responses.npz", **table)
+    assert f"{name}.npy holds text that is not Unicode" in refusal(lambda: ImpulseResponses.load(tmp_path / "responses.npz"))
 
 
 BAD_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
