@@ -151,6 +151,8 @@ def test_bad_poses_are_refused_with_one_sentence_each_and_the_next_is_rendered(l
         b"no json": "not JSON",
         b'{"x": "far"}': "x of pose must be a finite number",
         b'{"x": NaN}': "x of pose must be a finite number",
+        b'{"x": 1, "id": 1e999}': "id of a pose is a finite number or a text",  # JSON has no word for it
+        b'{"x": 1, "id": NaN}': "id of a pose is a finite number or a text",
         b'{"yaw": 3}': "has no key 'yaw'",
         b'{"x": 1e9}': "within 1e+06 m of the origin",
         b'{"pose": {"position": {"x": 1}, "orientation": {}}}': "quaternion of length 1",
