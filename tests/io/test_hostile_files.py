@@ -31,19 +31,25 @@ from hostile_readers import (
     make_run,
     make_store,
     read_exr,
+    read_frames_zarr,
     read_meshes,
     read_odometry,
     read_run,
+    read_store,
     responses,
     serialized,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from mutations import changed_arrays, changed_bytes, limits, npz, outcome, with_part
+from numcodecs import Pickle
+from zarr.abc.codec import BytesBytesCodec
+from zarr.registry import register_codec
 
 import mitsonar
 from mitsonar.acoustics.backscatter import material
 from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
+from mitsonar.io.storage import refuse_codecs
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.worlds.imported_world import imported_world
@@ -430,6 +436,54 @@ def test_a_model_that_promises_millions_of_points(tmp_path: Path) -> None:
     head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
     (tmp_path / "many.glb").write_bytes(head + text + rest)
     assert "169,000,000" in refusal(lambda: mesh_world(tmp_path / "many.glb"))
+
+
+# ---------------------------------------------------------------- Zarr
+
+
+class Hostile(BytesBytesCodec):
+    """A codec of a package that happens to be installed."""
+
+    decoded = 0
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Hostile:
+        return cls()
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"name": "hostile"}
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: Any) -> int:
+        return input_byte_length
+
+    async def _decode_single(self, chunk_data: Any, chunk_spec: Any) -> Any:
+        Hostile.decoded += 1
+        return chunk_data
+
+
+@pytest.mark.parametrize("name", ["frames.zarr", "data set"])
+def test_a_codec_that_is_not_of_zarr_itself_is_refused_before_it_decodes(name: str, tmp_path: Path) -> None:
+    register_codec("hostile", Hostile)
+    make, read, array = {
+        "frames.zarr": (make_frames_zarr, read_frames_zarr, "frames.zarr/image"),
+        "data set": (make_store, read_store, "data.zarr/pose"),
+    }[name]
+    make(tmp_path)
+    path = tmp_path / array / "zarr.json"
+    about = json.loads(path.read_text())
+    path.write_text(json.dumps(about | {"codecs": [*about["codecs"], {"name": "hostile"}]}))
+    with pytest.raises(MitsonarError):
+        read(tmp_path)
+    assert Hostile.decoded == 0
+
+
+def test_responses_in_the_format_that_may_hold_pickles_are_not_resumed(tmp_path: Path) -> None:
+    import zarr
+
+    group = zarr.open_group(tmp_path / "responses.zarr", mode="w", zarr_format=2)
+    array = group.create_array("height_m", shape=(3,), dtype="f8", chunks=(3,), filters=[Pickle()], compressors=None)
+    with pytest.raises(ValueError, match="version 2"):
+        refuse_codecs(array)
 
 
 # ---------------------------------------------------------------- npz
