@@ -95,25 +95,36 @@ def _silence_asyncio() -> None:
 
 
 @contextmanager
-def _sigterm_stops() -> Iterator[None]:
-    """Let SIGTERM raise :class:`Terminated`. A second one ends the process at once, and so does one in a child."""
-    main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-    owner = os.getpid()
+def _signals_stop() -> Iterator[None]:
+    """Let SIGTERM raise :class:`Terminated`, and Ctrl-C KeyboardInterrupt, whatever else comes of it.
+
+    Native code that calls Python turns the exception of a signal into one of its own, and an import that it breaks off may
+    fail in any way. A second SIGTERM ends the process at once, and so does one in a child that was forked.
+    """
+    usual: dict[int, object] = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
+    ours = [number for number, handler in usual.items() if signal.getsignal(number) is handler]
+    if threading.current_thread() is not threading.main_thread():
+        ours = []
+    owner, come = os.getpid(), list[type[KeyboardInterrupt]]()
 
     def stop(number: int, _: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, usual[number])  # type: ignore[arg-type]
         if os.getpid() != owner:
             os.kill(os.getpid(), number)
-        raise Terminated
+        come.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        raise come[0]
 
-    signal.signal(signal.SIGTERM, stop)
+    for number in ours:
+        signal.signal(number, stop)
     try:
         yield
+    except Exception:
+        if come:
+            raise come[0] from None
+        raise
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in ours:
+            signal.signal(number, usual[number])  # type: ignore[arg-type]
 
 
 GEOMETRY = {"height_m": "--height", "pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"}
@@ -159,7 +170,7 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
         warnings.filterwarnings("always", category=MitsonarWarning)
         warnings.showwarning = _show
         try:
-            with _sigterm_stops():
+            with _signals_stop():
                 return command(*args, **kwargs)
         except MitsonarError as error:
             typer.echo(f"error: {' '.join(error.said(typed).split())}", err=True)
