@@ -16,6 +16,7 @@ party quotes from the named document, ``ours`` a choice or our own arithmetic.
 from __future__ import annotations
 
 import math
+import os
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -308,7 +309,7 @@ def material(name_or_file: str | Path) -> Material:
     """
     text = str(name_or_file)
     if not text.lower().endswith((".yaml", ".yml")):
-        if text in named_materials() or not Path(text).exists():
+        if text in named_materials() or not os.path.exists(text):
             return Material.create(**_named(text))
         raise MitsonarError(f"a material's file ends in .yaml: got {text}; rename it, or name a material")
     fields = read_yaml(text, "material file", " or a material's name")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 
 __all__ = ["compare"]
 
@@ -62,7 +61,7 @@ def compare(
     for sentence in report["notes"]:
         warn(sentence)
     if as_json:
-        say(json.dumps(report, indent=1))
+        say_json(report, indent=1)
         return
     say(
         f"{data}: {report['pairs']} pairs of {report['scenes']} scenes, {report['model']} model; sideways mm / forward mm / "

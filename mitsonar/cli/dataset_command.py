@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
+from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_json, say_stopped, warn
 from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.frames_command import (
     LEAST_SNR_DB,
@@ -94,10 +93,10 @@ def _made(recipe: Recipe, out: str, **words: object) -> Made:
     try:
         with bar:
             made = make_dataset(recipe, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
-    except KeyboardInterrupt:
-        say_stopped()
+    except KeyboardInterrupt as stop:
+        code = say_stopped(make, stop)
         sys.stdout.flush()
-        os._exit(130)  # threads of Zarr and dask would complain one by one
+        os._exit(code)  # threads of Zarr and dask would complain one by one
     for sentence in made.warnings:
         warn(sentence)
     return made
@@ -180,7 +179,7 @@ def info(
         return
     table = information(store)
     if as_json:
-        say(json.dumps(table, indent=2))
+        say_json(table)
         return
     for key, value in table.items():
         if key == "levels":

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 
 if TYPE_CHECKING:
     from mitsonar.networks.checkpoint import Checkpoint
@@ -75,7 +74,7 @@ def evaluate(
     if out is not None:
         save_tables(out, report)
     if as_json:
-        say(json.dumps(report, indent=1))
+        say_json(report, indent=1)
         return
     for name, value in checkpoint.rows():
         say(f"{name:18} {value}")

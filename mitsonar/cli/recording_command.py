@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 from mitsonar.cli.odometry_command import Geometry
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.io.run_directory import refuse_to_replace
@@ -65,7 +64,7 @@ def info(
         found = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
     if as_json:
         told = {} if found is None else {"handedness": found._asdict()}
-        say(json.dumps({**summary, **told}, indent=2))
+        say_json({**summary, **told})
         return
     for line in summary_lines(summary):
         say(line)

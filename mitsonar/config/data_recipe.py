@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
@@ -374,4 +375,4 @@ def _find_files(fields: Keys, folder: Path) -> None:
         *(g.get("world") for g in (groups if isinstance(groups, list) else []) if isinstance(g, dict)),
     ]:
         if isinstance(world, dict) and isinstance(world.get("file"), str):
-            world["file"] = str((folder / world["file"]).resolve())
+            world["file"] = os.path.realpath(folder / world["file"])

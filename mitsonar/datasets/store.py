@@ -22,7 +22,7 @@ from mitsonar.datasets.store_attributes import check_attributes
 from mitsonar.errors import MitsonarError, shortened
 from mitsonar.io.plain_data import check_plain
 from mitsonar.io.provenance import other_versions
-from mitsonar.io.storage import Storage
+from mitsonar.io.storage import Storage, refuse_codecs
 from mitsonar.records.columns import FEW_ROWS, rows_that_fit
 
 __all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
@@ -179,6 +179,8 @@ class DataStore:
             try:
                 with zarr.config.set({"array.write_empty_chunks": True}):  # a missing file is a missing shard
                     found = self.group[name]
+                if isinstance(found, zarr.Array):
+                    refuse_codecs(found)
             except Exception as error:  # no metadata, or damaged ones
                 raise MitsonarError(
                     f"{self.place.url}/{name}/zarr.json is damaged or gone ({type(error).__name__}): remove the data set "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -94,7 +95,7 @@ def estimator_from(text: str) -> AnyEstimator:
     Raises:
         MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
     """
-    if "," in text and not Path(text).exists():
+    if "," in text and not os.path.exists(text):
         return _nearest([part.strip() for part in text.split(",") if part.strip()])
     name, *words = text.split(":")
     if name in NAMES:
@@ -145,7 +146,7 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
 
 def names_checkpoint(name: str) -> bool:
     """Return whether a word of the command line is a path, not a name."""
-    return "/" in name or "." in name or Path(name).is_dir()
+    return "/" in name or "." in name or os.path.isdir(name)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

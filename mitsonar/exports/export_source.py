@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -96,8 +97,8 @@ def _of_frames(where: str | Path, view: str | None) -> ExportSource:
     if view is not None:
         raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
     path = Path(where)
-    if path.is_dir():
-        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+    if os.path.isdir(path):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
         path = found[0] if found else path
     if path.suffix == ".npz":
         return _in_memory(SonarFrames.load(path), str(where))

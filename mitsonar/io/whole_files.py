@@ -37,6 +37,9 @@ LARGEST_YAML = 2**20
 INFLATION = 1032
 """Largest factor by which deflated data can grow."""
 
+LAST_LETTER = 0x10FFFF
+"""Largest number of a letter in Unicode."""
+
 MOST_PARTS = 10_000
 """Arrays of an npz file, at most."""
 
@@ -213,5 +216,9 @@ def _array_in(content: bytes, name: str) -> FileArray:
     if any(length < 0 for length in shape) or math.prod(shape) * kind.itemsize != len(content) - part.tell():
         raise ValueError(f"{name} says that its shape is {str(shape)[:60]}, its bytes are {len(content) - part.tell():,}")
     values = np.frombuffer(content, kind, math.prod(shape), part.tell()) if kind.itemsize and math.prod(shape) else None
+    if values is not None and kind.kind == "U":
+        letters = values.view(np.dtype(np.uint32).newbyteorder(kind.byteorder))
+        if (letters > LAST_LETTER).any():  # NumPy makes a text of them, which ends others' readers
+            raise ValueError(f"{name} holds text that is not Unicode")
     made = np.zeros(shape, kind) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
     return np.array(made)  # writable

@@ -56,12 +56,12 @@ def open_frames(
         return _of_data_set(str(where), sequence, view)
     if sequence is not None or view is not None:
         raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
-    if path.is_dir() and not (path / "zarr.json").is_file():
-        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+    if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
         if not found:
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
         path = found[0]
-    return _of_zarr(path, str(where)) if path.is_dir() else _of_npz(path, str(where))
+    return _of_zarr(path, str(where)) if os.path.isdir(path) else _of_npz(path, str(where))
 
 
 def load_frames(
@@ -83,7 +83,7 @@ def is_data_set(where: str | Path) -> bool:
     path = Path(where)
     if "://" in str(where):
         return True
-    if not (path / "zarr.json").is_file():
+    if not os.path.isfile(path / "zarr.json"):
         return False
     import zarr
 
@@ -116,9 +116,9 @@ def _of_npz(path: Path, name: str) -> FrameSource:
     Raises:
         MitsonarError: nothing there, a file of another kind, or a damaged one.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         raise MitsonarError(f"there are no frames at {path}: {FINDING}")
-    if path.is_file() and os.access(path, os.R_OK) and not is_zipfile(path):
+    if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
         empty = path.stat().st_size == 0
         reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
         raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -93,7 +94,7 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
     import OpenEXR
 
     shape = (sonar.rays_per_beam, sonar.columns)
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise MitsonarError(f"no such echo file: {path}")
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -246,15 +247,15 @@ class SonarFrames:
             MitsonarError: no such file, or not frames.
         """
         path = Path(path)
-        if path.is_dir() and path.suffix != ".zarr":
-            found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+        if os.path.isdir(path) and path.suffix != ".zarr":
+            found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
             if not found:
                 raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
             path = found[0]
-        if not path.exists():
+        if not os.path.exists(path):
             raise MitsonarError(f"there are no frames at {path}: give frames.npz or a run's folder")
         try:
-            if path.is_dir():
+            if os.path.isdir(path):
                 table, done = open_group(path, COLUMNS, "time_s", "frames_done")
                 refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
                 arrays = {name: values for name, values in table.items() if not isinstance(values, np.ndarray)}

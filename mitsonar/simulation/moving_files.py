@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -208,6 +209,6 @@ def _found(name: str, folders: Sequence[Path]) -> list[Path]:
         except MitsonarError as error:
             errors.append(error)
             continue
-        if all(file.is_file() for file in files):
+        if all(os.path.isfile(file) for file in files):
             return files
     raise errors[0] if errors else MitsonarError(f"there is no {name} in {folders[0] if folders else Path()}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -62,12 +63,12 @@ def find_scene(name_or_file: str | Path) -> Path:
         MitsonarError: there is neither.
     """
     path = Path(name_or_file)
-    if path.is_file():
+    if os.path.isfile(path):
         return path
     shipped = shipped_scenes()
     if str(name_or_file) in shipped:
         return shipped[str(name_or_file)]
-    if path.is_dir():
+    if os.path.isdir(path):
         raise MitsonarError(f"scene {path} is a folder: give the XML file in it")
     names = nearest_names(path.stem, shipped)
     raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or the name of a shipped scene, {names}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from mitsonar.errors import MitsonarError, nearest_names
@@ -14,6 +15,7 @@ __all__ = [
     "backend",
     "current_variant",
     "ensure_variant",
+    "frozen",
     "release_memory",
     "replayed",
     "thread_count",
@@ -87,6 +89,20 @@ def thread_count() -> int:
     import drjit as dr
 
     return max(1, int(dr.thread_count()))
+
+
+def frozen(launch: Callable[..., Any]) -> Callable[..., Any]:
+    """Record a launch at its first call and replay it at later ones: ``dr.freeze``, for launches that evaluate BSDFs.
+
+    A kernel that evaluates BSDFs holds the code of all that are alive, those of other scenes included, and Dr.Jit records it
+    only if the values that they read are among the inputs. It collects these of every class of which the inputs hold a
+    pointer. A scene holds pointers to shapes only, and through a shape Dr.Jit finds the shape's BSDF, but not a BSDF of
+    another scene that no shape uses. Hence the pointer to a BSDF, which points at none.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.freeze(launch, state_fn=lambda *_: mi.BSDFPtr(None))
 
 
 def replayed(launch: Any, *inputs: object) -> Any:

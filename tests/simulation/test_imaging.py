@@ -311,6 +311,14 @@ def test_a_launch_that_cannot_be_replayed_is_recorded_anew(flat: mi.Scene) -> No
     np.testing.assert_array_equal(before.levels, after.levels)
 
 
+def test_a_scene_with_a_bsdf_that_no_shape_uses_is_rendered_beside_another() -> None:
+    """Dr.Jit refuses to record a launch of the second scene while it does not find the values of that BSDF."""
+    shapes = {"unused": diffuse(0.3), "ground": floor(), "ball": sphere([0, 3, 0], 0.5)}
+    first, second = scene(**shapes), scene(**shapes)
+    before, after = (Simulator(one, SMALL).render([POSE], gain=1.0).image for one in (first, second))
+    np.testing.assert_array_equal(before, after)
+
+
 def test_a_replayed_launch_gives_what_a_new_one_gives(flat: mi.Scene) -> None:
     """Poses, ping numbers and jitter are inputs of the recording, not constants in it."""
     old = Simulator(flat, SMALL)
