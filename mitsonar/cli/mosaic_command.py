@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
 from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.odometry_command import Frames, Geometry
 from mitsonar.cli.render_command import NOISE
 from mitsonar.errors import MitsonarError, meant
-from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.io.run_directory import kind_of_run, refuse_to_replace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,9 +66,15 @@ def mosaic(
     from mitsonar.mapping.geotiff import save_geotiff
     from mitsonar.mapping.illumination import illumination
     from mitsonar.mapping.mosaic import Mosaic, build_mosaic
+    from mitsonar.mapping.odometry_run import ODOMETRY
     from mitsonar.mapping.open_frames import is_recording
     from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
 
+    if kind_of_run(frames) == ODOMETRY.name:
+        raise MitsonarError(
+            f"{frames} is the folder of an odometry, and mosaic takes the frames first, the odometry second: "
+            f"{command_line('mosaic', trajectory, frames, '-o', out)}"
+        )
     quality = _checked_out(out, true, overwrite)
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
     paths, path_height = _paths(trajectory, true, frame)
