@@ -108,3 +108,35 @@ def test_a_trajectory_that_no_shape_reads_is_refused(shape: str, said: str, tmp_
             load_scene(file)
     else:
         assert [found.name for found in said_by(load_scene(file))] == ["fish"]
+
+
+GLB = b"glTF\x02\x00\x00\x00" + bytes(100)
+BINARY_STL = bytes(80) + (2).to_bytes(4, "little") + bytes(100)
+COLLADA = b'<?xml version="1.0"?><COLLADA version="1.4.1"/>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "content", "message"),
+    [
+        (
+            "ply",
+            "ship.glb",
+            GLB,
+            r"is a file of glTF, and Mitsuba's shape ply does not read it.*mitsonar world mesh .*ship.glb",
+        ),
+        ("obj", "ship.gltf", b'{"asset": {"version": "2.0"}}', r"is a file of glTF.*mitsonar world mesh"),
+        ("ply", "ship.dae", COLLADA, r"is a file of COLLADA.*mitsonar world mesh"),
+        ("obj", "ship.stl", BINARY_STL, r"is a file of STL.*ply, obj and serialized.*mitsonar world mesh"),
+        ("glb", "ship.glb", GLB, r"is a file of glTF, and Mitsuba has no shape glb.*mitsonar world mesh"),
+        ("obj", "ship.ply", b"ply\nformat ascii 1.0\n", r"is a file of PLY.*name the shape ply"),
+        ("ply", "ship.ply", b"ply\nformat ascii 1.0\n", r"is damaged: it has no header of PLY; export it again"),
+    ],
+)
+def test_a_model_in_a_format_that_mitsuba_lacks_is_named(
+    tmp_path: Path, kind: str, name: str, content: bytes, message: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    shape = f'<shape type="{kind}"><string name="filename" value="{name}"/></shape>'
+    (tmp_path / "mine.xml").write_text(f'<scene version="3.0.0">{shape}</scene>')
+    with pytest.raises(MitsonarError, match=message):
+        load_scene(tmp_path / "mine.xml")
