@@ -63,7 +63,7 @@ def render_vehicle(
     from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, sensors_in
 
-    sensors = sensors_in(scene, Pose(*path.poses[0])) if vehicle is None else vehicle.sensors
+    sensors = sensors_in(scene, Pose.from_row(path.poses[0])) if vehicle is None else vehicle.sensors
     changed = {}
     for name, one in sensors.items():
         instrument: Any = one.instrument

@@ -193,7 +193,9 @@ def _sequence(
         outermost = np.maximum(np.abs(x + position[:, :1]), np.abs(y + position[:, 1:])).max(axis=1)
         found = int((outermost <= half).argmax())
         if outermost[found] <= half:
-            start = Pose(float(position[found, 0]), float(position[found, 1]), height, 0, 0, float(heading[found]))
+            start = Pose.from_row(
+                (float(position[found, 0]), float(position[found, 1]), height, 0, 0, float(heading[found]))
+            )
             return _drive(start, motion, flight.pings)
     raise MitsonarError(
         f"no place for a sequence found in {TRIES * CANDIDATES:,} tries: its footprint reaches "

@@ -109,7 +109,7 @@ class Odometry:
         if self.series.covariances is None:
             return None
         by_map = np.array([one.about.get("map") == USED for one in self.estimates], dtype=bool)
-        return pose_covariances(self.series, Pose(*self.path.poses[0]), correlated=self.correlated, alone=by_map)
+        return pose_covariances(self.series, Pose.from_row(self.path.poses[0]), correlated=self.correlated, alone=by_map)
 
     def rows(self) -> list[Row]:
         """Return name, value and unit of all results: the one table for console, file and README."""
@@ -284,7 +284,7 @@ def _scale_factors(
 def _start(source: Source, first: int) -> Pose:
     """Return the true first pose, or what is known of it."""
     if source.poses is not None:
-        return Pose(*(float(value) for value in source.poses[first]))
+        return Pose.from_row(float(value) for value in source.poses[first])
     height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
     return Pose(0.0, 0.0, height, source.pitch_rad or 0.0)
 

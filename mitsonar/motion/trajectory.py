@@ -62,7 +62,8 @@ class Trajectory:
     def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
         """Space ``frames`` poses equally from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
 
-        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard.
+        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard
+        (:meth:`Pose.from_degrees` takes angles beyond a full turn).
 
         Raises:
             MitsonarError: no frames.
