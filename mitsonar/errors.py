@@ -27,7 +27,7 @@ __all__ = [
 EXTRAS = {
     "distributed": ("data", "making a data set on several processes"),
     "dask": ("data", "making a data set on several processes"),
-    "trimesh": ("meshes", "worlds and models"),
+    "trimesh": ("data,meshes", "worlds and models"),
     "collada": ("meshes", "reading a .dae model"),
     "lxml": ("meshes", "reading a .dae model"),
     "pxr": ("usd", "reading USD"),
@@ -49,7 +49,7 @@ EXTRAS = {
     "small_gicp": ("bench", "the estimator cfar-gicp"),
     "pystackreg": ("bench", "the estimator stackreg"),
 }
-"""Optional packages: the extra that installs each, and what needs it."""
+"""Optional packages: the extras that install each, by the tasks that need it, and what these tasks are."""
 
 LONGEST_KEY = 60
 """Letters of a key in a message; those of a stranger's file may be of any length."""
@@ -103,7 +103,8 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
     if package not in EXTRAS:
         raise error
     extra, what = EXTRAS[package]
-    return MitsonarError(f"{what} needs {package}, which is not installed: pip install 'mitsonar[{extra}]'")
+    needs = "need" if what.endswith("s") else "needs"
+    return MitsonarError(f"{what} {needs} {package}, which is not installed: pip install 'mitsonar[{extra}]'")
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
