@@ -18,6 +18,7 @@ __all__ = [
     "MitsonarWarning",
     "argument",
     "complaint",
+    "counted",
     "explain_missing",
     "meant",
     "nearest_names",
@@ -113,6 +114,11 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
     near = [name for name in known if wrong and wrong.lower() in name.lower()]
     near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
     return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun, for messages: ``1 frame``, ``1,200 frames``."""
+    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def meant(wrong: object, names: Iterable[str]) -> str:

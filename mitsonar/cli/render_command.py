@@ -15,9 +15,11 @@ from mitsonar.errors import MitsonarError
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.moving_files import Said
 
-__all__ = ["NOISE", "instrument_for", "moving_said", "render", "scene_parameters", "sonar_changes"]
+__all__ = ["NOISE", "check_above_ground", "instrument_for", "moving_said", "render", "scene_parameters", "sonar_changes"]
 
 NOISE = (
     "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
@@ -118,6 +120,7 @@ def render(
     simulator = Simulator(
         loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
     )
+    check_above_ground(loaded, path, simulator.motion is not None, simulator)
     origin |= {"mirrors": True} if mirrors else {}
     origin |= {"moving": digests_of(said)} if said else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
@@ -131,6 +134,29 @@ def render(
         say(line)
     if report.pictures:
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
+
+
+def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Simulator | None = None) -> None:
+    """Refuse a path below the ground or inside an object, from where the sonar sees nothing; warn where it sees something.
+
+    Args:
+        scene: the Mitsuba scene.
+        path: of the sonar or vehicle.
+        moving: whether bodies move, which is not judged.
+        simulator: of the sonar, tells whether it sees anything; None: only warn.
+    """
+    from mitsonar.simulation.clearance import buried_in
+
+    found = None if moving else buried_in(scene, path.poses)
+    if found is None:
+        return
+    frames = f"pose {found.frame}" if found.frames == 1 else f"pose {found.frame}, the first of {found.frames:,} such poses,"
+    if simulator is not None:
+        echoes, sonar = simulator.film_echoes(path.poses[found.frame], found.frame), simulator.sonar
+        if not ((echoes.hit > 0) & (echoes.far_m >= sonar.range_min) & (echoes.near_m < sonar.range_max)).any():
+            raise MitsonarError(f"{frames} {found.text}, and sees nothing from there: correct --from, --to or --trajectory")
+    if not found.inside:  # a tank is an object, too
+        warn(f"{frames} {found.text}: its frames show the ground from below")
 
 
 def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said] = ()) -> list[Said]:

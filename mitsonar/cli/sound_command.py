@@ -9,7 +9,7 @@ import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.flown_path import SIX, SPEED, Frame, path_for, warn_of_speed
-from mitsonar.cli.render_command import moving_said, scene_parameters, sonar_changes
+from mitsonar.cli.render_command import check_above_ground, moving_said, scene_parameters, sonar_changes
 
 __all__ = ["sound"]
 
@@ -66,6 +66,7 @@ def sound(
     said = moving_said(loaded, moving or [], named)
     bodies = MovingBodies.of(read_said(said), named, flown)
     simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)
+    check_above_ground(loaded, flown, bool(said))
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     origin |= {"moving": digests_of(said)} if said else {}
     options: dict[str, Any] = {"frame": named, "overwrite": overwrite, "resume": resume}

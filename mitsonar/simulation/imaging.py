@@ -216,6 +216,15 @@ class Simulator:
         """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 
+    def buried(self, pose: ArrayLike) -> str:
+        """Describe where a pose lies below the ground or inside an object; empty where it does not, or bodies move."""
+        from mitsonar.simulation.clearance import buried_in
+
+        found = (
+            None if self.motion is not None else buried_in(self.tracer.scene, np.atleast_2d(np.asarray(pose, dtype=float)))
+        )
+        return "" if found is None else found.text
+
     def render(
         self,
         trajectory: Trajectory | ArrayLike,

@@ -82,7 +82,9 @@ class Tally:
             pose = poses[number - first]
             window = (sonar.range_min, sonar.range_max)
             beside = source.window_range(pose, number)
-            found["empty"] = empty_frames(self.empty, self.frames, (number, pose), its_rays, window, beside)
+            found["empty"] = empty_frames(
+                self.empty, self.frames, (number, pose), its_rays, window, beside, source.buried(pose)
+            )
         if outside > 0 and "window" not in told:
             frame = self.worst[1]
             ends = source.window_range(poses[frame - first], frame)
