@@ -8,7 +8,7 @@ from typing import Annotated, cast
 import typer
 
 from mitsonar.cli.console import answered, command_line, progress_bar, say
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 __all__ = ["Least", "Out", "Picture", "Polygons", "To", "Without", "exported", "frames"]
 
@@ -62,4 +62,4 @@ def exported(
     kind = cast(PictureKind, picture)
     with progress_bar("exporting", source.frames, "frames") as progress:
         export_to(to, source, out, picture=kind, without=without, least=least, polygons=polygons, progress=progress)
-    say(f"{source.frames:,} frames as {to}: {out}")
+    say(f"{counted(source.frames, 'frame')} as {to}: {out}")

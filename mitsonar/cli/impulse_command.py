@@ -11,7 +11,7 @@ import typer
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
 from mitsonar.cli.flown_path import SIX, Frame
 from mitsonar.cli.render_command import scene_parameters
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, counted, meant
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,7 +85,10 @@ def impulse(
     for sentence in report.warnings:
         warn(sentence)
     names = ", ".join(receiver.name for receiver in sonar.receivers)
-    say(f"{report.pings} pings ({sonar.model} model, {sonar.name}: {names}) of {sonar.taps} taps in {folder}")
+    say(
+        f"{counted(report.pings, 'ping')} ({sonar.model} model, {sonar.name}: {names}) of "
+        f"{counted(sonar.taps, 'tap')} in {folder}"
+    )
     spread = report.spread
     say(
         f"spread factor {spread.factor:.3g}: delays over {1e3 * spread.delay_s:.3g} ms, Doppler shifts over "

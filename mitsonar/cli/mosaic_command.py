@@ -14,7 +14,7 @@ from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
 from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.odometry_command import Frames, Geometry
 from mitsonar.cli.render_command import NOISE
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, counted, meant
 from mitsonar.io.run_directory import kind_of_run, refuse_to_replace
 
 if TYPE_CHECKING:
@@ -112,9 +112,9 @@ def mosaic(
             illumination=light,
         )
     if len(index) < len(source):
-        warn(f"{len(source) - len(index):,} of {len(source):,} frames have no pose at their time and were left out")
+        warn(f"left out without a pose at their time: {len(source) - len(index):,} of {counted(len(source), 'frame')}")
     if found.frames_without_ground:
-        warn(f"{found.frames_without_ground:,} of {found.frames:,} frames show no ground and were left out")
+        warn(f"left out since they show no ground: {found.frames_without_ground:,} of {counted(found.frames, 'frame')}")
     if quality is None:
         save_geotiff(out, found)
     else:
@@ -122,7 +122,7 @@ def mosaic(
     rows, columns = found.mean.shape
     spread = float(np.nanmedian(found.std)) if np.isfinite(found.std).any() else float("nan")
     say(
-        f"{found.frames:,} frames along the {laid_along} path: {rows:,} x {columns:,} cells of {cell_mm:g} mm, "
+        f"{counted(found.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of {cell_mm:g} mm, "
         f"{rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; median standard deviation {spread:.4f}"
     )
     say(f"mosaic: {out}" + (f", quality: {quality}" if quality else " (bands: mean, standard deviation, count)"))

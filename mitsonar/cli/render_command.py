@@ -10,7 +10,7 @@ import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, warn_of_speed
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
@@ -129,7 +129,7 @@ def render(
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{report.frames} frames ({instrument.model} model, {instrument.name}) in {folder}")
+    say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.name}) in {folder}")
     if line := absorption_line(instrument):
         say(line)
     if report.pictures:

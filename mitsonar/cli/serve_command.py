@@ -15,7 +15,7 @@ import typer
 from mitsonar.cli.console import answered, say
 from mitsonar.cli.flown_path import SIX, Frame, path_for
 from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters, sonar_changes
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.live.live_loop import LivePublisher
@@ -72,7 +72,7 @@ def serve(
                     break
     finally:
         publisher.close()
-    say(f"{served} pings")
+    say(f"{counted(served, 'ping')}")
 
 
 @contextmanager

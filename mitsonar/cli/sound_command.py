@@ -10,6 +10,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.flown_path import SIX, SPEED, Frame, path_for, warn_of_speed
 from mitsonar.cli.render_command import check_above_ground, moving_said, scene_parameters, sonar_changes
+from mitsonar.errors import counted
 
 __all__ = ["sound"]
 
@@ -75,5 +76,5 @@ def sound(
         report = run_sounder(simulator, flown, folder, origin=origin, progress=progress, **options)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{len(flown)} pings ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
-    say(f"{report.found:,} of {report.beams:,} beams have an echo; files: {', '.join(report.files)}")
+    say(f"{counted(len(flown), 'ping')} ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
+    say(f"echoes in {report.found:,} of {counted(report.beams, 'beam')}; files: {', '.join(report.files)}")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mitsonar.cli.console import progress_bar, say, warn
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
@@ -77,4 +77,7 @@ def render_vehicle(
         report = run_vehicle(simulator, path, folder, outputs, origin=origin, progress=progress, **begun)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{len(path)} poses, {len(report.sensors)} sensors ({', '.join(report.sensors)}) in {folder}, a folder each")
+    say(
+        f"{counted(len(path), 'pose')}, "
+        f"{counted(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {folder}, a folder each"
+    )

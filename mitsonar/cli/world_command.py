@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from mitsonar.cli.console import answered, command_line, say, warn
 from mitsonar.cli.help_texts import with_plain_brackets
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -218,4 +218,4 @@ def _joint_values(pairs: list[str]) -> dict[str, float]:
 def _write(world: World, out: Path) -> None:
     scene = world.write(out)
     say(world.about)
-    say(f"{world.faces:,} triangles in {scene}; render it with: {command_line('render', scene, '--cartesian')}")
+    say(f"{counted(world.faces, 'triangle')} in {scene}; render it with: {command_line('render', scene, '--cartesian')}")

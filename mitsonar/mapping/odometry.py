@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, counted, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
@@ -147,7 +147,9 @@ class Odometry:
         for reasons, what in ((lost, "are not believed and were bridged"), (without, "are those of pairs of frames")):
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
-                told.append(f"{len(reasons)} of {len(self.estimates)} motions ({part:.0f} %) {what}: {_usual(reasons)}")
+                told.append(
+                    f"{len(reasons)} of {counted(len(self.estimates), 'motion')} ({part:.0f} %) {what}: {_usual(reasons)}"
+                )
         return told
 
 
@@ -345,4 +347,4 @@ def _usual(reasons: list[str]) -> str:
     """Return the most frequent reasons; reasons that differ in their numbers only count as one."""
     kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
     example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
-    return "; ".join(f"{count} times such as {example[kind]!r}" for kind, count in kinds)
+    return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mitsonar.errors import counted
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
         axes.set(title=receiver.name, xlabel="delay (ms)")
     grid[0].set_ylabel("time (s)")
     figure.colorbar(shown, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
-    figure.suptitle(_title(responses, f"{len(responses)} pings"), fontsize=10)
+    figure.suptitle(_title(responses, counted(len(responses), "ping")), fontsize=10)
     return figure
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.beam_table import TABLES, aris_bearings
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
@@ -154,7 +154,7 @@ def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], lis
     whole = tabled if tabled.any() else whole  # where all frames lack a table, the error says which
     notes = []
     if not whole.all():
-        notes.append(f"{(~whole).sum():,} frames have a damaged header and are left out")
+        notes.append(f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header")
     if frames.left_over:
         notes.append(f"the last {frames.left_over:,} bytes are no whole frame and are left out")
     return whole, notes

@@ -121,7 +121,9 @@ def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
         return None
     shapes = [dr.reinterpret_array(mi.UInt32, found.shape) for found in (above, below)]
     names = {
-        number: shape.id() for shape in scene.shapes() for number in dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+        number: shape.id()
+        for shape in scene.shapes()
+        for number in np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
     }
     up, down = (np.array(number) for number in shapes)
     wet = np.array([names.get(int(number), "") == SEA_SURFACE for number in up])

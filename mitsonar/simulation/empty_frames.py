@@ -47,8 +47,8 @@ def empty_frames(
     beside = f" (returns at {found[0]:.3g}..{found[1]:.3g} m)" if found else ""
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
     return (
-        f"{empty} of {frames} frames are empty, frame {number} first: {inside} % of its rays meet something within the "
-        f"window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{beside}, {missed} % "
+        f"empty: {empty} of {counted(frames, 'frame')}, frame {number} first: {inside} % of its rays meet something within "
+        f"the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{beside}, {missed} % "
         f"nothing; {view_of(pose)}; {hint or check}"
     )
 

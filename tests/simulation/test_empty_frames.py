@@ -35,8 +35,8 @@ def warned(loaded: mi.Scene, poses: ArrayLike, sonar: Sonar = SONAR) -> list[str
 def test_frames_that_look_over_the_ground_say_so() -> None:
     """Radians given where degrees are meant: pitch 0.61 deg; the floor is met beyond the window."""
     ground = scene(floor=floor(diffuse(0.5), 50))
-    (said,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "frames are empty" in text]
-    assert said.startswith("1 of 2 frames are empty, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
+    (said,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "empty: " in text]
+    assert said.startswith("empty: 1 of 2 frames, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
     assert "farther (returns at" in said
     assert "the sonar is at (0, 0, 2.5) m and looks 0.61 deg below the horizon, along (0.00, 1.00, -0.01)" in said
     assert said.endswith("its pitch, roll, heading are only 0.61, 0, 0 deg: were radians given where degrees are meant?")
@@ -61,7 +61,7 @@ def test_frames_with_hardly_an_echo_count_and_frames_with_a_small_target_do_not(
     sonar = SONAR.replace(range_bins=2048, beams=64)
     tiny = scene(ball=sphere((0, 3, 2.5), 0.003, diffuse(0.9)))
     hardly = warned(tiny, [Pose(0, 0, 2.5)], sonar.replace(rays_per_beam=400, rays_across=4))
-    assert any(text.startswith("1 of 1 frames are empty") for text in hardly)
+    assert any(text.startswith("empty: 1 of 1 frame,") for text in hardly)
     assert not warned(scene(ball=sphere((0, 3, 2.5), 0.3, diffuse(0.9))), [Pose(0, 0, 2.5)], sonar)
 
 
