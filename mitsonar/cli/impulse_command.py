@@ -86,7 +86,7 @@ def impulse(
         warn(sentence)
     names = ", ".join(receiver.name for receiver in sonar.receivers)
     say(
-        f"{counted(report.pings, 'ping')} ({sonar.model} model, {sonar.name}: {names}) of "
+        f"{counted(report.pings, 'ping')} ({sonar.model} model, {sonar.title}: {names}) of "
         f"{counted(sonar.taps, 'tap')} in {folder}"
     )
     spread = report.spread

@@ -129,7 +129,7 @@ def render(
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.name}) in {folder}")
+    say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
     if line := absorption_line(instrument):
         say(line)
     if report.pictures:

@@ -63,7 +63,7 @@ def serve(
     simulator = Simulator(loaded, instrument)
     mailbox, served = PoseMailbox(), 0
     publisher = _ros_node(mailbox) if ros else _foxglove(mailbox, host, port)
-    say(f"{instrument.name}, {instrument.model} model, {instrument.beams} beams x {instrument.range_bins} bins: ready")
+    say(f"{instrument.title}, {instrument.model} model, {instrument.beams} beams x {instrument.range_bins} bins: ready")
     try:
         with _set_by_signals() as ends:
             for _ in live_pings(simulator, mailbox, publisher, path, rate_hz=hertz, noise=drawn, seed=seed or 0, ends=ends):

@@ -15,6 +15,7 @@ from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 from mitsonar.records.sonar_frames import LABELS
+from mitsonar.simulation.tally import NEGLIGIBLE
 
 __all__ = ["ImageModality", "footprint"]
 
@@ -43,6 +44,10 @@ PER_FRAME = {
     "dropped": StoredArray(np.dtype(np.uint32), "returns of the frame that lie outside the window and were dropped"),
     "saturated": StoredArray(np.dtype(np.uint32), "pixels of the frame at the maximum"),
 }
+
+
+MOST_DROPPED = 0.5
+"""Part of a ping's rays that the window of a recipe may drop: a recipe that states its window means it."""
 
 
 class ImageModality:
@@ -174,11 +179,12 @@ class ImageModality:
                 "flight.sideways_mm and forward_mm are in millimetres"
             )
         dropped, saturated = (read(name).astype(np.int64) for name in ("dropped", "saturated"))
-        if dropped.any():
-            rays = self.sonar.rays
+        rays, stated = self.sonar.rays, {"range_min", "range_max"} <= set(self.recipe.sonar or {})
+        if dropped.mean() > (MOST_DROPPED if stated else NEGLIGIBLE) * rays:
             sentences.append(
                 f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside "
-                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped, as the window says"
+                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped: set sonar.range_min "
+                "and range_max"
             )
         pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.recipe.views)
         if saturated.mean() > 0.01 * pixels:

@@ -91,7 +91,8 @@ def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
 
 def _title(responses: ImpulseResponses, what: str) -> str:
     sonar = responses.sonar
-    return f"{sonar.name}, {sonar.model}: {sonar.carrier_hz / 1e3:g} kHz, bandwidth {sonar.bandwidth_hz / 1e3:g} kHz; {what}"
+    bands = f"{sonar.carrier_hz / 1e3:g} kHz, bandwidth {sonar.bandwidth_hz / 1e3:g} kHz"
+    return f"{sonar.title}, {sonar.model} model: {bands}; {what}"
 
 
 def _png(figure: Figure) -> bytes:

@@ -298,10 +298,9 @@ def facts_of(headers: Header, beams: int) -> Facts:
     facts: Facts = {"system": f"ARIS {KINDS[int(first['system'])].name}", "beams": beams}
     facts |= {name: int(first[name]) for name in names} | {"gain_db": int(first["gain_db"])}
     facts["sound_speed"] = float(first["sound_speed"])
-    for name in ("heading_deg", "pitch_deg", "roll_deg", "temperature_c"):
-        known = headers[name][np.isfinite(headers[name])]
-        if len(known):
-            facts[name] = [float(known.min()), float(known.max())]
+    known = headers["temperature_c"][np.isfinite(headers["temperature_c"])]  # attitude is in the frames, in our signs
+    if len(known):
+        facts["temperature_c"] = [float(known.min()), float(known.max())]
     return facts
 
 

@@ -142,6 +142,8 @@ def _date(time_s: float) -> str:
 def _shown(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(one, int | float) for one in value):
+        return f"{value[0]:.6g}..{value[1]:.6g}"
     if isinstance(value, list):
         return ", ".join(_shown(one) for one in value)
     return str(value)

@@ -384,7 +384,7 @@ def _write_pictures(folder: Path, first: int, frames: SonarFrames, outputs: Outp
     if outputs.cartesian:
         (folder / "cartesian").mkdir(exist_ok=True)
         for index in range(len(frames)):
-            title = f"{frames.sonar.name}, {frames.sonar.model}, frame {first + index}"
+            title = f"{frames.sonar.title}, {frames.sonar.model} model, frame {first + index}"
             save_fan(folder / "cartesian" / f"{first + index:06d}.png", frames, index, title=title)
 
 
