@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, warn_of_speed
+from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, poses_line, warn_of_speed
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
@@ -35,7 +35,10 @@ def render(
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
     speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM or CSV file, or `shipped`.")] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="Poses of the sonar, or with --vehicle of the vehicle: a TUM or CSV file, or `shipped`."),
+    ] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
@@ -130,6 +133,7 @@ def render(
     for sentence in report.warnings:
         warn(sentence)
     say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
+    say(poses_line(path))
     if line := absorption_line(instrument):
         say(line)
     if report.pictures:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mitsonar.cli.console import progress_bar, say, warn
+from mitsonar.cli.flown_path import poses_line
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ def render_vehicle(
         report = run_vehicle(simulator, path, folder, outputs, origin=origin, progress=progress, **begun)
     for sentence in report.warnings:
         warn(sentence)
+    say(poses_line(path, {name: one.mount for name, one in changed.items()}))
     say(
         f"{counted(len(path), 'pose')}, "
         f"{counted(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {folder}, a folder each"

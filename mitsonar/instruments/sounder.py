@@ -125,6 +125,11 @@ class Sounder(BaseModel):
         """Return the unit vectors of the fans' axes ``(channels, 3)`` as (starboard, forward, up) of the vehicle."""
         return np.asarray(vehicle_rotation(self.mount_poses).apply([0.0, 1.0, 0.0]))
 
+    @property
+    def looks_ahead(self) -> bool:
+        """Return whether all fans look ahead, so that the instrument's poses are those of a forward-looking sonar."""
+        return bool((self.axes[:, 1] > math.cos(math.radians(45))).all())
+
     def fan_poses(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the poses of all fans in the world ``(pings, channels, 6)`` for poses of the vehicle ``(pings, 6)``."""
         return np.stack([mounted(poses, Pose.from_row(mount)) for mount in self.mount_poses], axis=1)
