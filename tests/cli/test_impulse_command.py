@@ -131,7 +131,7 @@ def test_a_receiver_that_hears_nothing_is_named(mitsonar: Command, tmp_path: Pat
     )
     done = mitsonar("impulse", path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert "receiver up has no echo in 1 of 1 pings" in done.stderr
+    assert "receiver up has no echo in 1 of 1 ping" in done.stderr
     assert "above 90: upwards" in done.stderr
     assert "receiver up is 20 m from the transmitter: positions are in metres" in done.stderr
     assert "receiver front" not in done.stderr
