@@ -4,8 +4,8 @@
 
 Milliseconds of processor time of all threads, and of wall time, medians within one run; rows take turns. `trace` is
 `ray_intersect_preliminary` on the rays of the coherent fan. `beams`: the model physical with pattern two_way. The poses move
-by 10 mm a ping. `--presets`: a ping of each preset over the flat floor instead, from 0.3 of the window's end above it at a pitch
-of 20 deg, and its figure with metre axes (`mitsonar render --cartesian`).
+by 10 mm a ping. `--presets`: a frame of each preset over the flat floor instead, from 0.3 of the window's end above it at a
+pitch of 20 deg, and its figure with metre axes (`mitsonar render --cartesian`).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def main() -> None:
     asked = parser.parse_args()
     ensure_variant(asked.variant)
     if asked.presets:
-        of_presets = {"machine": machine(), "rows": [preset_row(name, 5) for name in named_sonars()]}
+        of_presets = {"machine": machine(), "rows": [preset_row(name, 3) for name in named_sonars()]}
         print(json.dumps(of_presets, indent=2) if asked.json else preset_table(of_presets))
         return
     rows = [measured(case, 1 if asked.quick else 15) for case in cases(asked.quick)]
