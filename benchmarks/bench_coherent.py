@@ -90,7 +90,7 @@ def rendered_frames(simulator: Simulator, case: Case, ping: int) -> SonarFrames:
     poses = np.repeat(case.pose(ping), 2 if scans(case.sonar) else 1, axis=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MitsonarWarning)
-        return simulator.render(Trajectory(poses, np.arange(len(poses)) * frame_period_s(case.sonar)))
+        return simulator.render(Trajectory(poses, frame_period_s(case.sonar) * np.arange(len(poses), dtype=float)))
 
 
 def drawn(frames: SonarFrames) -> bytes:
