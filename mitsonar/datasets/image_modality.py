@@ -15,7 +15,6 @@ from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 from mitsonar.records.sonar_frames import LABELS
-from mitsonar.simulation.tally import NEGLIGIBLE
 
 __all__ = ["ImageModality", "footprint"]
 
@@ -170,6 +169,8 @@ class ImageModality:
 
     def warnings(self, read: Read) -> list[str]:
         """Warn of motions far below a bin, of returns outside the window, and of a gain that is too high."""
+        from mitsonar.simulation.tally import NEGLIGIBLE  # a stored set is read without a simulator
+
         sentences = []
         flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m
         largest_mm = max(flight.sideways_mm, flight.forward_mm)
