@@ -367,11 +367,11 @@ def figure(asked: argparse.Namespace) -> None:
     flown = course_of(asked, "sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
     sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
     frames = Simulator(scene, sonar).render(flown)
-    seen = odometry(frames, create_estimator("direct"), start=Pose(*flown.poses[0]))
+    seen = odometry(frames, create_estimator("direct"), start=Pose.from_row(flown.poses[0]))
     path = asked.out / f"course-sinusoid-{asked.model}-{asked.pings}-correlation.json"
     received = np.array(json.loads(path.read_text()))[:, :3]
     driven_by = {
-        "impulse responses, correlation of ten pings": path_of(received, Pose(*flown.poses[0]), flown.time_s).poses,
+        "impulse responses, correlation of ten pings": path_of(received, Pose.from_row(flown.poses[0]), flown.time_s).poses,
         "DIDSON images, direct": seen.path.poses,
     }
     drawn = Figure(figsize=(10, 5), layout="constrained")

@@ -18,6 +18,7 @@ __all__ = [
     "MitsonarWarning",
     "argument",
     "complaint",
+    "counted",
     "explain_missing",
     "meant",
     "nearest_names",
@@ -27,7 +28,7 @@ __all__ = [
 EXTRAS = {
     "distributed": ("data", "making a data set on several processes"),
     "dask": ("data", "making a data set on several processes"),
-    "trimesh": ("meshes", "worlds and models"),
+    "trimesh": ("data,meshes", "worlds and models"),
     "collada": ("meshes", "reading a .dae model"),
     "lxml": ("meshes", "reading a .dae model"),
     "pxr": ("usd", "reading USD"),
@@ -49,7 +50,7 @@ EXTRAS = {
     "small_gicp": ("bench", "the estimator cfar-gicp"),
     "pystackreg": ("bench", "the estimator stackreg"),
 }
-"""Optional packages: the extra that installs each, and what needs it."""
+"""Optional packages: the extras that install each, by the tasks that need it, and what these tasks are."""
 
 LONGEST_KEY = 60
 """Letters of a key in a message; those of a stranger's file may be of any length."""
@@ -103,7 +104,8 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
     if package not in EXTRAS:
         raise error
     extra, what = EXTRAS[package]
-    return MitsonarError(f"{what} needs {package}, which is not installed: pip install 'mitsonar[{extra}]'")
+    needs = "need" if what.endswith("s") else "needs"
+    return MitsonarError(f"{what} {needs} {package}, which is not installed: pip install 'mitsonar[{extra}]'")
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
@@ -112,6 +114,11 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
     near = [name for name in known if wrong and wrong.lower() in name.lower()]
     near = near or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
     return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun, for messages: ``1 frame``, ``1,200 frames``."""
+    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
 def meant(wrong: object, names: Iterable[str]) -> str:

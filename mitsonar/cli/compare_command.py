@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
+from mitsonar.errors import counted
 
 __all__ = ["compare"]
 
@@ -64,7 +65,8 @@ def compare(
         say_json(report, indent=1)
         return
     say(
-        f"{data}: {report['pairs']} pairs of {report['scenes']} scenes, {report['model']} model; sideways mm / forward mm / "
+        f"{data}: {counted(report['pairs'], 'pair')} of "
+        f"{counted(report['scenes'], 'scene')}, {report['model']} model; sideways mm / forward mm / "
         "yaw deg"
     )
     for table in report["tables"]:

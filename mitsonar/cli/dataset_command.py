@@ -28,7 +28,7 @@ from mitsonar.cli.frames_command import (
     shares_of,
 )
 from mitsonar.cli.odometry_command import Geometry
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.config.data_recipe import Recipe
@@ -81,7 +81,10 @@ def make(
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     made = _made(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
     there = made.shards - made.made
-    say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
+    say(
+        f"{counted(made.frames, 'frame')} in {made.url}: {counted(made.made, 'shard')} made"
+        + (f", {there} were there" if there else "")
+    )
     say(f"show it: {command_line('dataset', 'show', made.url)}")
 
 
@@ -246,7 +249,7 @@ def check(data: Data) -> None:
             f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it resumes where it stopped, and with "
             "--verify makes damaged shards anew; empty frames stay until the recipe changes"
         )
-    say(f"{len(store):,} frames in {store.shards} shards: all is well")
+    say(f"{counted(len(store), 'frame')} in {counted(store.shards, 'shard')}: all is well")
 
 
 @answered
@@ -327,6 +330,6 @@ def from_frames(
         made = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
     for sentence in made.notes:
         warn(sentence)
-    say(f"{made.frames:,} frames in {made.sequences:,} sequences in {made.path}")
+    say(f"{counted(made.frames, 'frame')} in {counted(made.sequences, 'sequence')} in {made.path}")
     part = ["--part", "all"] if made.sequences == 1 else []
     say(f"compare estimators on it: {command_line('compare', made.path, *part)}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
+from mitsonar.errors import counted
 
 if TYPE_CHECKING:
     from mitsonar.networks.checkpoint import Checkpoint
@@ -69,7 +70,10 @@ def evaluate(
     for sentence in report["notes"]:
         warn(sentence)
     if report["scenes"] < FEWEST_SCENES:
-        warn(f"{report['scenes']} scenes only: the 95 % intervals are too narrow; evaluate on {FEWEST_SCENES} or more")
+        warn(
+            f"{counted(report['scenes'], 'scene')} only: the 95 % intervals are too narrow; evaluate on "
+            f"{FEWEST_SCENES} or more"
+        )
     lines = report_lines(report)
     if out is not None:
         save_tables(out, report)

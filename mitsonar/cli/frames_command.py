@@ -9,7 +9,7 @@ from typing import Annotated, cast
 import typer
 
 from mitsonar.cli.console import answered, command_line, progress_bar, say
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 __all__ = [
     *("Classes", "Least", "LeastSnr", "Out", "Picture", "Polygons", "Shares", "To", "Without"),
@@ -141,7 +141,7 @@ def exported(
     with progress_bar("exporting", source.frames, "frames") as progress:
         kind = cast(PictureKind, picture)
         made = export_to(to, source, out, picture=kind, every_class=every_class, progress=progress, **words)  # type: ignore[arg-type]
-    say(f"{source.frames:,} frames as {to}: {out}")
+    say(f"{counted(source.frames, 'frame')} as {to}: {out}")
     for part in ("train", "validation", "test"):
         counts = ", ".join(f"{name} {made.boxes[part, name]:,}" for name in made.classes)
         if to in ("coco", "yolo") and (source.part == part).any():

@@ -12,7 +12,7 @@ import typer
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
 from mitsonar.cli.flown_path import SIX, Frame
 from mitsonar.cli.render_command import NOISE
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 __all__ = ["Frames", "Geometry", "odometry"]
 
@@ -172,5 +172,5 @@ def odometry(
     count, lost = len(found.estimates), int((~found.believed).sum())
     if found.graph is not None and found.graph.sensors:
         say(f"sensors: {', '.join(found.graph.sensors)}")
-    say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
+    say(f"{counted(count, 'motion')} by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")

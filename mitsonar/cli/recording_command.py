@@ -12,7 +12,7 @@ import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 from mitsonar.cli.odometry_command import Geometry
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.io.run_directory import refuse_to_replace
 
 if TYPE_CHECKING:
@@ -70,7 +70,10 @@ def info(
         say(line)
     if found is not None:
         why = f" ({found.reason})" if found.reason else ""
-        say(f"handedness             {found.verdict}{why}: correlation {found.correlation:.2f} over {found.pairs} pairs")
+        say(
+            f"handedness             {found.verdict}{why}: "
+            f"correlation {found.correlation:.2f} over {counted(found.pairs, 'pair')}"
+        )
 
 
 @answered
@@ -119,7 +122,7 @@ def video(
     with progress_bar("drawing", len(chosen), "frames") as progress:
         speed = rate or min(1000.0, found)
         count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
-    say(f"{count:,} frames at {speed:.4g} a second in {out}")
+    say(f"{counted(count, 'frame')} at {speed:.4g} a second in {out}")
 
 
 def convert(
@@ -154,7 +157,7 @@ def convert(
     chosen = recording.part(part)
     if len(recording.parts) > 1:
         number = recording.longest if part is None else part
-        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {len(recording):,} frames")
+        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {counted(len(recording), 'frame')}")
     made = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":
@@ -164,7 +167,7 @@ def convert(
             _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
         else:
             made = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
-    say(f"{len(chosen):,} frames in {made}")
+    say(f"{counted(len(chosen), 'frame')} in {made}")
 
 
 def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:

@@ -45,6 +45,10 @@ PER_FRAME = {
 }
 
 
+MOST_DROPPED = 0.5
+"""Part of a ping's rays that the window of a recipe may drop: a recipe that states its window means it."""
+
+
 class ImageModality:
     """Images of a recipe with a sonar; see :class:`~mitsonar.datasets.modality.Modality`."""
 
@@ -165,6 +169,8 @@ class ImageModality:
 
     def warnings(self, read: Read) -> list[str]:
         """Warn of motions far below a bin, of returns outside the window, and of a gain that is too high."""
+        from mitsonar.simulation.tally import NEGLIGIBLE  # a stored set is read without a simulator
+
         sentences = []
         flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m
         largest_mm = max(flight.sideways_mm, flight.forward_mm)
@@ -174,11 +180,12 @@ class ImageModality:
                 "flight.sideways_mm and forward_mm are in millimetres"
             )
         dropped, saturated = (read(name).astype(np.int64) for name in ("dropped", "saturated"))
-        if dropped.any():
-            rays = self.sonar.rays
+        rays, stated = self.sonar.rays, {"range_min", "range_max"} <= set(self.recipe.sonar or {})
+        if dropped.mean() > (MOST_DROPPED if stated else NEGLIGIBLE) * rays:
             sentences.append(
                 f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside "
-                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped, as the window says"
+                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped: set sonar.range_min "
+                "and range_max"
             )
         pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.recipe.views)
         if saturated.mean() > 0.01 * pixels:

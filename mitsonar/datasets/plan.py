@@ -200,7 +200,9 @@ def _sequence(
         fits &= ~_kept_out(flight, x[:, here] + position[:, :1], y[:, here] + position[:, 1:], height)
         found = int(fits.argmax())
         if fits[found]:
-            start = Pose(float(position[found, 0]), float(position[found, 1]), height, pitch, 0, float(heading[found]))
+            start = Pose.from_row(
+                (float(position[found, 0]), float(position[found, 1]), height, pitch, 0, float(heading[found]))
+            )
             return _drive(start, motion, flight.pings)
     raise MitsonarError(
         f"no place for a sequence found in {TRIES * CANDIDATES:,} tries: its footprint reaches "

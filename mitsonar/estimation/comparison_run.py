@@ -17,7 +17,7 @@ from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
 from mitsonar.datasets.response_samples import ImpulseSamples
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, counted, meant
 from mitsonar.estimation.benchmark import (
     VARIATIONS,
     Answers,
@@ -139,7 +139,7 @@ def compare(
         bounds = _bounds(bench, level, asked.limit, kept, begin)
         tables += [_table(bench, asked, level, variation, answers[level, variation], bounds) for variation in variations]
     scenes = len(np.unique(bench.scenes))
-    notes = [f"{scenes} scenes only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
+    notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
     report = {"data": data, "model": modality_of(bench.first.recipe).sonar.model, **settings, "scenes": scenes}
     report |= {"notes": notes if scenes < FEWEST_SCENES else [], "tables": tables, **versions(("mitsonar",))}
     kept.finish(report)

@@ -53,6 +53,10 @@ def _rays_across(given: dict[str, FieldValue]) -> int:
     return rays_across(given["quality"], width, fov, given["range_max"])
 
 
+UNNAMED = "custom"
+"""Name of an instrument that was given none."""
+
+
 class Instrument(BaseModel):
     """Base of all instruments. :meth:`create` answers a mistake with one sentence."""
 
@@ -61,11 +65,16 @@ class Instrument(BaseModel):
     called: ClassVar[str]
     see: ClassVar[str]
 
-    name: str = Field("custom", description="what the instrument is called")
+    name: str = Field(UNNAMED, description="what the instrument is called")
 
     if TYPE_CHECKING:  # each has its own, at its own position among the keys
         model: str
         frame_rate_hz: float
+
+    @property
+    def title(self) -> str:
+        """Return the name for titles and sentences; of an instrument without one, what it is: ``unnamed sonar``."""
+        return f"unnamed {self.called}" if self.name == UNNAMED else self.name
 
     @classmethod
     def create(cls, **fields: FieldValue) -> Self:

@@ -117,7 +117,7 @@ class Sounder(BaseModel):
             return bases
         step = math.radians(self.fan.elevation_fov_deg)
         pitch = (np.arange(self.rows) + 0.5 - self.rows / 2) * step  # the first row looks up
-        rows = [mounted(bases, Pose(0, 0, 0, float(one))) for one in pitch]
+        rows = [mounted(bases, Pose.from_row((0, 0, 0, float(one), 0, 0))) for one in pitch]
         return np.stack(rows, axis=1).reshape(-1, 6)
 
     @property
@@ -125,9 +125,14 @@ class Sounder(BaseModel):
         """Return the unit vectors of the fans' axes ``(channels, 3)`` as (starboard, forward, up) of the vehicle."""
         return np.asarray(vehicle_rotation(self.mount_poses).apply([0.0, 1.0, 0.0]))
 
+    @property
+    def looks_ahead(self) -> bool:
+        """Return whether all fans look ahead, so that the instrument's poses are those of a forward-looking sonar."""
+        return bool((self.axes[:, 1] > math.cos(math.radians(45))).all())
+
     def fan_poses(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the poses of all fans in the world ``(pings, channels, 6)`` for poses of the vehicle ``(pings, 6)``."""
-        return np.stack([mounted(poses, Pose(*mount)) for mount in self.mount_poses], axis=1)
+        return np.stack([mounted(poses, Pose.from_row(mount)) for mount in self.mount_poses], axis=1)
 
     def directions(self) -> NDArray[np.float64]:
         """Return the beams' axes in the frame of their fan ``(beams, 3)`` as (starboard, forward, up)."""

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, counted, nearest_names
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.mapping.frame_footprint import (
     LONGEST_SIDE,
@@ -278,7 +278,7 @@ class Mosaic:
             raise MitsonarError(self._empty())
 
     def _empty(self) -> str:
-        added = f"{self.frames} frames added, {self.frames_without_ground} of them show no ground"
+        added = f"{counted(self.frames, 'frame')} added, without ground in {self.frames_without_ground:,}"
         return f"the mosaic is empty: {added}; check height, pitch and window"
 
     @property

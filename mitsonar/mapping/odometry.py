@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, counted, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
@@ -109,7 +109,7 @@ class Odometry:
         if self.series.covariances is None:
             return None
         by_map = np.array([one.about.get("map") == USED for one in self.estimates], dtype=bool)
-        return pose_covariances(self.series, Pose(*self.path.poses[0]), correlated=self.correlated, alone=by_map)
+        return pose_covariances(self.series, Pose.from_row(self.path.poses[0]), correlated=self.correlated, alone=by_map)
 
     def rows(self) -> list[Row]:
         """Return name, value and unit of all results: the one table for console, file and README."""
@@ -147,7 +147,9 @@ class Odometry:
         for reasons, what in ((lost, "are not believed and were bridged"), (without, "are those of pairs of frames")):
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
-                told.append(f"{len(reasons)} of {len(self.estimates)} motions ({part:.0f} %) {what}: {_usual(reasons)}")
+                told.append(
+                    f"{len(reasons)} of {counted(len(self.estimates), 'motion')} ({part:.0f} %) {what}: {_usual(reasons)}"
+                )
         return told
 
 
@@ -284,7 +286,7 @@ def _scale_factors(
 def _start(source: Source, first: int) -> Pose:
     """Return the true first pose, or what is known of it."""
     if source.poses is not None:
-        return Pose(*(float(value) for value in source.poses[first]))
+        return Pose.from_row(float(value) for value in source.poses[first])
     height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
     return Pose(0.0, 0.0, height, source.pitch_rad or 0.0)
 
@@ -345,4 +347,4 @@ def _usual(reasons: list[str]) -> str:
     """Return the most frequent reasons; reasons that differ in their numbers only count as one."""
     kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
     example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
-    return "; ".join(f"{count} times such as {example[kind]!r}" for kind, count in kinds)
+    return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)

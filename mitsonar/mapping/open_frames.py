@@ -12,7 +12,7 @@ from zipfile import is_zipfile
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.recordings.open_recording import format_of, known_formats, open_recording
 from mitsonar.recordings.recording import Pixels
@@ -106,7 +106,8 @@ def _of_recording(path: Path, number: int | None, view: str | None, geometry: st
     part, which = recording.part(number), ""
     if len(recording.parts) > 1:
         chosen = recording.longest if number is None else number
-        which = f"part {chosen} of {len(recording.parts):,}{', the longest' if number is None else ''}: {len(part):,} frames"
+        longest = ", the longest" if number is None else ""
+        which = f"part {chosen} of {len(recording.parts):,}{longest}: {counted(len(part), 'frame')}"
     return FrameSource.of_part(part, str(path), which)
 
 
@@ -148,7 +149,7 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
     if times.ndim == 1:
         check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
     if done < image.shape[0]:
-        message = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
+        message = f"{path} is not finished: {done:,} of {counted(image.shape[0], 'frame')} written"
         warnings.warn(message, MitsonarWarning, stacklevel=3)
     poses, attitude, height = table.get("poses"), table.get("attitude_rad"), table.get("height_m")
 
@@ -228,7 +229,8 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
     if not (0 <= number < len(lengths) and lengths[number]):
         raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
     first = int(np.argmax(sequences == number))
-    which = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
+    longest = ", the longest" if sequence is None else ""
+    which = f"sequence {number} of {len(lengths):,}{longest}: {counted(int(lengths[number]), 'frame')}"
     return slice(first, first + int(lengths[number])), number, which
 
 

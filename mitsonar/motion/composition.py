@@ -29,7 +29,7 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     sin, cos = np.sin(heading), np.cos(heading)
     x = pose.x + motion.forward * sin + motion.sideways * cos
     y = pose.y + motion.forward * cos - motion.sideways * sin
-    return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
+    return Pose.from_row((float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading)))
 
 
 def inverse(motion: AnyArray) -> AnyArray:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted
 from mitsonar.motion.conventions import CONVENTIONS, Convention, convention_named, sideways_or_up
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory_files import read_csv, read_tum, write_csv, write_tum
@@ -62,7 +62,8 @@ class Trajectory:
     def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
         """Space ``frames`` poses equally from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
 
-        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard.
+        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard
+        (:meth:`Pose.from_degrees` takes angles beyond a full turn).
 
         Raises:
             MitsonarError: no frames.
@@ -209,9 +210,9 @@ def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], fr
     pitch, roll, heading = np.degrees(read[frame][0, 3:])
     count = round(share[frame] * len(read[frame]))
     warnings.warn(
-        f"the sonar looks sideways or at the sky in {count} of {len(read[frame])} frames of {path}, read as {frame} (first "
-        f"pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's convention by "
-        f"--frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
+        f"the sonar looks sideways or at the sky in {count} of {counted(len(read[frame]), 'frame')} of {path}, read as "
+        f"{frame} (first pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's "
+        f"convention by --frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
         MitsonarWarning,
         stacklevel=3,
     )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.bag_file import BagFile, Topic
 from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
@@ -107,7 +107,8 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
             raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in there])}")
         if named not in readable:
             raise MitsonarError(
-                f"{bag.path}: {topic} holds {named.messages:,} messages {short(named.kind)}; a sonar's are {_words(*kinds)}"
+                f"{bag.path}: {topic} holds {counted(named.messages, 'message')} {short(named.kind)}; a sonar's "
+                f"are {_words(*kinds)}"
             )
         return named
     found = [one for one in readable if one.kind in kinds]

@@ -77,7 +77,7 @@ class Simulator:
         from mitsonar.simulation.mirror_parts import refuse_moving_mirrors
         from mitsonar.simulation.moving_scene import motion_in
         from mitsonar.simulation.moving_tracing import tracer_of
-        from mitsonar.simulation.scene import sonar_in
+        from mitsonar.simulation.scene import scale_notes, sonar_in
         from mitsonar.simulation.second_mirrors import second_notes
         from mitsonar.simulation.view_tracers import view_tracers
 
@@ -104,7 +104,11 @@ class Simulator:
         traced = one if self.former is None else self.former.traced
         self.tracer = tracer_of(scene, traced, self.motion)
         self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
-        self.notes = [*self.notes, *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ())]
+        self.notes = [
+            *self.notes,
+            *scale_notes(scene, one),
+            *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ()),
+        ]
         self.notes += second_notes(scene, mirrors) if sonar.bounces > 2 else []
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
@@ -211,6 +215,15 @@ class Simulator:
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
         return self.film_echoes(pose, ping).outside(self.sonar)
+
+    def buried(self, pose: ArrayLike) -> str:
+        """Describe where a pose lies below the ground or inside an object; empty where it does not, or bodies move."""
+        from mitsonar.simulation.clearance import buried_in
+
+        found = (
+            None if self.motion is not None else buried_in(self.tracer.scene, np.atleast_2d(np.asarray(pose, dtype=float)))
+        )
+        return "" if found is None else found.text
 
     def render(
         self,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
@@ -236,7 +236,7 @@ def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
             up = " (above 90: upwards)" if view.tilt_deg > 90 else ""
             pitch = "" if made.poses is None else f" (pitched by {math.degrees(made.poses[0, 3]):.3g} deg)"
             sentences.append(
-                f"receiver {receiver.name} has no echo in {silent} of {len(made)} pings: check its direction "
+                f"receiver {receiver.name} has no echo in {silent} of {counted(len(made), 'ping')}: check its direction "
                 f"(heading {view.heading_deg:g} deg, tilt {view.tilt_deg:g} deg from straight down{up}), "
                 f"the vehicle's pose{pitch} and range_max"
             )

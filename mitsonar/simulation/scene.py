@@ -30,6 +30,7 @@ __all__ = [
     "find_scene",
     "load_scene",
     "object_names_in",
+    "scale_notes",
     "shape_boxes_in",
     "shape_names_in",
     "shipped_scenes",
@@ -39,6 +40,13 @@ __all__ = [
 
 MOST_OBJECTS = 1_000_000
 """Objects that are named; beyond, their numbers have to do."""
+
+
+TOO_LARGE = 20
+"""Ends of the window [m] that a body's smallest extent may have before its unit is doubted."""
+
+FARTHEST_WINDOW_M = 500.0
+"""End of a window beyond the reach of imaging sonars [m]: those of 100 kHz see some hundred metres."""
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -172,6 +180,32 @@ def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pos
 
     found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
     return (found[index].sonar, found[index].pose) if index < len(found) else None
+
+
+def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
+    """Return a sentence where sizes show that a scene is probably not in metres.
+
+    A body counts as too large where its smallest extent exceeds :data:`TOO_LARGE` windows (floors are flat), and a window
+    where it reaches farther than an imaging sonar does. A scene counts as too small where it fits into a range bin.
+    """
+    do = (
+        'scenes are in metres; where this one is in millimetres, give its shapes <scale value="0.001"/>, or `mitsonar '
+        "world mesh` --scale 0.001"
+    )
+    for shape in scene.shapes():
+        extents = np.ravel(np.array(shape.bbox().extents(), dtype=float))
+        if np.isfinite(extents).all() and extents.min() > TOO_LARGE * sonar.range_max:
+            size = " x ".join(f"{edge:.3g}" for edge in extents)
+            return [f"shape {shape.id()} is {size} m large, and the window of the sonar ends at {sonar.range_max:g} m: {do}"]
+    if sonar.range_max > FARTHEST_WINDOW_M:
+        return [f"the window ends at {sonar.range_max:g} m, farther than imaging sonars reach: {do}"]
+    diagonal = float(np.linalg.norm(np.ravel(np.array(scene.bbox().extents(), dtype=float)))) if scene.shapes() else 0.0
+    if 0 < diagonal < sonar.bin_m:
+        return [
+            f"the whole scene is {1e3 * diagonal:.3g} mm large, less than a range bin of {1e3 * sonar.bin_m:.3g} mm: scenes "
+            "are in metres; give its shapes a <scale/>, or `mitsonar world mesh` a larger --scale"
+        ]
+    return []
 
 
 def _parameters(path: Path, error: BaseException) -> str:

@@ -36,10 +36,11 @@ class Backend(NamedTuple):
 
 
 def ensure_variant(name: str | None = None) -> str:
-    """Set a variant unless a usable one is set, and return its name; ``name`` or ``MITSONAR_VARIANT`` forces one.
+    """Set a variant where none is set, and return the name of the one that is; ``name`` or ``MITSONAR_VARIANT`` forces one.
 
     Raises:
-        MitsonarError: unknown variant; neither CUDA nor LLVM is found (with the command that installs it).
+        MitsonarError: unknown variant; one is set that mitsonar does not work with; neither CUDA nor LLVM is found (with the
+            command that installs it).
     """
     cuda, llvm = _backends()
     import mitsuba as mi
@@ -49,6 +50,11 @@ def ensure_variant(name: str | None = None) -> str:
         if mi.variant() in VARIANTS:
             return str(mi.variant())
         wanted = "cuda_ad_mono" if cuda else "llvm_ad_mono"
+        if mi.variant() is not None:  # chosen by the user, whose objects another variant would not know
+            raise MitsonarError(
+                f"the Mitsuba variant {mi.variant()} is set, and mitsonar works with {', '.join(VARIANTS)}: call "
+                f'mi.set_variant("{wanted}") first, or leave set_variant out'
+            )
     if wanted not in VARIANTS:
         raise MitsonarError(f"unknown variant {wanted!r}: {nearest_names(wanted, VARIANTS)}")
     if not (cuda if wanted.startswith("cuda") else llvm):

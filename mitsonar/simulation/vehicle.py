@@ -89,7 +89,7 @@ class VehicleSimulator:
 
     def sensors(self, vehicle: Trajectory) -> Mapping[str, Mounted]:
         """Return the sensors by name; those of the scene stand in it as at the path's first pose."""
-        return sensors_in(self.scene, Pose(*vehicle.poses[0])) if self._sensors is None else self._sensors
+        return sensors_in(self.scene, Pose.from_row(vehicle.poses[0])) if self._sensors is None else self._sensors
 
     def bodies(self, vehicle: Trajectory) -> MovingBodies:
         """Return the bodies that move while the vehicle flies a path.

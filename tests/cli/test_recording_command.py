@@ -57,7 +57,7 @@ def test_info_tells_gaps_and_notes(mitsonar: Command, frames: SonarFrames, tmp_p
     time = np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1]) + 1_790_000_000
     replace(frames, time_s=time).save(tmp_path / "frames.npz")
     table = mitsonar("recording", "info", tmp_path).stdout
-    assert "10 Hz, 1 gaps; the longest step takes 0.7 s" in table
+    assert "10 Hz, 1 gap; the longest step takes 0.7 s" in table
     assert "2026-09-21" in table
 
 

@@ -125,7 +125,7 @@ def test_what_the_user_should_know_is_said(places: dict[str, Path], frames: Sona
     quiet = frames_with_poses(str(tmp_path / "quiet.npz"), path=tmp_path / "short.tum")
     made = write_recorded([frames_with_poses(str(places["npz"])), quiet], tmp_path / "data.zarr")
     left, gains, heights = made.notes
-    assert "quiet.npz: 4 frames are left out" in left
+    assert "quiet.npz: left out: 4 frames" in left
     assert "the gains of the files differ (levels of a pixel of 1 from 0.5 to 1)" in gains
     assert "--height gives one" in heights
     recipe = DataStore.open(tmp_path / "data.zarr").recipe

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 
 DEFAULTS = {
@@ -202,3 +203,9 @@ def test_the_widest_beam_that_is_told_would_do(model: str, shading: str) -> None
     told = float(str(caught.value).split("below ")[1].split()[0].rstrip("."))
     assert Sonar.create(**fields, azimuth_fov_deg=100.0, beam_width_deg=told).aperture.length == pytest.approx(0.5, rel=0.01)
     assert Sonar.create(**{**fields, "model": "thesis"}, azimuth_fov_deg=160.0).beam_pattern == "box"
+
+
+def test_the_title_names_an_instrument_or_says_that_it_has_no_name() -> None:
+    assert Sonar().title == "unnamed sonar"
+    assert Sonar(name="rov").title == "rov"
+    assert ChannelSonar().title == "unnamed channel sonar"

@@ -710,10 +710,10 @@ def test_a_run_without_frames_has_none_to_read(tmp_path: Path) -> None:
     assert f"{path} has no frame 3: it holds 3, numbered from 0" in refusal(lambda: open_frames(path).read([0, 3]))
     assert "has no frame -1" in refusal(lambda: open_frames(path).read([-1]))
     set_attributes(path, frames_done=0)
-    with pytest.warns(MitsonarWarning, match="0 of 3 frames are there"):
+    with pytest.warns(MitsonarWarning, match="0 of 3 frames written"):
         source = open_frames(path)
     assert f"{path} has no frame 0: it holds 0" in refusal(lambda: source.read([0]))
-    with pytest.warns(MitsonarWarning, match="0 of 3 frames are there"):
+    with pytest.warns(MitsonarWarning, match="0 of 3 frames written"):
         assert load_frames(path).image.shape == (0, 6, 4)
 
 

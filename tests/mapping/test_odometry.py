@@ -442,7 +442,7 @@ def test_the_attitude_of_a_long_recording_is_its_own(tmp_path: Path) -> None:
 
 def test_a_run_that_goes_on_gives_what_is_there(tmp_path: Path) -> None:
     as_zarr(numbered(sway(12)), tmp_path / "frames.zarr", done=7)
-    with pytest.warns(MitsonarWarning, match="7 of 12 frames are there"):
+    with pytest.warns(MitsonarWarning, match="7 of 12 frames written"):
         source = open_frames(tmp_path)
     assert len(source) == 7
     np.testing.assert_array_equal(source.read([6]).image[0, 0], 6)

@@ -19,6 +19,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.tally import Tally
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -243,6 +244,21 @@ def test_warned_of_returns_outside_the_window(flat: mi.Scene) -> None:
     assert lost > 100
     with pytest.warns(MitsonarWarning, match=wanted):
         simulator.render(poses, gain=1e-3)
+
+
+class _Seen:
+    """A source whose worst frame lost returns at 6..7 m."""
+
+    def window_range(self, pose: object, number: int) -> tuple[float, float]:
+        return 6.0, 7.0
+
+
+@pytest.mark.parametrize(("outside", "warned"), [(1, False), (21_000, False), (22_000, True)])
+def test_a_negligible_share_outside_the_window_is_not_warned_of(outside: int, warned: bool) -> None:
+    """Up to a thousandth of the returns."""
+    rays = {"inside": 21_299_182 - outside, "nearer": 0, "farther": outside, "missed": 0}
+    tally = Tally(SMALL, frames=1, rays=rays, pixels=100, filled=100, worst=(outside, 0))
+    assert ("window" in tally.findings(_Seen(), np.zeros((1, 6)))) == warned
 
 
 def test_warned_of_saturation(flat: mi.Scene) -> None:

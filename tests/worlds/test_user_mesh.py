@@ -192,3 +192,14 @@ def test_a_model_without_colours_is_half_reflecting(tmp_path: Path) -> None:
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.stl")
     (mesh,) = mesh_world(tmp_path / "box.stl").meshes
     np.testing.assert_array_equal(mesh.reflectivity, 0.5)
+
+
+@pytest.mark.parametrize(("edge", "scale", "warned"), [(400, 1, "400 m large"), (400, 0.001, ""), (400, 0.0001, "0.04 m")])
+def test_a_model_of_another_unit_is_warned_of(
+    mitsonar: Command, tmp_path: Path, edge: float, scale: float, warned: str
+) -> None:
+    trimesh.creation.box((edge, edge, edge)).export(tmp_path / "box.stl")
+    done = mitsonar("world", "mesh", tmp_path / "box.stl", "-o", tmp_path / "out", "--scale", scale)
+    assert done.returncode == 0
+    assert ("--scale 0.001 where the unit is a millimetre" in done.stderr) == bool(warned)
+    assert warned in done.stderr
