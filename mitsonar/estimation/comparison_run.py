@@ -31,7 +31,7 @@ from mitsonar.estimation.benchmark import (
 from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
-from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.io.provenance import digest, versions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import cluster_resamples, in_units
@@ -158,7 +158,7 @@ def _bench(data: str, asked: Asked) -> Bench:
     recipe = DataStore.open(data).recipe
     modality = modality_of(recipe)
     names = (asked.estimators or modality.estimators).split(",")
-    methods = {text: estimator_from(text) for text in dict.fromkeys(names) if text}
+    methods = {text: create_estimator(text) for text in dict.fromkeys(names) if text}
     if not methods or (asked.reference is not None and asked.reference not in methods):
         raise MitsonarError(
             f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {asked.reference!r}"

@@ -20,7 +20,7 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.comparison_run import Asked, compare
-from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.exports.recorded_data_set import write_recorded
 from mitsonar.exports.recorded_frames import as_pixels, axes_of, frames_with_poses
 from mitsonar.mapping.known_poses import poses_at, stretches
@@ -192,7 +192,7 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
     report = compare(str(tmp_path / "data.zarr"), Asked("zero,direct", part="all"))
     rows = {row["method"]: row for row in report["tables"][0]["rows"]}
     truth = motions(true_poses(frames))
-    direct = estimator_from("direct")
+    direct = create_estimator("direct")
     pairs = [frames.select(slice(number, number + 2)) for number in range(len(truth))]
     found = np.array([direct.estimate(pair).motion for pair in pairs])
     wanted = np.sqrt((in_units(found - truth) ** 2).mean(axis=0))

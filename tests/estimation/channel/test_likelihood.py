@@ -18,7 +18,7 @@ from mitsonar.estimation.channel.motion_search import receiver_bands_of
 from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz, link_response
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb, impulse_information
-from mitsonar.estimation.named_estimators import create_estimator, estimator_from
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.instruments.channel_sonar import ChannelSonar, four_receivers
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
@@ -322,8 +322,8 @@ def test_unknown_names_and_options_are_refused() -> None:
         create_estimator("likelyhood")
     with pytest.raises(MitsonarError, match="likelihood"):
         create_estimator("likelihood", hight_m=1.0)
-    assert estimator_from("likelihood:yaw=1:speed=0.5") == Likelihood(yaw=True, speed=0.5)
+    assert create_estimator("likelihood:yaw=1:speed=0.5") == Likelihood(yaw=True, speed=0.5)
     with pytest.raises(MitsonarError, match="unknown option 'hight_m': correlation takes height_m, speed"):
-        estimator_from("correlation:hight_m=3")
+        create_estimator("correlation:hight_m=3")
     with pytest.raises(MitsonarError, match="speed must be a number"):
-        estimator_from("likelihood:speed=fast")
+        create_estimator("likelihood:speed=fast")
