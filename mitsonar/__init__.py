@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mitsonar.environments.sonar_env import SonarEnv
     from mitsonar.environments.sonar_vector_env import SonarVectorEnv
     from mitsonar.errors import MitsonarError, MitsonarWarning
+    from mitsonar.estimation.benchmark_tables import Comparison
+    from mitsonar.estimation.comparison_run import compare
     from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
     from mitsonar.estimation.estimator import Estimate
     from mitsonar.estimation.named_estimators import create_estimator, load_checkpoint
@@ -65,6 +67,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ChannelSimulator",
     "ChannelSonar",
+    "Comparison",
     "DataStore",
     "Deforming",
     "Echogram",
@@ -92,6 +95,7 @@ __all__ = [
     "VehicleSensors",
     "VehicleSimulator",
     "build_mosaic",
+    "compare",
     "cramer_rao_bound",
     "create_estimator",
     "load_checkpoint",
@@ -119,6 +123,7 @@ __all__ = [
 _MODULES = {
     "ChannelSimulator": "simulation.channel",
     "ChannelSonar": "instruments.channel_sonar",
+    "Comparison": "estimation.benchmark_tables",
     "DataStore": "datasets.store",
     "Deforming": "motion.deforming",
     "Echogram": "records.echogram",
@@ -146,6 +151,7 @@ _MODULES = {
     "VehicleSensors": "mapping.vehicle_sensors",
     "VehicleSimulator": "simulation.vehicle",
     "build_mosaic": "mapping.mosaic",
+    "compare": "estimation.comparison_run",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
     "load_checkpoint": "estimation.named_estimators",

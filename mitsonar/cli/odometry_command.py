@@ -42,8 +42,9 @@ def odometry(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, corrnet, or a checkpoint; NAME:key=value:key=value. Of several "
-            "checkpoints, separated by commas, the one trained nearest to the height is used. For impulse responses: "
+            help="zero, ecc, flow, phase, direct, corrnet, a checkpoint, or a class of your own as my_module:MyEstimator; "
+            "NAME:key=value:key=value. Of several checkpoints, separated by commas, the one trained nearest to the height is "
+            "used. For impulse responses: "
             "zero, correlation, likelihood. Default: direct, or likelihood."
         ),
     ] = None,
