@@ -178,13 +178,11 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
             f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {asked.reference!r}"
             f"{meant(asked.reference, methods)}"
         )
+    perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))
     if not modality.variations and (asked.perturb or asked.jitter or asked.prior):
-        options = f"{argument('perturb')}, {argument('jitter')} and {argument('prior')}"
-        raise MitsonarError(f"{options} are for data sets of images: leave them out")
+        raise MitsonarError(f"{perturb}, {jitter} and {prior} are for data sets of images: leave them out")
     if recipe.recorded is not None and (asked.perturb or asked.jitter):
-        raise MitsonarError(
-            f"{argument('perturb')} and {argument('jitter')} render anew, and recorded frames have no world: leave them out"
-        )
+        raise MitsonarError(f"{perturb} and {jitter} render anew, and recorded frames have no world: leave them out")
     words = list(dict.fromkeys(asked.noise.split(";" if ";" in asked.noise else ",")))
     levels = {word: modality.noise_model(word) for word in words}
     options = {"part": asked.part or recipe.split.unseen, "one_a_sequence": recipe.recorded is None, "seed": asked.seed}
@@ -193,7 +191,7 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     if len(first) < 2:
         raise MitsonarError(f"a comparison needs two pairs or more: give {argument('part')} all, or a larger data set")
     if asked.jitter and first.recipe.instrument.jittered:
-        raise MitsonarError(f"the rays of this data set move already: {argument('jitter')} is for Almanza-Medina's model")
+        raise MitsonarError(f"the rays of this data set move already: {jitter} is for Almanza-Medina's model")
     numbers = chosen(len(first), asked.pairs, asked.seed)
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
