@@ -57,8 +57,8 @@ Reward: TypeAlias = Callable[[Transition], ArrayLike]
 class TaskFields(TypedDict, total=False):
     """Fields of a :class:`SonarTask` as arguments of an environment."""
 
-    start: ArrayLike | Sequence[Sequence[float]] | None
-    bounds: ArrayLike | Sequence[Sequence[float]] | None
+    start: ArrayLike | None
+    bounds: Sequence[Sequence[float]] | NDArray[Any] | None
     max_velocity: tuple[float, float, float, float]
     step_s: float | None
     clearance_m: float
