@@ -40,6 +40,8 @@ GROUPS = {
     "Estimation and mapping": (
         "create_estimator",
         "Estimate",
+        "compare",
+        "Comparison",
         "odometry",
         "VehicleSensors",
         "load_sensors",

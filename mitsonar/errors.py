@@ -22,6 +22,7 @@ __all__ = [
     "explain_missing",
     "meant",
     "nearest_names",
+    "refuse_unknown",
     "shortened",
 ]
 
@@ -125,6 +126,23 @@ def meant(wrong: object, names: Iterable[str]) -> str:
     """Suggest the nearest of some names, for the end of a message that lists them; empty where none is near."""
     near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> None:
+    """Refuse keyword arguments of other names.
+
+    Args:
+        given: names.
+        known: those that there are.
+        owner: of the arguments, for the message.
+
+    Raises:
+        MitsonarError: an unknown name, with the nearest one and all that are known.
+    """
+    names = list(known)
+    for name in given:
+        if name not in names:
+            raise MitsonarError(f"{owner} has no argument {name}: {nearest_names(name, names)}")
 
 
 def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:

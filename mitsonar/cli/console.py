@@ -140,7 +140,11 @@ OPTIONS: dict[str, dict[str, str]] = {
     "odometry": {**GEOMETRY, "every": "--every"},
     "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},
     "mosaic": {**GEOMETRY, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
-    "compare": {"height_m": "NAME:height_m=METRES", "pitch_rad": "NAME:pitch_deg=DEGREES"},
+    "compare": {
+        "height_m": "NAME:height_m=METRES",
+        "pitch_rad": "NAME:pitch_deg=DEGREES",
+        **{name: f"--{name}" for name in ("reference", "perturb", "jitter", "prior", "part")},
+    },
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},
     "reproduce": {"minutes": "--minutes"},

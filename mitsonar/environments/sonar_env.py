@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -18,7 +18,7 @@ from mitsonar.environments.sonar_spaces import (
     observation_space,
     observed,
 )
-from mitsonar.environments.sonar_task import SonarTask
+from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.moving_bodies import Moving
@@ -51,11 +51,11 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         *,
         moving: Moving | None = None,
         render_mode: str | None = None,
-        **task: Any,
+        **task: Unpack[TaskFields],
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
-        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create(task))
+        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create({**task}, own=("moving", "render_mode")))
         self.render_mode = render_mode
         self.action_space, self.observation_space = action_space(), observation_space(self.fleet)
         self._image: NDArray[np.uint8] | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -22,7 +22,7 @@ from mitsonar.environments.sonar_spaces import (
     observation_space,
     observed,
 )
-from mitsonar.environments.sonar_task import SonarTask, Table, Transition
+from mitsonar.environments.sonar_task import SonarTask, Table, TaskFields, Transition
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.moving_bodies import Moving
@@ -64,7 +64,7 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         moving: Moving | None = None,
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        **task: Any,
+        **task: Unpack[TaskFields],
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
@@ -72,7 +72,13 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if name not in modes:
             raise MitsonarError(f"autoreset_mode is {' or '.join(modes)}: got {name!r}")
-        self.fleet = SonarFleet(scene, sonar, num_envs, moving, SonarTask.create(task))
+        self.fleet = SonarFleet(
+            scene,
+            sonar,
+            num_envs,
+            moving,
+            SonarTask.create({**task}, own=("num_envs", "moving", "render_mode", "autoreset_mode")),
+        )
         self.num_envs, self.render_mode, self._mode = num_envs, render_mode, modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.single_action_space, self.single_observation_space = action_space(), observation_space(self.fleet)

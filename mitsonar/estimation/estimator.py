@@ -25,6 +25,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Excess",
+    "Options",
     "PlainTable",
     "Record",
     "ambiguity",
@@ -73,6 +74,9 @@ FEWEST_BLOCKS = 8.0
 
 LARGEST_REUSED = 2**24
 """Bytes of the largest arrays whose memory is kept."""
+
+Options = dict[str, Any]
+"""Options of an estimator by name."""
 
 PlainTable = dict[str, Any]
 """What JSON holds, by key: texts, numbers, lists, tables and None."""

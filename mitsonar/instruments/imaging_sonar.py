@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.aperture import Aperture, Pattern, Shading
 from mitsonar.instruments.ping_groups import GroupOrder, check_groups, scans
 from mitsonar.instruments.pulse import Pulse
 from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
+from mitsonar.io.checked_model import CheckedModel
 
 __all__ = ["RAYS", "Bearing", "Coding", "FieldValue", "Instrument", "Model", "Sonar"]
 
@@ -57,13 +57,10 @@ UNNAMED = "custom"
 """Name of an instrument that was given none."""
 
 
-class Instrument(BaseModel):
-    """Base of all instruments. :meth:`create` answers a mistake with one sentence."""
+class Instrument(CheckedModel):
+    """Base of all instruments."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-    called: ClassVar[str]
-    see: ClassVar[str]
 
     name: str = Field(UNNAMED, description="what the instrument is called")
 
@@ -83,10 +80,7 @@ class Instrument(BaseModel):
         Raises:
             MitsonarError: an unknown key, a value outside its limits.
         """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, cls.called, cls.see)) from None
+        return cls(**fields)
 
     def replace(self, **fields: FieldValue) -> Self:
         """Return a copy with some fields changed; all fields are checked.

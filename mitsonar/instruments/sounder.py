@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.checked_model import CheckedModel
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 
 __all__ = ["KINDS", "Kind", "Sounder"]
@@ -28,17 +29,20 @@ Mount = tuple[float, float, float, float, float, float]
 """Place of a fan in the vehicle: starboard, forward, up [m], pitch, roll, heading [deg]."""
 
 
-class Sounder(BaseModel):
+class Sounder(CheckedModel):
     """An instrument made of equal fans. All of them ping at once, and do not hear each other.
 
     ``rows`` above 1 stacks fans on each mount, ``elevation_fov_deg`` of the fan apart: a 2-D array. With the bearing
     ``cone`` the rows share their cones, as those of such an array do.
 
     Raises:
-        MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
+        MitsonarError: an unknown key, or a value outside its limits.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str] = "instrument"
+    see: ClassVar[str] = SEE
 
     name: str = Field("custom", description="what the instrument is called")
     kind: Kind = Field(description="what is made of its echoes")
@@ -68,10 +72,7 @@ class Sounder(BaseModel):
                 f"unknown instrument key {wrong[0]}: {nearest_names(wrong[0], own | set(Sonar.model_fields))}"
             )
         fan = Sonar.create(**{key: value for key, value in fields.items() if key not in own or key == "name"})
-        try:
-            return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "instrument", SEE)) from None
+        return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})
 
     def replace(self, **fields: Any) -> Self:
         """Return a copy with some keys changed, of its own or of the fan; all are checked.

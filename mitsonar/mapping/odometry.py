@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, counted, nearest_names
-from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, errors_along, graph_path
@@ -155,7 +156,7 @@ class Odometry:
 
 def odometry(
     frames: Source | SonarFrames,
-    estimator: AnyEstimator,
+    estimator: EstimatorLike,
     *,
     smooth: Smoothing = "none",
     scale: ArrayLike | Literal["fit"] | None = None,
@@ -180,7 +181,8 @@ def odometry(
 
     Args:
         frames: of one run.
-        estimator: estimates the motion between two frames.
+        estimator: estimates the motion between two frames; any that
+            :func:`~mitsonar.estimation.named_estimators.create_estimator` takes: a name, a checkpoint, one of your own.
         smooth: see above.
         scale: factors for sideways, forward, yaw ``(3,)``; ``fit``: by least squares of valid against true motions.
         start: the first pose; default: the true one, or the origin with the height, pitch and roll of the first frame.
@@ -201,6 +203,7 @@ def odometry(
             motion, ``fit`` without true poses, loops of records that are not sonar frames, smoothing of a pose graph.
     """
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
+    estimator = create_estimator(estimator)
     numbers = _frames_used(source, smooth, scale, every, closure)
     time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops, local_map)
     if local_map and shown is not None:

@@ -6,14 +6,15 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Self, overload
+from typing import Annotated, ClassVar, NoReturn, Self, overload
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 
 from mitsonar.errors import MitsonarError, complaint
+from mitsonar.io.checked_model import CheckedModel
 
 __all__ = [
     *("BuiltFamily", "Counts", "Family", "Floor", "Interval", "Mesh", "Standpoint", "World", "draw", "shifted_grid"),
@@ -45,15 +46,14 @@ SURFACE_MARGIN_M = 25.0
 """What a sea surface reaches beyond the world [m]."""
 
 
-class Family(BaseModel):
+class Family(CheckedModel):
     """A family of worlds: its options are the fields, and :meth:`build` makes a world from a seed.
 
-    :meth:`create` answers a mistake with one sentence, by the name of the family and where its options are described.
+    A mistake is one sentence, with the name of the family and where its options are described.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    called: ClassVar[str]
     described: ClassVar[str] = ""
 
     @classmethod
@@ -63,11 +63,17 @@ class Family(BaseModel):
         Raises:
             MitsonarError: an unknown key, a value outside its limits, or numbers that do not fit each other.
         """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            described = cls.described or f"`mitsonar world {cls.called} --help`"
-            raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
+        return cls(**fields)
+
+    @classmethod
+    def refuse(cls, error: ValidationError) -> NoReturn:
+        """Raise the sentence.
+
+        Raises:
+            MitsonarError: the first of pydantic's complaints.
+        """
+        described = cls.described or f"`mitsonar world {cls.called} --help`"
+        raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
 
     @property
     def half_m(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import fields
 from typing import Any
 
 import gymnasium
@@ -11,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from mitsonar.environments.sonar_env import SonarEnv
+from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -176,3 +178,11 @@ def test_a_reward_may_be_one_number_and_a_wrong_one_is_shown(simulator: Simulato
         bad.reset(seed=0)
         with pytest.raises(MitsonarError, match=said):
             bad.step(np.zeros((2, 4)))
+
+
+def test_a_mistyped_argument_of_an_environment_is_one_sentence() -> None:
+    with pytest.raises(MitsonarError, match=r"an environment has no argument boundz: did you mean bounds\?"):
+        SonarEnv("flat_floor", boundz=1)  # type: ignore[call-arg]
+    with pytest.raises(MitsonarError, match=r"an environment has no argument num_env: did you mean num_envs\?"):
+        SonarVectorEnv("flat_floor", num_env=2)  # type: ignore[call-arg]
+    assert list(TaskFields.__annotations__) == [field.name for field in fields(SonarTask)]

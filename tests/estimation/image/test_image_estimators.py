@@ -13,7 +13,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.ground_view import GroundView
-from mitsonar.estimation.named_estimators import create_estimator, estimator_from, estimators_for
+from mitsonar.estimation.named_estimators import create_estimator, estimators_for
 from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
@@ -231,8 +231,12 @@ def test_what_is_missing_is_said() -> None:
         Zero().estimate(bare.select(slice(0, 1)))
     with pytest.raises(MitsonarError, match="did you mean direct"):
         create_estimator("dierct")
-    with pytest.raises(MitsonarError, match="estimator direct"):
-        create_estimator("direct", heigth_m=2)
+    with pytest.raises(
+        MitsonarError, match=r"'height': direct takes height_m, pitch_rad, relief_m, heave_std_m.*; did you mean height_m\?"
+    ):
+        create_estimator("direct", height=2)
+    with pytest.raises(MitsonarError, match="direct: height_m must be a number: got 'high'"):
+        create_estimator("direct", height_m="high")
     with pytest.raises(MitsonarError, match="above 0"):
         Direct(height_m=1.0, pitch_rad=0.6, relief_m=1.5).estimate(bare)
     with pytest.raises(MitsonarError, match="heave_std_m"):
@@ -241,9 +245,9 @@ def test_what_is_missing_is_said() -> None:
 
 
 def test_estimators_are_named_with_options_on_one_line() -> None:
-    assert estimator_from("direct") == Direct()
-    assert estimator_from("direct:height_m=2.5:heave_std_m=0.005") == Direct(height_m=2.5, heave_std_m=0.005)
-    assert estimator_from("ecc:pitch_deg=30") == Ecc(pitch_rad=np.radians(30))
+    assert create_estimator("direct") == Direct()
+    assert create_estimator("direct:height_m=2.5:heave_std_m=0.005") == Direct(height_m=2.5, heave_std_m=0.005)
+    assert create_estimator("ecc:pitch_deg=30") == Ecc(pitch_rad=np.radians(30))
     for text, words in {
         "direct:height_m": "NAME:key=value",
         "direct:height_m=high": "must be a number",
@@ -251,7 +255,7 @@ def test_estimators_are_named_with_options_on_one_line() -> None:
         "posenet.ckpt": "checkpoint",
     }.items():
         with pytest.raises(MitsonarError, match=words):
-            estimator_from(text)
+            create_estimator(text)
 
 
 def test_a_view_of_the_ground_moves_with_the_motion(pair: Pair) -> None:
