@@ -56,7 +56,7 @@ class Comparison:
         """Return the tables as ``mitsonar compare`` prints them."""
         report = self.report
         head = (
-            f"{report['data']}: {report['pairs']} pairs of {report['scenes']} scenes, {report['model']} model; "
+            f"{report['data']}: {counted(report['pairs'], 'pair')} of {counted(report['scenes'], 'scene')}, {report['model']} model; "
             "sideways mm / forward mm / yaw deg"
         )
         return "\n".join([head, *(line for table in report["tables"] for line in table_lines(table))])
