@@ -11,6 +11,7 @@ from mitsonar.acoustics.effective_mu import single_mu
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
 from mitsonar.plugins.hashed_texture import number_of_property
+from mitsonar.plugins.native_plugins import load_dict
 
 __all__ = ["AcousticMaterial", "is_acoustic_material"]
 
@@ -55,7 +56,7 @@ class AcousticMaterial(mi.BSDF):
         self.mean = _mean(self.reflectance, number_of_property(props, "reflectance_mean", 0.0))
         self.mu = min(max(single_mu(self.material), FAINTEST), LOUDEST)
         shown = {"type": "twosided", "below": {"type": "diffuse", "reflectance": self.reflectance}}
-        self.shown = cast(mi.BSDF, mi.load_dict(shown))
+        self.shown = cast(mi.BSDF, load_dict(shown))
         self.m_components = [self.shown.flags(index) for index in range(self.shown.component_count())]
         self.m_flags = self.shown.flags()
 
@@ -138,7 +139,7 @@ def _create(props: mi.Properties) -> mi.BSDF:
     if str(props.get("material", "")) != NO_MATERIAL:
         return AcousticMaterial(props)
     reflectance = props.get_texture("reflectance", SHADE)
-    return cast(mi.BSDF, mi.load_dict({"type": "diffuse", "id": props.id(), "reflectance": reflectance}))
+    return cast(mi.BSDF, load_dict({"type": "diffuse", "id": props.id(), "reflectance": reflectance}))
 
 
 mi.register_bsdf("acoustic_material", _create)

@@ -13,6 +13,7 @@ from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import LOOKS, ChannelSonar, FieldOfView, four_receivers
 from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
+from mitsonar.plugins.native_plugins import load_dict
 
 __all__ = ["ChannelSensor", "is_channel_sonar"]
 
@@ -57,7 +58,7 @@ class ChannelSensor(mi.Sensor):
         self.sonar = _read(props)
         if not any(isinstance(child, mi.Film) for _, child in props.objects(mark_queried=False)):
             one = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "luminance", "rfilter": {"type": "box"}}
-            props["film"] = mi.load_dict(one)
+            props["film"] = load_dict(one)
         super().__init__(props)
         self.pose  # noqa: B018  a to_world that scales is refused here
 

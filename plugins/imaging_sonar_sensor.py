@@ -15,6 +15,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
 from mitsonar.plugins.hashed_texture import ROUNDS
+from mitsonar.plugins.native_plugins import load_dict
 
 __all__ = ["Fan", "ImagingSonar", "is_imaging_sonar"]
 
@@ -195,7 +196,7 @@ class ImagingSonar(mi.Sensor):
         return f"ImagingSonar[{self.sonar!r}]"
 
     def _film(self) -> mi.Film:
-        film = mi.load_dict(
+        film = load_dict(
             {
                 "type": "hdrfilm",
                 "width": self.sonar.columns,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
 from mitsonar.plugins.hashed_texture import number_of_property
+from mitsonar.plugins.native_plugins import search_folders
 
 __all__ = ["MOTION", "TrajectoryTexture"]
 
@@ -39,7 +39,7 @@ class TrajectoryTexture(mi.Texture):
         for name, key in (("filename", "path"), ("meshes", "meshes")):
             if name in props:
                 self.fields[key] = str(props[name])
-        self.folders = [Path(str(folder)) for folder in _resolver()]
+        self.folders = search_folders()
 
     def to_string(self) -> str:
         """Return one line for Mitsuba's logs."""
@@ -48,11 +48,6 @@ class TrajectoryTexture(mi.Texture):
     def mean(self) -> Any:
         """Return 0: it has no colour."""
         return mi.Float(0)
-
-
-def _resolver() -> Any:
-    resolver: Any = mi.file_resolver  # its types lack the paths
-    return resolver()
 
 
 mi.register_texture("trajectory", TrajectoryTexture)

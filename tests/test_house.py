@@ -125,6 +125,17 @@ def test_modules_import_from_their_own_and_earlier_rooms_only(name: str) -> None
         assert ROOMS.index(room(other)) <= ROOMS.index(room(name)), f"{name} imports from {other}, a later room"
 
 
+def test_objects_of_mitsuba_are_created_where_no_foreign_library_is_loaded() -> None:
+    """Mitsuba runs ``plugins/NAME.so`` of the scene's folder and of the current one: see ``plugins/native_plugins.py``."""
+    creating = {"load_dict", "load_file", "load_string", "instantiate", "create_object", "plugin_type"}
+    found = set()
+    for name, path in HOUSE.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and node.attr in creating:
+                found.add((name, node.attr))
+    assert found == {("plugins.native_plugins", "load_dict"), ("simulation.scene", "instantiate")}
+
+
 def test_no_circles_within_a_room() -> None:
     waiting = {name: imported(path) & set(HOUSE) for name, path in HOUSE.items() if room(name) != "cli"}
     while ready := [name for name, others in waiting.items() if not others & set(waiting)]:

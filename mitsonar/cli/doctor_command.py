@@ -37,13 +37,13 @@ def doctor() -> None:
 
 def _check_sphere() -> None:
     """Check that inside a sphere of 10 m every range is 10 m and every cosine 1."""
-    import mitsuba as mi
     import numpy as np
 
     from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.plugins.native_plugins import load_dict
     from mitsonar.simulation.imaging import Simulator
 
-    scene = mi.load_dict({"type": "scene", "sphere": {"type": "sphere", "radius": 10.0}})
+    scene = load_dict({"type": "scene", "sphere": {"type": "sphere", "radius": 10.0}})
     echoes = Simulator(scene, Sonar(range_max=12.0)).film_echoes(np.zeros(6), 0)
     error = max(np.abs(echoes.range_m - 10).max(), np.abs(echoes.cosine - 1).max())
     say(f"inside a 10 m sphere: largest error of range (m) and cosine {error:.1e}")
@@ -59,10 +59,11 @@ def _check_floor() -> None:
     import numpy as np
 
     from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.plugins.native_plugins import load_dict
     from mitsonar.simulation.imaging import Simulator
 
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(100.0)}
-    scene = mi.load_dict({"type": "scene", "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}}})
+    scene = load_dict({"type": "scene", "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}}})
     sonar = Sonar(range_min=2.0, range_max=8.0)
     simulator = Simulator(scene, sonar)
     height, pitch = 2.5, np.radians(35)

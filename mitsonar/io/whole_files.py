@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import stat
 import zipfile
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,6 +25,7 @@ __all__ = [
     "read_npz",
     "read_yaml",
     "refuse_beyond_memory",
+    "refuse_irregular",
     "write_json",
     "write_whole",
 ]
@@ -75,6 +77,28 @@ def at_most(path: str | Path, limit: int) -> bytes:
         while sum(map(len, parts)) <= limit and (part := file.read(min(2**24, limit + 1))):
             parts.append(part)
     return b"".join(parts)[: limit + 1]
+
+
+def refuse_irregular(path: str | Path, what: str, limit: int | None = None) -> None:
+    """Refuse what is no file on a disk, such as a device that never ends or a pipe that nobody writes to.
+
+    Args:
+        path: that exists.
+        what: kind of file, for errors.
+        limit: largest size in bytes.
+
+    Raises:
+        MitsonarError: a folder, a device, a pipe or a socket; or larger than the limit.
+    """
+    try:
+        known = Path(path).stat()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise MitsonarError(f"cannot read {what} {path}: {reason}; give an existing file") from None
+    if not stat.S_ISREG(known.st_mode):
+        raise MitsonarError(f"{what} {path} is a folder, a device or a pipe: give a file")
+    if limit is not None and known.st_size > limit:
+        raise MitsonarError(f"{what} {path} is larger than {limit:,} bytes: it is damaged, or something else")
 
 
 def read_bytes(path: str | Path, what: str, limit: int) -> bytes:

@@ -12,12 +12,27 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["Pose", "mount_between", "mounted", "pose_from_to_world", "poses_from", "to_world_matrices", "vehicle_rotation"]
+__all__ = [
+    "Pose",
+    "mount_between",
+    "mounted",
+    "pose_from_to_world",
+    "poses_from",
+    "refuse_beyond_reach",
+    "to_world_matrices",
+    "vehicle_rotation",
+]
 
 FULL_TURN = 2 * math.pi
 """Largest angle of a pose that is typed in [rad]."""
 
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+
+FARTHEST = 1e12
+"""Largest coordinate of a pose [m]: farther away, single precision cannot hold a scene."""
+
+MOST_TURNED = 1e6
+"""Largest angle of a pose [rad]: larger ones no longer say where it points."""
 
 
 class _Six(NamedTuple):
@@ -65,14 +80,31 @@ class Pose(_Six):
         """Make a pose from ``x, y, z, pitch, roll, heading`` in metres and degrees.
 
         Raises:
-            MitsonarError: not six finite numbers.
+            MitsonarError: not six finite numbers, or too large ones.
         """
         values = np.asarray(numbers, dtype=float)
         if values.shape != (6,):
             raise MitsonarError(f"a pose is six numbers x,y,z,pitch,roll,heading (m, deg): got {values.size}")
         if not np.isfinite(values).all():
             raise MitsonarError(f"a pose must be finite: got {','.join(f'{v:g}' for v in values)}; give m and deg")
-        return cls.from_row([*values[:3], *np.radians(values[3:])])
+        made = cls.from_row([*values[:3], *np.radians(values[3:])])
+        refuse_beyond_reach([made])
+        return made
+
+
+def refuse_beyond_reach(poses: ArrayLike) -> None:
+    """Refuse poses ``(..., 6)`` [m, rad] whose numbers are so large that nothing could be rendered there.
+
+    Raises:
+        MitsonarError: a coordinate or an angle is beyond its bound.
+    """
+    table = np.abs(np.asarray(poses, dtype=float).reshape(-1, 6))
+    for what, unit, values, bound in (
+        ("position", "m", table[:, :3], FARTHEST),
+        ("angle", "rad", table[:, 3:], MOST_TURNED),
+    ):
+        if values.size and values.max() > bound:
+            raise MitsonarError(f"a pose's {what} must be at most {bound:g} {unit}: got {values.max():g} {unit}")
 
 
 def mounted(poses: ArrayLike, mount: Pose) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, counted
 from mitsonar.motion.conventions import CONVENTIONS, Convention, convention_named, sideways_or_up
-from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
+from mitsonar.motion.pose import Pose, poses_from, refuse_beyond_reach, vehicle_rotation
 from mitsonar.motion.trajectory_files import read_csv, read_tum, write_csv, write_tum
 
 __all__ = ["Trajectory", "velocities"]
@@ -54,6 +54,7 @@ class Trajectory:
             raise MitsonarError(f"a trajectory is poses (frames, 6) with a time each: got {self.poses.shape}")
         if not (np.isfinite(self.poses).all() and np.isfinite(self.time_s).all()):
             raise MitsonarError("a trajectory must be finite: got inf or nan in a pose or a time")
+        refuse_beyond_reach(self.poses)
 
     def __len__(self) -> int:
         return len(self.poses)

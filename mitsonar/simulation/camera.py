@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.moving_bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices, vehicle_rotation
+from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.simulation.moving_scene import SceneMotion, motion_in
 
 __all__ = ["CameraSimulator", "camera_of", "told_of"]
@@ -23,7 +24,7 @@ PATH_DEPTH = 8
 def camera_of(fov_deg: float, width: int, height: int, samples: int) -> mi.Sensor:
     """Return a pinhole camera of Mitsuba; ``fov_deg`` is across the picture."""
     pixel = "luminance" if "mono" in str(mi.variant()) else "rgb"
-    made = mi.load_dict(
+    made = load_dict(
         {
             "type": "perspective",
             "fov": fov_deg,
@@ -58,7 +59,7 @@ class CameraSimulator:
         self.camera, self.motion = camera, motion_in(scene, moving)
         own = scene.integrator()
         sees = own is not None and not type(own).__module__.startswith("mitsonar")
-        self.integrator = own if sees else mi.load_dict({"type": "path", "max_depth": PATH_DEPTH})
+        self.integrator = own if sees else load_dict({"type": "path", "max_depth": PATH_DEPTH})
         self.scene = scene if self.motion is None else _with_instances(scene, self.motion)
         self.samples = int(camera.sampler().sample_count())
 
@@ -119,7 +120,7 @@ def _with_instances(scene: mi.Scene, motion: SceneMotion) -> mi.Scene:
         group = {"type": "ref", "id": f"group{motion.numbers[name]}"}
         parts[f"body{body}"] = {"type": "instance", "group": group}
     names = [shape.id() for shape in motion.shapes]
-    made = mi.load_dict(parts, optimize=False)
+    made = load_dict(parts, optimize=False)
     for shape, name in zip(motion.shapes, names, strict=True):
         shape.set_id(name)  # the loader has changed it
     assert isinstance(made, mi.Scene)

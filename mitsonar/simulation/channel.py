@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
 from mitsonar.instruments.mirror_rules import check_channel_mirrors
+from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.simulation.nonuniform_fft import phasor_sums, phasors
@@ -250,6 +251,7 @@ class ChannelSimulator:
         table = np.asarray(pose, dtype=float).reshape(1, -1)
         if table.shape != (1, 6) or not np.isfinite(table).all():
             raise MitsonarError(f"a pose is six numbers x, y, z [m], pitch, roll, heading [rad]: got {table.size}")
+        refuse_beyond_reach(table)
         receiver = self.sonar.receiver_number(receiver)
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
         parts = [

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
+from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.hashed_points import lattice_key, nearest_axis, patch_weight, pick, place_in_cell, weight_of
@@ -116,7 +117,7 @@ class _Search:
 
     def __init__(self, shape: mi.Shape, pitch: float, patches: Patches | None) -> None:
         name = shape.id()
-        self.scene: mi.Scene = mi.load_dict({"type": "scene", "shape": shape})
+        self.scene: mi.Scene = load_dict({"type": "scene", "shape": shape})
         shape.set_id(name)  # Mitsuba renames it
         self.surfaces = Surfaces.of(self.scene)
         self.pitch, self.patches = pitch, patches

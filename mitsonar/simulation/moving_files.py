@@ -17,6 +17,7 @@ from mitsonar.io.whole_files import refuse_beyond_memory
 from mitsonar.motion.deforming import Deforming, MeshSequence
 from mitsonar.motion.moving_bodies import VEHICLE
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.worlds.mesh_check import check_mesh
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ def _mesh(file: Path) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     import mitsuba as mi
 
     check_mesh(file, "ply")
-    values = mi.traverse(mi.load_dict({"type": "ply", "filename": str(file)}))
+    values = mi.traverse(load_dict({"type": "ply", "filename": str(file)}))
     return np.array(values["vertex_positions"]).reshape(-1, 3), np.array(values["faces"])
 
 

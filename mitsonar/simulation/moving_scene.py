@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.motion.moving_bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices
+from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.simulation.deforming_mesh import DeformingMesh
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.moving_files import motions_of
@@ -234,7 +235,7 @@ def scene_of(shapes: list[mi.Shape]) -> mi.Scene:
     """Return a scene of some shapes of another."""
     names = [shape.id() for shape in shapes]
     numbered = {f"shape{number}": shape for number, shape in enumerate(shapes)}
-    scene = mi.load_dict({"type": "scene", **numbered}, optimize=False)  # merged meshes would be other shapes
+    scene = load_dict({"type": "scene", **numbered}, optimize=False)  # merged meshes would be other shapes
     assert isinstance(scene, mi.Scene)
     for shape, name in zip(shapes, names, strict=True):
         shape.set_id(name)  # the loader has changed it

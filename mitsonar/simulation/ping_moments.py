@@ -13,6 +13,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.mirror_rules import check_image_mirrors
 from mitsonar.instruments.ping_groups import group_of_beams, one_beam, scans, turned_heads
 from mitsonar.instruments.views import View, Whole
+from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.simulation.binning import Counts
 from mitsonar.simulation.rendered_pings import CutRays, RenderedPings
 
@@ -44,13 +45,14 @@ def moments_of(
         first: number of the first frame, or of each.
 
     Raises:
-        MitsonarError: another shape, or numbers that are not finite.
+        MitsonarError: another shape, numbers that are not finite, or too large ones.
     """
     table, groups = np.atleast_2d(np.asarray(poses, dtype=float)), sonar.ping_groups
     shapes = [(len(table), 6)] + ([(len(table), groups, 6)] if groups > 1 else [])
     if table.shape not in shapes or not len(table) or not np.isfinite(table).all():
         known = "(frames, 6)" if groups == 1 else f"(frames, 6) or (frames, {groups}, 6)"
         raise MitsonarError(f"poses must be finite numbers {known}: got {table.shape}; give m and rad")
+    refuse_beyond_reach(table)
     numbers = (
         [first + place for place in range(len(table))]
         if isinstance(first, int | np.integer)

@@ -16,10 +16,11 @@ from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import Pose
+from mitsonar.plugins.native_plugins import file_resolver, own_code_only, search_in
 from mitsonar.simulation.moving_files import refuse_unread_motions
 from mitsonar.simulation.variant import ensure_variant
-from mitsonar.worlds.mesh_check import check_meshes_of
-from mitsonar.worlds.scene_text import check_nesting
+from mitsonar.worlds.scene_check import check_parsed
+from mitsonar.worlds.scene_text import check_text
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -40,6 +41,15 @@ __all__ = [
 
 MOST_OBJECTS = 1_000_000
 """Objects that are named; beyond, their numbers have to do."""
+
+QUOTING = {
+    r"(failed to load spectrum from file \".*?\"): .*": r"\1: it must hold a wavelength and a value in each line",
+    r"(Error while loading .*? curve\(s\) from \".*?\"): .*": r"\1: it must hold x, y, z and a radius in each line",
+}
+"""Mitsuba's errors that quote the file which the scene names, and what is shown of them."""
+
+LONGEST_REASON = 600
+"""Letters of Mitsuba's errors that are shown."""
 
 
 TOO_LARGE = 20
@@ -85,23 +95,19 @@ def find_scene(name_or_file: str | Path) -> Path:
 def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
     """Load a Mitsuba scene; ``parameters`` replace its ``$name`` values, as in ``mi.load_file``.
 
+    The scene may be a stranger's: unlike ``mi.load_file``, this loads no library from the scene's folder, and checks the
+    files that the scene names before Mitsuba reads them (SECURITY.md).
+
     Raises:
-        MitsonarError: missing file, malformed XML, a damaged mesh, a plugin that refuses its properties, a trajectory that
-            no shape reads.
+        MitsonarError: missing file, malformed XML, an unknown plugin, a damaged mesh or picture, a plugin that refuses its
+            properties, a trajectory that no shape reads.
     """
     path = find_scene(name_or_file)
     variant = ensure_variant()
     import mitsuba as mi
 
     try:
-        texts = {key: str(value) for key, value in parameters.items()}
-        check_nesting(path, texts)
-        parser = mi.parser
-        state = parser.parse_file(parser.ParserConfig(variant), str(path), **texts)
-        check_meshes_of(state, path.parent)
-        refuse_unread_motions(state)
-        # merged meshes would lose their ids; in parallel, one load in some 150 failed on a good file, and none is faster
-        scene = mi.load_file(str(path), optimize=False, parallel=False, **texts)
+        scene = _loaded(path, variant, {key: str(value) for key, value in parameters.items()})
     except MitsonarError as error:
         raise MitsonarError(f"cannot load scene {path}: {error}") from None
     except Exception as error:
@@ -109,6 +115,25 @@ def load_scene(name_or_file: str | Path, **parameters: object) -> mi.Scene:
     if not isinstance(scene, mi.Scene):
         raise MitsonarError(f"{path} holds a {type(scene).__name__.lower()}, not a scene: wrap it in <scene>")
     return scene
+
+
+def _loaded(path: Path, variant: str, parameters: dict[str, str]) -> object:
+    """Read a scene's XML, check it, and create its objects; what was checked is what is created."""
+    import mitsuba as mi
+
+    parser = mi.parser
+    config = parser.ParserConfig(variant)
+    config.merge_equivalent = config.merge_meshes = False  # merged meshes would lose their ids
+    config.parallel = False  # in parallel, one load in some 150 failed on a good file, and none is faster
+    with search_in([path.parent]):
+        check_text(path, parameters, [Path(str(folder)) for folder in file_resolver()])
+        state = parser.parse_file(config, str(path), **parameters)
+        looked_at = parser.ParserState(state)  # a copy: Mitsuba refuses properties that nothing has looked at
+        check_parsed(looked_at)
+        refuse_unread_motions(looked_at)
+        parser.transform_all(config, state)
+        with own_code_only(node.props.plugin_name() for node in state.nodes):
+            return parser.instantiate(config, state)
 
 
 def shape_names_in(scene: mi.Scene) -> tuple[str, ...]:
@@ -225,4 +250,7 @@ def _reason(error: BaseException) -> str:
         return str(ours[-1])
     head, _, trace = text.partition("Traceback (most recent call last):")
     shown = f"{head} {trace.strip().splitlines()[-1]}" if trace.strip() else head
-    return " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", shown).split())
+    words = " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", shown).split())
+    for pattern, instead in QUOTING.items():
+        words = re.sub(pattern, instead, words)
+    return words if len(words) <= LONGEST_REASON else f"{words[:LONGEST_REASON]}..."

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins import echo_integrator, imaging_sonar_sensor, surfaces
+from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables
 
@@ -89,7 +90,7 @@ class Tracer:
         self.scene = scene
         self.sonar = sonar
         given = {name: value for name, value in sonar.model_dump(exclude={"name"}).items() if value is not None}
-        self.sensor: imaging_sonar_sensor.ImagingSonar = mi.load_dict({"type": "imaging_sonar", **given})
+        self.sensor: imaging_sonar_sensor.ImagingSonar = load_dict({"type": "imaging_sonar", **given})
         self.surfaces = surfaces.Surfaces.of(scene).heard_by(sonar)
         self.notes = self.surfaces.notes
 

@@ -1,4 +1,4 @@
-"""Check a scene's meshes before Mitsuba reads them: it checks no indices, and a wrong index ends the process."""
+"""Check a mesh before Mitsuba reads it: it checks no indices, and a wrong index ends the process."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.io.whole_files import refuse_irregular
 
-if TYPE_CHECKING:
-    import mitsuba as mi
-
-__all__ = ["check_counts", "check_mesh", "check_meshes_of"]
+__all__ = ["CHECKS", "LARGEST_COORDINATE", "check_counts", "check_mesh"]
 
 LARGEST_COORDINATE = 1e12
 """Largest coordinate of vertices, normals and textures: beyond it single precision overflows."""
@@ -65,37 +62,6 @@ class _Element:
         return np.dtype(parts)
 
 
-# ---------------------------------------------------------------- scenes
-
-
-def check_meshes_of(state: mi.parser.ParserState, folder: Path) -> None:
-    """Check the mesh files of a parsed scene, whose included files and parameters are resolved.
-
-    Args:
-        state: of the scene, not instantiated yet.
-        folder: of its XML file; Mitsuba searches there, beside included files, and in the paths of its resolver.
-
-    Raises:
-        MitsonarError: a mesh is damaged.
-    """
-    import mitsuba as mi
-
-    resolver: Any = mi.file_resolver
-    folders = [folder, Path(), *(Path(str(path)).parent for path in state.files)]
-    for node in state.nodes:
-        kind = node.props.plugin_name()
-        if node.type != mi.ObjectType.Shape or "filename" not in node.props:
-            continue
-        name = str(node.props["filename"])
-        if kind in FOREIGN_FORMATS:
-            raise MitsonarError(_foreign(name, FOREIGN_FORMATS[kind], kind))
-        if kind not in CHECKS:
-            continue
-        found = {folder / name for folder in folders} | {Path(str(resolver().resolve(name)))}
-        for path in sorted(path for path in found if path.is_file()):
-            check_mesh(path, kind)
-
-
 def check_mesh(path: str | Path, kind: str) -> None:
     """Check a mesh file, once in a process: counts against its size, indices against vertices, finite numbers.
 
@@ -106,6 +72,7 @@ def check_mesh(path: str | Path, kind: str) -> None:
     Raises:
         MitsonarError: it is damaged, or has no triangles.
     """
+    refuse_irregular(path, "mesh")
     try:
         known = Path(path).stat()
         _check_once(str(path), kind, known.st_size, known.st_mtime_ns)

@@ -11,9 +11,11 @@ import pytest
 from helpers import axes
 
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose, mounted, pose_from_to_world, to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.simulation.ping_moments import moments_of
 
 RIGHT_ANGLE = np.pi / 2
 
@@ -293,3 +295,20 @@ def test_headings_may_go_on_turning() -> None:
         assert isinstance(same, Pose)
         assert same == further
     assert Pose(0, 0, 0, heading=-2 * np.pi).heading == -2 * np.pi
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        ((0, 0, 2.5, 1e18, 0, 0), r"a pose's angle must be at most 1e\+06 rad: got 1e\+18 rad"),
+        ((0, 1e30, 2.5, 0, 0, 0), r"a pose's position must be at most 1e\+12 m: got 1e\+30 m"),
+    ],
+)
+def test_poses_beyond_reach_are_refused(pose: tuple[float, ...], words: str) -> None:
+    """Nothing could be rendered there; earlier, a picture without an echo came out."""
+    with pytest.raises(MitsonarError, match=words):
+        moments_of(Sonar(), [Pose.from_row(pose)], None, 0)
+    with pytest.raises(MitsonarError, match=words):
+        Trajectory(np.array([pose]), np.zeros(1))
+    with pytest.raises(MitsonarError, match="at most"):
+        Pose.from_degrees(pose)

@@ -57,10 +57,11 @@ def test_sonars_are_found_and_cameras_ignored(tmp_path: Path) -> None:
         (XML.replace('name="beams"', 'name="beems"'), r"bad\.xml: .*beems"),
         (XML.replace('type="sphere"', 'type="spere"'), r"bad\.xml: .*spere"),
         (XML.replace("diffuse", "cell_noise"), r"bad\.xml"),
+        (XML.replace('name="reflectance"', 'name="reflectence"'), r"bad\.xml: .*unreferenced property .*reflectence"),
         ('<shape version="3.0.0" type="sphere"/>', r"bad\.xml holds a \w+, not a scene: wrap it in <scene>"),
         ("", r"cannot load scene .*bad\.xml"),
     ],
-    ids=["cut off", "bad value", "slip", "unknown plugin", "wrong place", "no scene", "empty"],
+    ids=["cut off", "bad value", "slip", "unknown plugin", "wrong place", "slip of a name", "no scene", "empty"],
 )
 def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "bad.xml").write_text(text)
