@@ -27,7 +27,7 @@ GROUPS = {
     "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar", "load_sounder", "Sounder"),
     "Poses and paths": ("Pose", "Motion", "Trajectory"),
     "Simulation": ("Simulator", "ChannelSimulator", "SounderSimulator", "load_noise", "NoiseModel"),
-    "Bodies that move": ("Deforming", "load_meshes", "load_motions", "range_rates", "particle_mesh", "net_mesh"),
+    "Bodies that move": ("Deforming", "load_meshes", "load_motions", "range_rates", "particle_mesh", "fishing_net_mesh"),
     "Sea surface": ("SeaSurface",),
     "Several sensors": ("VehicleSimulator", "Mounted", "load_vehicle"),
     "Environments": (

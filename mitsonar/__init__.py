@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
     from mitsonar.worlds.sea_surface import SeaSurface
-    from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
+    from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
 
 __all__ = [
     "ChannelSimulator",
@@ -94,6 +94,7 @@ __all__ = [
     "build_mosaic",
     "cramer_rao_bound",
     "create_estimator",
+    "fishing_net_mesh",
     "load_checkpoint",
     "load_frames",
     "load_meshes",
@@ -106,7 +107,6 @@ __all__ = [
     "load_sounder",
     "load_vehicle",
     "make_dataset",
-    "net_mesh",
     "odometry",
     "open_recording",
     "particle_mesh",
@@ -148,6 +148,7 @@ _MODULES = {
     "build_mosaic": "mapping.mosaic",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
+    "fishing_net_mesh": "worlds.water_bodies",
     "load_checkpoint": "estimation.named_estimators",
     "load_frames": "mapping.open_frames",
     "load_meshes": "simulation.moving_files",
@@ -160,7 +161,6 @@ _MODULES = {
     "load_sounder": "instruments.named_sounders",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",
-    "net_mesh": "worlds.water_bodies",
     "odometry": "mapping.odometry",
     "particle_mesh": "worlds.water_bodies",
     "open_recording": "recordings.open_recording",
