@@ -144,6 +144,10 @@ class DataStore:
             )
         return store
 
+    def __repr__(self) -> str:
+        state, sequences = "" if self.finished else ", not finished", int(self.about["sequences"])
+        return f"DataStore({len(self):,} frames in {sequences:,} sequences, {self.recipe.name}{state}: {self.place.url})"
+
     # ---------------------------------------------------------------- reading
 
     @property

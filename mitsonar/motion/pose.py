@@ -15,6 +15,11 @@ __all__ = ["Pose", "mount_between", "mounted", "pose_from_to_world", "poses_from
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 
+def plain_number(value: object) -> object:
+    """Return a number of NumPy as one of Python; others as they are."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 class Pose(NamedTuple):
     """Position and attitude of the sonar: x, y, z [m], pitch, roll, heading [rad]."""
 
@@ -24,6 +29,9 @@ class Pose(NamedTuple):
     pitch: float = 0.0
     roll: float = 0.0
     heading: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"Pose({', '.join(f'{name}={plain_number(value)!r}' for name, value in self._asdict().items())})"
 
     @classmethod
     def from_degrees(cls, numbers: ArrayLike) -> Self:

@@ -58,6 +58,13 @@ class Soundings:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    def __repr__(self) -> str:
+        pings, fans, beams = self.range_m.shape
+        return (
+            f"Soundings({pings} pings of {fans} fans x {beams} beams, {int(self.found.sum()):,} of {self.range_m.size:,} "
+            f"found, {self.sounder.name})"
+        )
+
     @property
     def found(self) -> NDArray[np.bool_]:
         """Return which beams have an echo ``(pings, channels, beams)``."""

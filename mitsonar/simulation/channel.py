@@ -146,6 +146,10 @@ class ChannelSimulator:
         self._build(None if like is None else like.tracer)
         self.reset()
 
+    def __repr__(self) -> str:
+        shapes, ways = len(self._given[0].shapes()), ", ".join(self.ways[:4])
+        return f"ChannelSimulator({self.sonar} in a scene of {shapes} shapes; ways {ways})"
+
     def _build(self, like: ChannelTracer | None = None) -> None:
         """Make all that follows from the scene as it is now: scatterers or tables of its surfaces, and mirrors."""
         scene, mirrors = self._given

@@ -87,6 +87,11 @@ class Simulator:
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
 
+    def __repr__(self) -> str:
+        shapes, moving = len(self.tracer.scene.shapes()), 0 if self.motion is None else len(self.motion.bodies)
+        also = f", {moving} bodies that move" if moving else ""
+        return f"Simulator({self.sonar} in a scene of {shapes} shapes{also}; {self.variant})"
+
     def _build(self) -> None:
         """Make all that follows from the scene as it is now: tables of its surfaces, mirrors, moving bodies, launches."""
         scene, views, moving, rays_per_launch = self._given

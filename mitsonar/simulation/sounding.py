@@ -68,6 +68,9 @@ class SounderSimulator:
         self.variant = self.simulator.variant
         self.noise = self._noise()
 
+    def __repr__(self) -> str:
+        return f"SounderSimulator({self.sounder})"
+
     @property
     def notes(self) -> list[str]:
         """Return what a user should know about the scene and the instrument."""
