@@ -106,7 +106,7 @@ class Soundings:
         return cls(arrays["time_s"], arrays["poses"], sounder, *(arrays[name] for name in MEASURED))
 
     def table(self) -> Array:
-        """Return the soundings found as rows of :data:`COLUMNS` ``(found, columns)``."""
+        """Return the soundings found ``(found, columns)``; columns: :data:`mitsonar.records.soundings.COLUMNS`."""
         ping, channel, beam = np.nonzero(self.found)
         bearing = np.degrees(self.sounder.fan.bearing_rad)[beam]
         measured = [getattr(self, name)[self.found] for name in MEASURED]

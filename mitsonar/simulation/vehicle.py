@@ -78,7 +78,7 @@ class VehicleSimulator:
 
     Args:
         scene: a Mitsuba scene.
-        sensors: by name; default: the scene's own, see :func:`sensors_in`.
+        sensors: by name; default: the scene's own, by their ids.
         moving: trajectories of bodies, as of :class:`mitsonar.Simulator`; ``vehicle`` stands for the path.
 
     Raises:
