@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     from mitsonar.training.document_tables import load_tables
     from mitsonar.training.reproduce import Effort, reproduce
     from mitsonar.worlds.sea_surface import SeaSurface
-    from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
+    from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
 
 __all__ = [
     "ChannelSimulator",
@@ -106,6 +106,7 @@ __all__ = [
     "compare",
     "cramer_rao_bound",
     "create_estimator",
+    "fishing_net_mesh",
     "illumination",
     "load_checkpoint",
     "load_frames",
@@ -121,7 +122,6 @@ __all__ = [
     "load_vehicle",
     "make_dataset",
     "mosaic_figure",
-    "net_mesh",
     "odometry",
     "open_recording",
     "particle_mesh",
@@ -173,6 +173,7 @@ _MODULES = {
     "compare": "estimation.comparison_run",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
+    "fishing_net_mesh": "worlds.water_bodies",
     "illumination": "mapping.illumination",
     "load_checkpoint": "estimation.named_estimators",
     "load_frames": "mapping.open_frames",
@@ -188,7 +189,6 @@ _MODULES = {
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",
     "mosaic_figure": "plotting.map_figure",
-    "net_mesh": "worlds.water_bodies",
     "odometry": "mapping.odometry",
     "open_recording": "recordings.open_recording",
     "particle_mesh": "worlds.water_bodies",

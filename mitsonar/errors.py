@@ -70,8 +70,8 @@ class MitsonarError(ValueError):
         """Return the message in the words of its reader.
 
         Args:
-            options: the option for each argument that :func:`argument` names, ``{"height_m": "--height"}``. Other arguments
-                keep their Python names.
+            options: the option for each argument that :func:`mitsonar.errors.argument` names,
+                ``{"height_m": "--height"}``. Other arguments keep their Python names.
         """
 
         def typed(found: re.Match[str]) -> str:

@@ -76,6 +76,10 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # a copy would keep cached values
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
 
+    def __repr__(self) -> str:
+        length = "endless" if self.length is None else f"{self.length:,}"
+        return f"RenderedPairs({length} samples of {self.frames} frames, rendered of {self.recipe.name}, seed {self.seed})"
+
     def __iter__(self) -> Iterator[Batch]:
         for sample in self.raw():
             yield self.one(sample)

@@ -113,7 +113,8 @@ class DataStore:
             known = attributes.get("format")
             check_plain(attributes, "its zarr.json")
         except Exception as error:  # a damaged file, or a storage that does not answer, may raise anything
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            nothing = isinstance(error, zarr.errors.GroupNotFoundError)
+            reason = "it is no Zarr group" if nothing else " ".join(str(error).split())[:200] or type(error).__name__
             raise MitsonarError(
                 f"no data set at {storage.url}: {reason}; give what `mitsonar dataset make` or `dataset from-frames` wrote"
             ) from None
@@ -143,6 +144,10 @@ class DataStore:
                 "again, it continues where it stopped"
             )
         return store
+
+    def __repr__(self) -> str:
+        state, sequences = "" if self.finished else ", not finished", int(self.about["sequences"])
+        return f"DataStore({len(self):,} frames in {sequences:,} sequences, {self.recipe.name}{state}: {self.place.url})"
 
     # ---------------------------------------------------------------- reading
 

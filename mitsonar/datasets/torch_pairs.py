@@ -241,7 +241,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
     ) -> None:
         own = ("part", "split", "one_a_sequence")
         refuse_unknown(arrangement, (*own, *SampleOptions.__annotations__), type(self).__name__)
-        self.store = DataStore.open(url)
+        self.store, self._part = DataStore.open(url), part
         Samples.__init__(self, self.store.recipe, **arrangement)
         self.chosen = Part.of(self.store, part, split, self.frames, seed=self.seed, one_a_sequence=one_a_sequence)
         self.split, self.first = self.chosen.split, self.chosen.first
@@ -249,6 +249,12 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
         self._grounds: dict[int, RawSample] = {}
         self._whole: dict[str, Values] = {}
+
+    def __repr__(self) -> str:
+        return (
+            f"SonarPairs({len(self):,} samples of {self.frames} frames, part {self._part}, {self.arrange.kind} of "
+            f"{', '.join(list(self.arrange.views)[:4])}, {self.recipe.name}: {self.store.place.url})"
+        )
 
     def __len__(self) -> int:
         return len(self.first)

@@ -88,6 +88,12 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         self._ended = np.zeros(num_envs, dtype=bool)
         self._image: NDArray[np.uint8] | None = None
 
+    def __repr__(self) -> str:
+        sonar, task = self.fleet.sonar, self.fleet.task
+        return (
+            f"SonarVectorEnv({self.num_envs} of {sonar}; observes {', '.join(task.observe)}, {self.fleet.step_s:g} s a step)"
+        )
+
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
@@ -113,13 +119,15 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         self.fleet.renew(which, self._generators)
         self._ended[which] = False
         self._image, altitude_m = self.fleet.look()
-        return observed(self.fleet, self._image, altitude_m), _told({"pose": self.fleet.poses.copy()}, which)
+        return observed(self.fleet, self._image, altitude_m), _masked({"pose": self.fleet.poses.copy()}, which)
 
     def step(self, actions: ArrayLike) -> tuple[Observation, Table, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Move all vehicles by their actions ``(num_envs, 4)``, then ping in one launch.
 
         Returns:
-            Observations, rewards, which collided or left their bounds, which are cut off, and what else is known.
+            observations, rewards, terminated, truncated, infos, as Gymnasium has them, each ``(num_envs, ...)``: terminated
+            where a vehicle collided or left its bounds, truncated after ``max_steps``. The infos hold ``pose``,
+            ``clearance_m``, ``collided`` and ``outside``, and a mask of each with ``_`` before its name.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -133,10 +141,10 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         moved = fleet.advance(actions, renewed, self._generators)
         self._image = moved.image
         rewards = np.where(renewed, 0.0, fleet.rewards(moved))
-        ended = (moved.collided | moved.outside) & ~renewed
-        cut = (fleet.steps >= (np.inf if fleet.task.max_steps is None else fleet.task.max_steps)) & ~renewed
-        self._ended = ended | cut
-        return observed(fleet, moved.image, moved.altitude_m), rewards, ended, cut, _known_of(moved, ~renewed)
+        terminated = (moved.collided | moved.outside) & ~renewed
+        truncated = (fleet.steps >= (np.inf if fleet.task.max_steps is None else fleet.task.max_steps)) & ~renewed
+        self._ended = terminated | truncated
+        return observed(fleet, moved.image, moved.altitude_m), rewards, terminated, truncated, _infos(moved, ~renewed)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each fan ``(rows, columns, 3)``, forward up; None before a ping, or without a mode."""
@@ -146,13 +154,13 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         return tuple(fan_picture(fan, image) for image in self._image)
 
 
-def _known_of(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
+def _infos(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
     """Return what is known of the vehicles beside their observations."""
-    whole = _told({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
+    whole = _masked({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
     table = {"clearance_m": moved.clearance_m.copy(), "collided": moved.collided.copy(), "outside": moved.outside.copy()}
-    return whole | _told(table, which)
+    return whole | _masked(table, which)
 
 
-def _told(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
+def _masked(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
     """Return arrays by name, each with the mask of the vehicles that it holds for, as Gymnasium has it."""
     return values | {f"_{name}": which.copy() for name in values}

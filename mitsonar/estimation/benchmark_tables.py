@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mitsonar.errors import counted
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.motion_errors import AXES
@@ -56,8 +57,8 @@ class Comparison:
         """Return the tables as ``mitsonar compare`` prints them."""
         report = self.report
         head = (
-            f"{report['data']}: {counted(report['pairs'], 'pair')} of {counted(report['scenes'], 'scene')}, {report['model']} model; "
-            "sideways mm / forward mm / yaw deg"
+            f"{report['data']}: {counted(report['pairs'], 'pair')} of {counted(report['scenes'], 'scene')}, "
+            f"{report['model']} model; sideways mm / forward mm / yaw deg"
         )
         return "\n".join([head, *(line for table in report["tables"] for line in table_lines(table))])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -105,6 +106,20 @@ class Estimate:
     valid: bool = True
     reason: str = ""
     about: PlainTable = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        if not self.valid:
+            return f"Estimate(rejected: {self.reason[:160]})"
+        motion = f"sideways {self.motion.sideways:+.4g} m, forward {self.motion.forward:+.4g} m"
+        return f"Estimate({motion}, yaw {math.degrees(self.motion.yaw):+.4g} deg{self._deviations})"
+
+    @property
+    def _deviations(self) -> str:
+        """Return the standard deviations in words, where they are known."""
+        if self.covariance is None:
+            return ""
+        sideways, forward, yaw = np.sqrt(np.diag(self.covariance))
+        return f"; std {sideways:.2g} m, {forward:.2g} m, {math.degrees(yaw):.2g} deg"
 
 
 def rejected(reason: str) -> Estimate:

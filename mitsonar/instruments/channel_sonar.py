@@ -198,6 +198,14 @@ class ChannelSonar(Instrument):
     transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="its field of view")
     receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
 
+    def __repr__(self) -> str:
+        names = [one.name for one in self.receivers]
+        shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+        return (
+            f"ChannelSonar({self.name}: {self.carrier_hz / 1e3:g} kHz, band {self.bandwidth_hz / 1e3:g} kHz, {len(names)} "
+            f"receivers ({shown}), {self.taps} taps, to {self.range_max:g} m, model {self.model})"
+        )
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         half_band = (1 + self.rolloff) * self.bandwidth_hz / 2

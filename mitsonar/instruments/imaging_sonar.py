@@ -90,6 +90,9 @@ class Instrument(CheckedModel):
         """
         return self.create(**{**self.model_dump(), **fields})
 
+    def __str__(self) -> str:
+        return repr(self)
+
 
 class Sonar(Instrument):
     """An imaging sonar. Angles in degrees (the edge of the program), all else SI.
@@ -127,7 +130,8 @@ class Sonar(Instrument):
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
     model: Model = Field(
         "physical",
-        description="coherent: with speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's",
+        description="coherent: with speckle, beams and pulse, as presets of real sonars have it; physical: expected levels, "
+        "the default since coherent needs a frequency_hz; thesis: Almanza-Medina's",
     )
     bounces: int = Field(
         1, ge=1, le=3, description="largest number of reflections of a path: 1, 2 or 3 (docs/guides/multipath.md)"
@@ -230,6 +234,13 @@ class Sonar(Instrument):
     )
     coding_db: float = Field(80.0, gt=0, le=300, description="span of the coding dB, from value 0 to 1 [dB]")
     coding_gamma: float = Field(0.5, gt=0, le=4, description="of the coding gamma: value = amplitude^gamma")
+
+    def __repr__(self) -> str:
+        carrier = "" if self.frequency_hz is None else f", {self.frequency_hz / 1e3:g} kHz"
+        return (
+            f"Sonar({self.name}: {self.beams} beams over {self.azimuth_fov_deg:g} deg, {self.range_bins} bins over "
+            f"{self.range_min:g}..{self.range_max:g} m{carrier}, model {self.model})"
+        )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

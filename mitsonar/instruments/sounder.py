@@ -86,6 +86,12 @@ class Sounder(CheckedModel):
         wrong = {key: value for key, value in fields.items() if key not in own and key not in Sonar.model_fields}
         return self.create(**{**fan.model_dump(include=fan.model_fields_set), **kept, **wrong})
 
+    def __repr__(self) -> str:
+        return f"Sounder({self.name}, {self.kind}: {len(self.channels)} fans ({', '.join(self.channels[:4])}) of {self.fan})"
+
+    def __str__(self) -> str:
+        return repr(self)
+
     @model_validator(mode="after")
     def _fits(self) -> Self:
         one_beam = self.kind in ("sidescan", "altimeter", "dvl")

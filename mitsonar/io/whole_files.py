@@ -182,16 +182,26 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
     try:
         return parse_yaml(content.decode("utf-8"), str(path))
     except UnicodeDecodeError as error:
-        raise MitsonarError(f"{path} is not YAML: {error}") from None
+        raise MitsonarError(f"{path} is not YAML: byte {error.start:,} is no text in UTF-8") from None
 
 
 def read_npz(path: str | Path) -> dict[str, FileArray]:
     """Read the arrays of an npz file by name: numbers and texts. Each is checked against its size in the file first.
 
     Raises:
-        ValueError: a list of parts, a size or a type that cannot be.
+        ValueError: nothing there, a folder, an empty file, another kind of file; a list of parts, a size or a type that
+            cannot be.
         Exception: damaged bytes raise errors of many kinds. The caller puts them into words.
     """
+    try:
+        with Path(path).open("rb") as raw:
+            begin = raw.read(1)
+    except OSError as error:
+        raise ValueError(f"{error.strerror or error}") from None
+    if not begin:
+        raise ValueError("it is empty")
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is no npz file, or was cut off")
     with zipfile.ZipFile(path) as file:  # read each part to its end: only then is its checksum tested
         parts = file.infolist()
         if any(entry.comment for entry in parts):  # a damaged length of a comment hides other parts

@@ -67,12 +67,18 @@ def open_frames(
 def load_frames(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
 ) -> SonarFrames:
-    """Load all frames at a path or URL into memory, with true poses where they are known; see :func:`open_frames`.
+    """Load all frames at a path or URL into memory, with true poses where they are known.
 
     Labels are not loaded: :meth:`mitsonar.SonarFrames.load` loads those of a run.
 
+    Args:
+        where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
+        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
+        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
+        geometry: file that tells how the pictures of a recording are laid out.
+
     Raises:
-        MitsonarError: no frames there; a sequence or view that is not there.
+        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
     """
     source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
     return replace(source.read(np.arange(len(source))), poses=source.poses, attitude_rad=source.attitude_rad)

@@ -9,7 +9,7 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.arrays import AnyArray
-from mitsonar.motion.pose import Pose
+from mitsonar.motion.pose import Pose, plain_number
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["Motion", "compose", "inverse", "motions", "steady"]
@@ -21,6 +21,9 @@ class Motion(NamedTuple):
     sideways: float
     forward: float
     yaw: float
+
+    def __repr__(self) -> str:
+        return f"Motion({', '.join(f'{name}={plain_number(value)!r}' for name, value in self._asdict().items())})"
 
 
 def compose(pose: Pose, motion: Motion) -> Pose:

@@ -35,6 +35,11 @@ MOST_TURNED = 1e6
 """Largest angle of a pose [rad]: larger ones no longer say where it points."""
 
 
+def plain_number(value: object) -> object:
+    """Return a number of NumPy as one of Python; others as they are."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 class _Six(NamedTuple):
     """The six numbers of a pose, unchecked."""
 
@@ -74,6 +79,9 @@ class Pose(_Six):
     def from_row(cls, row: Iterable[float]) -> Self:
         """Make a pose from a row of a trajectory: six numbers in metres and radians, with a heading of any size."""
         return cls._make(row)
+
+    def __repr__(self) -> str:
+        return f"Pose({', '.join(f'{name}={plain_number(value)!r}' for name, value in self._asdict().items())})"
 
     @classmethod
     def from_degrees(cls, numbers: ArrayLike) -> Self:

@@ -59,6 +59,11 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def __repr__(self) -> str:
+        low, high = self.poses[:, :3].min(axis=0), self.poses[:, :3].max(axis=0)
+        reach = ", ".join(f"{axis} {a:.4g}..{b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+        return f"Trajectory({len(self)} poses over {np.ptp(self.time_s):.4g} s; {reach} m)"
+
     @classmethod
     def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
         """Space ``frames`` poses equally from ``start`` to ``end`` (Almanza-Medina, 2.2.1).

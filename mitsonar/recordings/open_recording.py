@@ -100,7 +100,7 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     """Open a recording of a real sonar; pixels are read on demand.
 
     Args:
-        path: of a file or folder in one of :data:`FORMATS`; its content tells which.
+        path: of a file or folder; its content tells the format (docs/guides/recordings.md).
         geometry: a geometry file, for pictures. Other formats tell their geometry themselves.
         topic: of the sonar in a ROS bag; default: the only one.
 

@@ -52,6 +52,13 @@ class Echoes:
     shape_id: AnyArray
     object_id: AnyArray
 
+    def __repr__(self) -> str:
+        if not isinstance(self.hit, np.ndarray):
+            return "Echoes(not evaluated yet)"
+        hit = self.hit > 0
+        reach = f", {self.range_m[hit].min():.4g}..{self.range_m[hit].max():.4g} m" if hit.any() else ""
+        return f"Echoes({hit.size:,} rays, {int(hit.sum()):,} hit{reach})"
+
     def outside(self, sonar: Sonar) -> tuple[float, float] | None:
         """Return the nearest and farthest echo outside the window [m]; None where all lie inside. NumPy arrays only."""
         near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)

@@ -122,6 +122,15 @@ class SonarFrames:
     def __len__(self) -> int:
         return len(self.image)
 
+    def __repr__(self) -> str:
+        known = [name for name in ("poses", "height_m", *LABELS) if getattr(self, name) is not None]
+        near, far = (self.range_m[0], self.range_m[-1]) if len(self.range_m) else (0.0, 0.0)
+        return (
+            f"SonarFrames({len(self)} frames of {len(self.range_m)} bins x {len(self.bearing_rad)} beams, "
+            f"{near:.4g}..{far:.4g} m, {self.image.dtype}, level {self.level}, sonar {self.sonar.name}; "
+            f"{', '.join(known) or 'no poses'})"
+        )
+
     @property
     def pitch_rad(self) -> NDArray[np.float64] | None:
         """Pitch of each frame ``(frames,)`` [rad], where poses are known."""

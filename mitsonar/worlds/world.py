@@ -75,6 +75,9 @@ class Family(CheckedModel):
         described = cls.described or f"`mitsonar world {cls.called} --help`"
         raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
 
+    def __str__(self) -> str:
+        return repr(self)
+
     @property
     def half_m(self) -> float:
         """Return half the edge of the square around the origin that the world fills [m]."""
