@@ -196,9 +196,10 @@ def test_every_public_name_that_opens_files_is_tried() -> None:
 
 
 def test_meshes_are_a_list() -> None:
-    for wrong in ([], "fish.ply"):
+    mistakes: tuple[Any, ...] = ([], "fish.ply")
+    for wrong in mistakes:
         with pytest.raises(mitsonar.MitsonarError, match="in the order of time"):
-            mitsonar.load_meshes(wrong, 10.0)  # type: ignore[arg-type]  # a mistake
+            mitsonar.load_meshes(wrong, 10.0)
 
 
 # ---------------------------------------------------------------- names in docstrings

@@ -82,8 +82,8 @@ class Simulator:
             sonar = found[0]
         self.sonar, self.mirrors = sonar, mirrors
         self._given = scene, views, moving, rays_per_launch
-        self._watch = SceneWatch(scene)
         self._build()
+        self._watch = SceneWatch(scene, places=bool(self.motion or mirrors))
         self._stepped, self._gain_from, self._told = 0, "", set[str]()
         self.gain: float | None = None
 
@@ -147,7 +147,7 @@ class Simulator:
         One that evaluates a BSDF is recorded anew after a change of it: Dr.Jit 1.5 replays it with the texture of before.
         """
         changed = self._watch.changed()
-        if changed is None or not (changed or self.motion or self.mirrors):
+        if changed is None:
             return
         import mitsuba as mi
 
