@@ -244,12 +244,12 @@ class Direct:
         covariance = model * fit.covariance[:3, :3] + np.outer(height, height)
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start)) or prior_rejection(motion, covariance, task.prior)
-        about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about}
+        about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about, **task.attitude.about}
         if fit.excess != UNMEASURED:
             about["stands_out"] = stands_out(fit.independent, fit.excess)
         if task.attitude.first is not None:
-            told_m = task.attitude.first.height_m  # over ground that rises the motion has another one
-            about |= {"height_m": told_m, "height_std_m": STD_MEASURED * told_m}
+            first_m = task.attitude.first.height_m  # over ground that rises the motion has another one
+            about |= {"height_m": first_m, "height_std_m": STD_MEASURED * first_m}
         return Estimate(motion, covariance, not reason, reason, about)
 
 
