@@ -42,6 +42,9 @@ BLUR = 2.0
 CLEAR = 90
 """Percentile of the beams by last echo: shadows of rocks end the light of the others early."""
 
+NEAREST = 0.5
+"""Least range at which the profile of a skirt is computed, as part of that of the first echoes."""
+
 ROUNDS = 4
 """Rounds of the height that the profile of a skirt tells."""
 
@@ -49,6 +52,9 @@ FEWEST_BEAMS = 8
 
 FAINTEST = 1e-9
 """Level, as part of full scale, below which nothing is an echo."""
+
+SHARE, SHARE_OF_SKIRT = 0.15, 0.5
+"""Level of an echo, as part of that in the middle of the window. Side lobes look straight down and answer before a skirt."""
 
 EDGE = 15
 """Bins at the near or far side of the window that show what no echo looks like."""
@@ -97,7 +103,8 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
     image = frames.linear_values().mean(axis=0, dtype=np.float32)
     across = (3, 0.5) if edged else (13, 2.0)  # speckle crosses a threshold early: more of it is averaged
     smooth = cv2.GaussianBlur(image, (across[0], 13), sigmaX=across[1], sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE)
-    near = _ends(smooth, frames.range_m, _down(frames, pitch_rad, roll_rad, far=False))
+    steepest = _down(frames, pitch_rad, roll_rad, far=False)
+    near = _ends(smooth, frames.range_m, steepest, SHARE if edged else SHARE_OF_SKIRT)
     if not edged and near.shown:
         near = near.scaled(_skirt(frames, pitch_rad, near))
     first = _first_echoes(near.received) if near.shown else None
@@ -140,19 +147,20 @@ class _Ends(NamedTuple):
         return self._replace(received=self.received * factor, ended=self.ended * factor)
 
 
-def _ends(smooth: Floats, range_m: Doubles, down: Doubles) -> _Ends:
+def _ends(smooth: Floats, range_m: Doubles, down: Doubles, share: float = SHARE) -> _Ends:
     """Measure how far below the sonar the first echoes of the beams lie.
 
     Args:
         smooth: levels ``(bins, beams)``; rows in the order in which they are searched.
         range_m: of the rows.
         down: part of each beam's ray that points down ``(beams,)``.
+        share: level of an echo over the dark, as part of that of the middle of the window.
     """
     bins = len(smooth)
     darkest, dark = (float(level) for level in np.percentile(smooth[:EDGE], [5, 25]))
     spread = (dark - darkest) / 0.97  # quartile to twentieth of a Gaussian, in standard deviations
     bright = float(smooth[bins // 4 : 3 * bins // 4].mean())
-    over_dark = max(5 * spread, 0.15 * (bright - dark), FAINTEST)
+    over_dark = max(5 * spread, share * (bright - dark), FAINTEST)
     over = smooth > dark + over_dark
     first = over.argmax(axis=0)
     received = over.any(axis=0)
@@ -169,7 +177,14 @@ def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
     The profile of level ground under the pattern of a uniform aperture, blurred as the frames are, crosses the same
     threshold somewhere; the height at which it does so where the frames do is the fixed point of a few rounds.
     """
-    sonar, range_m = frames.sonar, frames.range_m
+    sonar, bin_m = frames.sonar, float(np.diff(frames.range_m).mean())
+    before = np.arange(frames.range_m[0] - bin_m, NEAREST * near.range_m, -bin_m)[
+        ::-1
+    ]  # a skirt may begin before the window
+    range_m, window = (
+        np.append(before, frames.range_m),
+        slice(len(before) + len(frames.range_m) // 4, -(len(frames.range_m) // 4)),
+    )
     power = 4 if sonar.vertical_pattern == "two_way" else 2
     half = math.radians(sonar.elevation_fov_deg) / 2
     edge_down = math.sin(min(pitch_rad + half, math.pi / 2))
@@ -180,9 +195,11 @@ def _skirt(frames: SonarFrames, pitch_rad: float, near: _Ends) -> float:
         pattern = np.abs(shaded_sinc(half_power((), power) * off_axis, ())) ** power
         level = np.where(height < range_m, pattern * range_m ** (sonar.gain_exponent - 5) / np.sqrt(1 - sine**2), 0.0)
         level = cv2.GaussianBlur(level, (1, 13), sigmaX=1e-3, sigmaY=BLUR, borderType=cv2.BORDER_REPLICATE).ravel()
-        over = level > near.threshold * level[len(level) // 4 : 3 * len(level) // 4].mean()
-        crossing = float(range_m[over.argmax()]) if over.any() else near.range_m
-        height *= near.range_m / crossing
+        below = level[: level.argmax() + 1] <= near.threshold * level[window].mean()
+        if not below.any():
+            return 1.0
+        crossing = range_m[np.flatnonzero(below)[-1] + 1]  # that of the main lobe: side lobes straight down are narrow
+        height *= near.range_m / float(crossing)
     return height / (near.range_m * edge_down)
 
 

@@ -52,7 +52,7 @@ class GroundNodes:
         self.derivative = self._derivative(self.ground)
 
     def _ground(self, number: int | None, lift_m: float = 0.0) -> GroundGeometry:
-        """Return the geometry of the nodes in the mean of the frames, or in one of them, over ground raised by ``lift_m``."""
+        """Return the geometry of the nodes, of the frames' mean or of one frame, over ground raised by ``lift_m``."""
         attitude = self.attitude
         mean = attitude.height_m - lift_m, attitude.pitch_rad, attitude.roll_rad
         pose = mean if number is None else attitude.of_frame(number, lift_m)
