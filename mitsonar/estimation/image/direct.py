@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,7 +39,7 @@ from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.motion_prior import MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.sonar_frames import LABELS, SonarFrames
 
 __all__ = ["Direct", "is_far"]
 
@@ -61,6 +62,9 @@ fields with a DIDSON, an ARIS and an Oculus, with speckle and without, 40 and 20
 
 GRAIN = 0.42
 """Standard deviation of the Gaussian filter whose noise is as coarse as the speckle of a beam or pulse of width 1."""
+
+MOST_CELLS = 196_608
+"""Most cells that are registered, four times those of a DIDSON. Beams within their own width are averaged at no loss."""
 
 FARTHEST = np.array([0.15, 0.15, np.radians(3)])
 """Farthest from its start that a motion is valid. Up to 100 mm and 2 deg it is always found; what is far beyond is noise."""
@@ -154,7 +158,7 @@ class Direct:
         attitude = attitude_of(frames, "direct", self.height_m, self.pitch_rad, self.relief_m)
         if attitude.reason:
             return rejected(attitude.reason)
-        task = _Task(frames, images, attitude, prior)
+        task = _Task(*_resolved(frames, images), attitude, prior)
         start = Motion(0.0, 0.0, 0.0) if prior is None else prior.motion
         found = self._from(task, start, "zero" if prior is None else "prior")
         # light over even ground correlates at any motion: a match that hardly stands out may be far from the true one
@@ -247,6 +251,34 @@ class Direct:
             first_m = task.attitude.first.height_m  # over ground that rises the motion has another one
             about |= {"height_m": first_m, "height_std_m": STD_MEASURED * first_m}
         return Estimate(motion, covariance, not reason, reason, about)
+
+
+def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[SonarFrames, tuple[Floats, Floats]]:
+    """Return frames of at most :data:`MOST_CELLS` cells: the means of as many bins and beams as that takes.
+
+    Beams that are closer than their width are averaged first, then what has the more cells.
+    """
+    bins, beams = images[0].shape
+    width = float(np.median(np.diff(frames.bearing_rad))) / frames.sonar.beam_width_rad
+    along = across = 1
+    while (bins // along) * (beams // across) > MOST_CELLS:
+        finer = (across + 1) * width <= 1 or beams // across > bins // along
+        along, across = (along, across + 1) if finer else (along + 1, across)
+    if along == across == 1:
+        return frames, images
+    rows, columns = bins // along, beams // across
+    cut = (image[: rows * along, : columns * across] for image in images)
+    first, second = (cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA) for one in cut)
+    axes = (frames.range_m, rows, along), (frames.bearing_rad, columns, across)
+    range_m, bearing_rad = (axis[: count * size].reshape(count, size).mean(axis=1) for axis, count, size in axes)
+    fewer = replace(
+        frames,
+        image=np.stack([first, second]),
+        range_m=range_m,
+        bearing_rad=bearing_rad,
+        **dict.fromkeys((*LABELS, "beam_poses")),
+    )
+    return fewer, (first, second)
 
 
 def _grains(frames: SonarFrames, level: DirectLevel) -> float:
