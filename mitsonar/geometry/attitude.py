@@ -148,8 +148,31 @@ def attitude_of(
             f"{name} needs height and pitch: the frames hold no height, and their window shows no first echoes; give "
             f"{argument('height_m')}"
         )
-    level = _over_level(found.first, given, pitch, roll)
-    return replace(_over_rising(level, found), apart=_apart(frames))
+    attitude = (
+        _over_rising(found, given, pitch, roll) if _rises(found, given) else _over_level(found.first, given, pitch, roll)
+    )
+    return replace(attitude, apart=_apart(frames))
+
+
+def _rises(found: EchoHeights, given_m: float | None) -> bool:
+    """Return whether the far end of the light lies so much higher than its near end that the ground must rise."""
+    if found.last_clear_m is None:
+        return False
+    first_m = found.first.height_m + found.first.tops_m if found.first is not None else given_m
+    assert first_m is not None
+    even = found.first is not None and found.first.even
+    return first_m - found.last_clear_m > (RISING_EVEN if even else RISING) * first_m
+
+
+def _over_rising(found: EchoHeights, given_m: float | None, pitch: float, roll: float) -> Attitude:
+    """Return the attitude over ground that rises: the mean height of both ends of the light counts."""
+    assert found.ends_m is not None
+    assert found.last_m is not None
+    first = found.first
+    first_m = first.height_m + first.tops_m if first is not None else given_m
+    assert first_m is not None
+    std = float(np.hypot(STD_MEASURED * found.ends_m, STD_RISING * (first_m - found.last_m)))
+    return Attitude(found.ends_m, std, pitch, roll, even=first is not None and first.even, given_m=given_m, first=first)
 
 
 def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, roll: float) -> Attitude:
@@ -169,17 +192,6 @@ def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, 
     weight = given_std**2 / (given_std**2 + std**2)
     height = given_m + weight * (first.height_m - given_m)
     return replace(measured, height_m=height, height_std_m=given_std * math.sqrt(1 - weight))
-
-
-def _over_rising(level: Attitude, found: EchoHeights) -> Attitude:
-    """Return the attitude over the mean of both ends of the light, where they show that the ground rises."""
-    if found.last_clear_m is None or found.last_m is None or found.ends_m is None or level.doubt:
-        return level
-    first_m = level.height_m + level.tops_m
-    if first_m - found.last_clear_m <= (RISING_EVEN if level.even else RISING) * first_m:
-        return level
-    std = float(np.hypot(STD_MEASURED * found.ends_m, STD_RISING * (first_m - found.last_m)))
-    return replace(level, height_m=found.ends_m, height_std_m=std)
 
 
 def _apart(frames: SonarFrames) -> tuple[Apart, ...]:

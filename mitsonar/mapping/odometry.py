@@ -298,10 +298,10 @@ def _start(source: Source, first: int) -> Pose:
 
 
 def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors: bool) -> Trajectory:
-    """Return a path with the height, pitch and roll of its frames, where these are known: motions are planar.
+    """Return a path along which height, pitch and roll change as those of its frames do, where known: motions are planar.
 
     Args:
-        path: poses at the frames; its first pose says where heights count from.
+        path: poses at the frames; heights and angles count from its first pose.
         source: of the records.
         numbers: of the frames.
         by_sensors: whether a depth sensor has given the heights already.
@@ -311,7 +311,7 @@ def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors:
     if known is None or not np.isfinite(known[:, 2:5]).all():
         return path
     poses = path.poses.copy()
-    poses[:, 3:5] = known[:, 3:5]
+    poses[:, 3:5] += known[:, 3:5] - known[0, 3:5]
     if source.poses is not None and not by_sensors:
         poses[:, 2] += known[:, 2] - known[0, 2]
     return Trajectory(poses, path.time_s)

@@ -197,7 +197,7 @@ def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_p
     assert "4 invalid and bridged" in done.stdout
     frames.image[...] = 0
     frames.save(tmp_path / "dark.npz")
-    refused(mitsonar("odometry", tmp_path / "dark.npz", "-o", tmp_path / "dark"), "none of 19 motions is believed")
+    refused(mitsonar("odometry", tmp_path / "dark.npz", "-o", tmp_path / "dark"), "none of 19 motions is valid")
 
 
 # ---------------------------------------------------------------- kills and workers

@@ -264,7 +264,7 @@ def test_many_that_are_not_believed_are_warned_of_and_all_is_an_error() -> None:
     (warning,) = odometry(*told(path, lost=(3, 4, 5, 6))).warnings()
     assert "4 of 30 motions (13 %) were rejected and bridged" in warning
     assert "4 times such as 'correlates by 0.03 only'" in warning
-    with pytest.raises(MitsonarError, match=r"none of 30 motions is believed.*30 times such as 'correlates by 0.00 only'"):
+    with pytest.raises(MitsonarError, match=r"none of 30 motions is valid.*30 times such as 'correlates by 0.00 only'"):
         odometry(*told(path, lost=tuple(range(30))))
 
 
