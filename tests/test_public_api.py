@@ -58,6 +58,7 @@ MADE: dict[str, Callable[[Path], Any]] = {
     "DataStore": lambda data: mitsonar.DataStore.open(data),
     "Deforming": lambda _: mitsonar.Deforming(PATH, lambda _time: np.zeros((3, 3), np.float32)),
     "Echogram": lambda _: _sounding().echogram(PATH),
+    "Effort": lambda _: mitsonar.Effort(),
     "Estimate": lambda _: mitsonar.Estimate(mitsonar.Motion(0.1, 0.2, 0.03), np.eye(3)),
     "ImpulseResponses": _responses,
     "Motion": lambda _: mitsonar.Motion(*np.array([0.1, 0.2, 0.3]) / 3),
@@ -82,8 +83,8 @@ MADE: dict[str, Callable[[Path], Any]] = {
 """An object of each public class that has one; a path holds a data set."""
 
 MESSAGES = {"MitsonarError", "MitsonarWarning"}
-ELSEWHERE = {"ImpulsePairs"}
-"""Classes whose objects print only their message, and those that another test prints."""
+ELSEWHERE = {"Comparison", "ImpulsePairs"}
+"""Classes whose objects print only their message, and those that other tests print: a comparison prints its table."""
 
 
 def test_every_public_class_is_printed_by_a_test() -> None:

@@ -139,11 +139,15 @@ def test_covariances_hold_with_noise(pair: Pair, rocks: Simulator, method: str, 
 
 
 def test_direct_tells_heave_apart_from_forward(simulator: Simulator) -> None:
-    """A sonar that has risen by 5 mm seems to have gone back by 3 to 5 mm, unless heave is allowed for."""
+    """A sonar that has risen by 5 mm seems to have gone back by 3 to 5 mm, unless heave is known, or allowed for."""
     motion = Motion(0.005, 0.01, 0.002)
     second = compose(START, motion)
     poses = np.array([START, second._replace(z=second.z + 0.005)])
     frames = simulator.render(Trajectory(poses, np.array([0.0, 0.1])), seed=3)
+    known = np.array(Direct().estimate(frames).motion) - motion
+    assert abs(known[1]) < 3e-4
+    assert frames.poses is not None
+    frames = changed(frames, poses=frames.poses * [1, 1, 0, 1, 1, 1])
     stiff, free = (np.array(Direct(heave_std_m=std).estimate(frames).motion) - motion for std in (0.0, 0.01))
     assert abs(stiff[1]) > 2e-3
     assert abs(free[1]) < abs(stiff[1]) / 2
@@ -195,22 +199,26 @@ def test_one_object_alone_is_not_believed(method: str) -> None:
 @pytest.mark.parametrize(
     "wrong", essence([{"height_m": 4.0}, {"height_m": 1.2}, {"pitch_rad": np.radians(10)}], {"height_m": 4.0})
 )
-def test_wrong_geometry_is_not_believed(rocks: Simulator, method: str, wrong: dict[str, float]) -> None:
-    """First echoes tell another height than the one given."""
-    found = create_estimator(method, **wrong).estimate(two(rocks, Motion(0.01, 0.01, 0.003)))
-    assert not found.valid
-    assert "height" in found.reason
+def test_wrong_geometry_is_reported(rocks: Simulator, method: str, wrong: dict[str, float]) -> None:
+    """First echoes give another height. The given one counts, with a covariance that holds both."""
+    motion = Motion(0.01, 0.01, 0.003)
+    found = create_estimator(method, **wrong).estimate(two(rocks, motion))
+    assert not found.valid or found.about["doubt"].startswith("first echoes give a height of")
+    if found.valid and method == "direct":
+        assert found.covariance is not None
+        off = np.array(found.motion) - motion
+        assert off @ np.linalg.solve(found.covariance, off) < 16
 
 
 # ---------------------------------------------------------------- height and ground
 
 
 def test_height_comes_from_first_echoes(pair: Pair) -> None:
-    """Over a flat floor the steepest rays end at the sonar's height, whatever height is told (within reason)."""
+    """Over a flat floor the steepest rays end at the sonar's height: a given height of 8 % less or more moves it by 2 %."""
     frames = pair(Motion(0.0, 0.0, 0.0))
     for told in (np.full(2, 2.3), np.full(2, 2.7), None):
         attitude = attitude_of(changed(frames, height_m=told), "direct", None, None)
-        assert attitude.height_m == pytest.approx(2.5, rel=0.01)
+        assert attitude.height_m == pytest.approx(2.5, rel=0.02)
         assert attitude.pitch_rad == pytest.approx(np.radians(35))
         assert not attitude.reason
     assert attitude_of(frames, "direct", 2.4, None, relief_m=0.1).height_m == pytest.approx(2.3)
