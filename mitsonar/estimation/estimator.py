@@ -205,7 +205,9 @@ def blank(image: NDArray[np.float32]) -> bool:
 
 
 def correlation_of(first: Real, second: Real) -> float:
-    """Return the correlation coefficient of two arrays of one shape; 0 where either is constant."""
+    """Return the correlation coefficient of two arrays of one shape; 0 where either is constant or empty."""
+    if not first.size:
+        return 0.0
     a, b = first - first.mean(), second - second.mean()
     size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
     return float(np.vdot(a, b)) / size if size > 0 else 0.0

@@ -44,7 +44,8 @@ def write_mcap(
     ``/sonar/imu`` (``sensor_msgs/Imu``), with heights ``/sonar/altitude`` (``sensor_msgs/Range``). Times in headers are
     those of the frames.
 
-    Samples are 8 bit: values in the codings dB and gamma times 255, linear levels as dB over :data:`SPAN_DB`, which
+    Samples are 8 bit: values in the codings dB and gamma times 255, linear levels as dB over
+    :data:`~mitsonar.recordings.mcap_writer.SPAN_DB`, which
     :func:`~mitsonar.recordings.open_recording.open_recording` turns into levels again. A metadata record holds the sonar,
     exact ranges and bearings, the coding, and how samples become levels, in words.
 

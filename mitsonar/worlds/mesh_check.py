@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.io.whole_files import refuse_irregular
 
-__all__ = ["CHECKS", "LARGEST_COORDINATE", "check_counts", "check_mesh"]
+__all__ = ["CHECKS", "LARGEST_COORDINATE", "check_counts", "check_mesh", "refuse_foreign_format"]
 
 LARGEST_COORDINATE = 1e12
 """Largest coordinate of vertices, normals and textures: beyond it single precision overflows."""
@@ -104,6 +104,16 @@ BEGINNINGS = {
     **{b"PXR-USDC": "USD", b"#usda": "USD", b"ISO-10303": "STEP"},
 }
 """Formats by the first bytes of a file."""
+
+
+def refuse_foreign_format(kind: str, filename: str) -> None:
+    """Refuse a shape whose type is a format of models that Mitsuba lacks, such as ``glb``.
+
+    Raises:
+        MitsonarError: it is; the message says how to make a scene of the file.
+    """
+    if kind in FOREIGN_FORMATS:
+        raise MitsonarError(_foreign(filename, FOREIGN_FORMATS[kind], kind))
 
 
 def _format_of(path: Path, content: bytes) -> str:

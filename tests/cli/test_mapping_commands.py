@@ -184,7 +184,7 @@ def test_a_long_run_and_some_of_its_frames(mitsonar: Command, tmp_path: Path) ->
     done = mitsonar("mosaic", tmp_path / "frames.zarr", tmp_path / "out", "-o", tmp_path / "map.tif")
     assert done.returncode == 0, done
     assert "6 frames along the estimated path" in done.stdout
-    assert "warning: 6 of 12 frames have no pose" in done.stderr
+    assert "warning: left out without a pose at their time: 6 of 12 frames" in done.stderr
 
 
 def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:

@@ -259,7 +259,6 @@ def test_networks_that_know_the_geometry_are_given_it(
     assert np.isfinite(estimator.estimate(fewer).motion).all()
     wrong = estimator.estimate(changed(frames, height_m=np.full(2, 6.0)))
     assert not wrong.valid
-    assert "first echoes tell a height" in wrong.reason
 
 
 def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: SonarPairs) -> None:
