@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -268,17 +269,11 @@ def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[Sonar
         return frames, images
     rows, columns = bins // along, beams // across
     cut = (image[: rows * along, : columns * across] for image in images)
-    first, second = (cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA) for one in cut)
+    image = np.stack([cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA) for one in cut]).astype(np.float32)
     axes = (frames.range_m, rows, along), (frames.bearing_rad, columns, across)
     range_m, bearing_rad = (axis[: count * size].reshape(count, size).mean(axis=1) for axis, count, size in axes)
-    fewer = replace(
-        frames,
-        image=np.stack([first, second]),
-        range_m=range_m,
-        bearing_rad=bearing_rad,
-        **dict.fromkeys((*LABELS, "beam_poses")),
-    )
-    return fewer, (first, second)
+    without: dict[str, Any] = dict.fromkeys((*LABELS, "beam_poses"))
+    return replace(frames, image=image, range_m=range_m, bearing_rad=bearing_rad, **without), (image[0], image[1])
 
 
 def _grains(frames: SonarFrames, level: DirectLevel) -> float:

@@ -236,6 +236,7 @@ def registered_over_relief(
             if converged:
                 break
     assert found is not None
+    assert heights is not None
     return v, _assessed(found, prior, heights - at.mean, level, converged=converged)
 
 

@@ -83,7 +83,7 @@ class GroundView:
 
         What lies around them is dark in every frame: an outline that moves with the sonar.
         """
-        return np.logical_and.reduce([lit for _, _, lit in self._pixel_positions])
+        return np.asarray(np.all([lit for _, _, lit in self._pixel_positions], axis=0))
 
     def draw(self, image: Floats, number: int = 0) -> Floats:
         """Draw the image ``(bins, beams)`` of a frame as seen from above ``(rows, columns)``; 0 outside the fan."""
