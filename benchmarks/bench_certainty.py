@@ -28,7 +28,7 @@ from real_recordings import recordings_folder
 
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
-from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.benchmark_sets import RenderedSet
 from mitsonar.mapping.closure import closure_of
 from mitsonar.mapping.open_source import LOOP
@@ -130,7 +130,7 @@ def measure_kind(out: Path, name: str, kind: Kind, noise: str, methods: Sequence
         run("dataset", "make", kind.recipe, *(w for one in changes for w in ("--set", one)), "--seed", seed, "-o", data)
     for word in methods:
         method = network_of(word, coherent="coherent" in name)
-        report(name, noise, method, stored(data, noise, seed), estimator_from(method))
+        report(name, noise, method, stored(data, noise, seed), create_estimator(method))
 
 
 def stored(data: Path, noise: str, seed: int) -> Pairs:
@@ -151,12 +151,12 @@ def measure_slope(out: Path, noise: str, methods: Sequence[str]) -> None:
     truth = motions(source.true.poses)
     for method in methods:
         each = ((source.read([k, k + 1]), truth[k], k // 5) for k in range(len(truth)))
-        report(SLOPE, noise, method, each, estimator_from(method))
+        report(SLOPE, noise, method, each, create_estimator(method))
 
 
 def measure_recordings(folder: Path, method: str) -> None:
     """Print the rows of sonars at rest, and of the loops of a chain."""
-    estimator = estimator_from(method)
+    estimator = create_estimator(method)
     for name, path in RESTING.items():
         source = opened(folder / path).with_contrast()
         report(

@@ -1,18 +1,21 @@
 """What a coherent ping costs, beside the bare tracing of its rays and beside the model physical.
 
-    python benchmarks/bench_coherent.py [--json] [--quick] [--variant cuda_ad_mono]
+    python benchmarks/bench_coherent.py [--json] [--quick] [--presets] [--variant cuda_ad_mono]
 
 Milliseconds of processor time of all threads, and of wall time, medians within one run; rows take turns. `trace` is
 `ray_intersect_preliminary` on the rays of the coherent fan. `beams`: the model physical with pattern two_way. The poses move
-by 10 mm a ping.
+by 10 mm a ping. `--presets`: a frame of each preset over the flat floor instead, from 0.3 of the window's end above it at a
+pitch of 20 deg, and its figure with metre axes (`mitsonar render --cartesian`).
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -24,8 +27,10 @@ import numpy as np
 from bench_render import machine
 from rocky_seabed import mitsuba_scene, rocky_seabed
 
-from mitsonar import Simulator, Sonar, load_scene
-from mitsonar.instruments.named_sonars import preset
+from mitsonar import MitsonarWarning, Simulator, Sonar, SonarFrames, Trajectory, load_scene
+from mitsonar.instruments.named_sonars import named_sonars, preset
+from mitsonar.instruments.ping_groups import frame_period_s, scans
+from mitsonar.plotting.fan_figure import fan_figure
 from mitsonar.simulation.variant import ensure_variant
 
 if TYPE_CHECKING:
@@ -55,12 +60,60 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print for programs")
     parser.add_argument("--quick", action="store_true", help="a small seabed, each once: within a minute")
+    parser.add_argument("--presets", action="store_true", help="a ping of each preset, and its figure")
     parser.add_argument("--variant", help="Mitsuba variant, e.g. cuda_ad_mono")
     asked = parser.parse_args()
     ensure_variant(asked.variant)
+    if asked.presets:
+        of_presets = {"machine": machine(), "rows": [preset_row(name, 3) for name in named_sonars()]}
+        print(json.dumps(of_presets, indent=2) if asked.json else preset_table(of_presets))
+        return
     rows = [measured(case, 1 if asked.quick else 15) for case in cases(asked.quick)]
     result = {"machine": machine(), "rows": rows}
     print(json.dumps(result, indent=2) if asked.json else table(result))
+
+
+def preset_row(name: str, repeats: int) -> dict[str, Any]:
+    """Measure a frame of a preset, of a head that turns a sweep: milliseconds of the frame and of its figure, medians."""
+    sonar = preset(name)
+    case = Case(name, load_scene("flat_floor"), sonar, 0.3 * sonar.range_max, 20)
+    simulator = Simulator(case.scene, sonar)
+    ping = partial(rendered_frames, simulator, case)
+    frames = ping(0)
+    work: dict[str, Callable[[int], object]] = {"frame": ping, "cartesian": lambda _: drawn(frames)}
+    times = turns(work, repeats)
+    return {"name": name, "beams": sonar.beams, "bins": sonar.range_bins, **{key: cpu for key, (cpu, _) in times.items()}}
+
+
+def rendered_frames(simulator: Simulator, case: Case, ping: int) -> SonarFrames:
+    """Render one frame of a case, as `mitsonar render` does."""
+    poses = np.repeat(case.pose(ping), 2 if scans(case.sonar) else 1, axis=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MitsonarWarning)
+        return simulator.render(Trajectory(poses, frame_period_s(case.sonar) * np.arange(len(poses), dtype=float)))
+
+
+def drawn(frames: SonarFrames) -> bytes:
+    """Draw the figure of a frame."""
+    buffer = io.BytesIO()
+    fan_figure(frames, 0).savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
+
+
+def preset_table(result: dict[str, Any]) -> str:
+    """Format the times of presets as Markdown."""
+    m = result["machine"]
+    lines = [
+        f"{m['cpu']}, {m['cores']} cores, {m['variant']}, Mitsuba {m['mitsuba']}, {m['date']}",
+        "",
+        "| preset | beams x bins | s of CPU a frame | with `--cartesian`, more |",
+        "|---|---|---|---|",
+    ]
+    lines += [
+        f"| `{row['name']}` | {row['beams']} x {row['bins']} | {row['frame'] / 1e3:.2f} | {row['cartesian'] / 1e3:.2f} |"
+        for row in result["rows"]
+    ]
+    return "\n".join(lines)
 
 
 def cases(quick: bool) -> Iterator[Case]:

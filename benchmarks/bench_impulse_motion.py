@@ -4,6 +4,7 @@
     python benchmarks/bench_impulse_motion.py noise --out bench/impulse
     python benchmarks/bench_impulse_motion.py courses --out bench/impulse
     python benchmarks/bench_impulse_motion.py figure --out bench/impulse
+    python benchmarks/bench_impulse_motion.py places [--samples 100]
     python benchmarks/bench_impulse_motion.py --quick      # all four, five samples of a small field, kept nowhere
 
 Samples are made like those of the data sets `impulse-*`, over 5 scenes that no network has seen (seed 4201). OUT keeps them,
@@ -11,6 +12,8 @@ so that a stopped run is resumed. `rows`: every row of table 5.2 by each estimat
 bound. `noise`: the standard row at signal-to-noise ratios, two pings of different scenes, one ping twice, and a wrong height
 or sound speed. `courses`: trajectories 1 to 6 over flat objects, with positions 50 ms apart and each motion from ten pings
 (--pings 2: from the pings at both positions; neighbours then resolve ambiguous motions).
+`places`: two pings 1/180 s apart at 1 m/s to starboard and 0.5 m/s forward, as in the guide, at places and headings drawn at
+random over the scene `hydrophones` (stones on a seabed) and over its seabed alone.
 `figure`: figure 5.11, the sinusoid by impulse responses, and by images of a DIDSON 2.5 m above the same field (`direct`).
 """
 
@@ -34,7 +37,16 @@ import numpy as np
 from bench_impulse import cpu
 from numpy.typing import NDArray
 
-from mitsonar import ChannelSimulator, ImpulseResponses, MitsonarError, Simulator, load_recipe, load_scene, load_sonar
+from mitsonar import (
+    ChannelSimulator,
+    ChannelSonar,
+    ImpulseResponses,
+    MitsonarError,
+    Simulator,
+    load_recipe,
+    load_scene,
+    load_sonar,
+)
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.response_packing import with_noise
@@ -367,11 +379,11 @@ def figure(asked: argparse.Namespace) -> None:
     flown = course_of(asked, "sinusoid", Pose(0, 0, 2.5, pitch=np.radians(35)))
     sonar = load_sonar("didson300").replace(frame_rate_hz=20.0)
     frames = Simulator(scene, sonar).render(flown)
-    seen = odometry(frames, create_estimator("direct"), start=Pose(*flown.poses[0]))
+    seen = odometry(frames, create_estimator("direct"), start=Pose.from_row(flown.poses[0]))
     path = asked.out / f"course-sinusoid-{asked.model}-{asked.pings}-correlation.json"
     received = np.array(json.loads(path.read_text()))[:, :3]
     driven_by = {
-        "impulse responses, correlation of ten pings": path_of(received, Pose(*flown.poses[0]), flown.time_s).poses,
+        "impulse responses, correlation of ten pings": path_of(received, Pose.from_row(flown.poses[0]), flown.time_s).poses,
         "DIDSON images, direct": seen.path.poses,
     }
     drawn = Figure(figsize=(10, 5), layout="constrained")
@@ -393,7 +405,48 @@ def figure(asked: argparse.Namespace) -> None:
     drawn.savefig(asked.out / "sinusoid.png", dpi=110)
 
 
-PARTS = {"rows": rows, "noise": noise, "courses": courses, "figure": figure}
+def places(asked: argparse.Namespace) -> None:
+    """Print errors and processor time of the guide's motion at many places."""
+    import mitsuba as mi
+
+    print(
+        "| ground | estimator | RMSE mm | median of distances mm | nees / 2, median | valid | ms of processor time |\n"
+        + "|---" * 7
+        + "|"
+    )
+    stones = load_scene("hydrophones")
+    seabed = mi.load_dict({"type": "scene", "seabed": next(one for one in stones.shapes() if one.id() == "seabed")})
+    for ground, scene in (("stones", stones), ("seabed alone", seabed)):
+        simulator = ChannelSimulator(scene, ChannelSonar(frame_rate_hz=180))
+        for name in ("correlation", "likelihood"):
+            print(
+                f"| {ground} | `{name}` | {place_cells(name, simulator, 5 if asked.quick else asked.samples)} |", flush=True
+            )
+
+
+def place_cells(name: str, simulator: ChannelSimulator, samples: int) -> str:
+    """Format the errors of an estimator at places drawn at random, the same for all."""
+    rng, motion = np.random.default_rng(SEED), np.array([1.0, 0.5, 0.0]) / 180
+    errors, nees, valid, ms = [], [], [], []
+    for _ in range(samples):
+        (x, y), heading = rng.uniform(-4, 4, 2), rng.uniform(0, 2 * np.pi)
+        pair = path_of(motion[None], Pose(x, y, 10.0, 0.0, 0.0, heading), np.array([0.0, 1 / 180]))
+        responses = simulator.responses(pair, velocities(pair))
+        begun = time.process_time()
+        found = create_estimator(name).estimate(responses)
+        ms.append(1e3 * (time.process_time() - begun))
+        error = (np.array(found.motion) - motion)[:2]
+        errors.append(1e3 * error)
+        valid.append(found.valid)
+        if found.covariance is not None:
+            nees.append(error @ np.linalg.solve(found.covariance[:2, :2], error) / 2)
+    rmse = " / ".join(f"{value:.3f}" for value in np.sqrt(np.square(errors).mean(axis=0)))
+    distance = np.median(np.hypot(*np.transpose(errors)))
+    known = f"{np.median(nees):.2f}" if nees else "-"
+    return f"{rmse} | {distance:.3f} | {known} | {sum(valid)} of {samples} | {np.median(ms):.0f}"
+
+
+PARTS = {"rows": rows, "noise": noise, "courses": courses, "figure": figure, "places": places}
 
 if __name__ == "__main__":
     main()

@@ -36,7 +36,7 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.estimation.height.direct_height import DirectHeight
 from mitsonar.estimation.learned.view_network import ViewNetwork
-from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.view_source import open_views
@@ -356,7 +356,7 @@ def halves(asked: argparse.Namespace) -> None:
     ):
         row(asked, name, recipe, learnt, {"unseen scenes": (other, "all")})
         if asked.frames is not None:
-            network = estimator_from(f"{asked.out / 'runs' / name}:force=1")
+            network = create_estimator(f"{asked.out / 'runs' / name}:force=1")
             frames = lamprey(asked.frames)
             pairs = [network.estimate(frames.select(slice(k, k + 2))) for k in range(len(frames) - 1)]
             motions = in_units(np.array([one.motion for one in pairs]))

@@ -124,7 +124,7 @@ def motions(data: str, noise: NoiseModel, poses: int) -> None:
             assert oracle is not None
             height = float(pairs.store.read("height_m", int(frame)))
             signal, level = spectra_of(seen, noise)
-            moving = derivative_of(pairs.recipe.instrument, Pose(*pairs.pose[frame]), height)
+            moving = derivative_of(pairs.recipe.instrument, Pose.from_row(pairs.pose[frame]), height)
             found["oracle, pixels (rays)"].append(oracle.std(2))
             found["scene known"].append(least(signal / (2 * level), moving))
             found["scene unknown"].append(least(signal**2 / (level**2 + 2 * signal * level), moving))

@@ -337,7 +337,7 @@ def run_trajectory(job: Job, out: Path) -> Result:
     moved = motions(frames.poses)
     keep(job, out, found, moved)
     row = scores(found, moved) | {"ms": each, "paths": {}}
-    start = Pose(*frames.poses[0])
+    start = Pose.from_row(frames.poses[0])
     for name, series in smoothed(found, frames.time_s).items():
         path = path_of(series.motions, start, series.time_s)
         path.save_tum(out / f"{job.name}-{name}.tum")

@@ -27,7 +27,7 @@ GROUPS = {
     "Scenes and sonars": ("load_scene", "load_sonar", "Sonar", "ChannelSonar", "load_sounder", "Sounder"),
     "Poses and paths": ("Pose", "Motion", "Trajectory"),
     "Simulation": ("Simulator", "ChannelSimulator", "SounderSimulator", "load_noise", "NoiseModel"),
-    "Bodies that move": ("Deforming", "load_meshes", "load_motions", "range_rates", "particle_mesh", "net_mesh"),
+    "Bodies that move": ("Deforming", "load_meshes", "load_motions", "range_rates", "particle_mesh", "fishing_net_mesh"),
     "Sea surface": ("SeaSurface",),
     "Several sensors": ("VehicleSimulator", "Mounted", "load_vehicle"),
     "Environments": (
@@ -40,6 +40,8 @@ GROUPS = {
     "Estimation and mapping": (
         "create_estimator",
         "Estimate",
+        "compare",
+        "Comparison",
         "odometry",
         "VehicleSensors",
         "load_sensors",
@@ -66,6 +68,18 @@ GROUPS = {
 come last."""
 
 
+OPENING = """There are three ways to read something, by what it is:
+
+| it is | call | then |
+|---|---|---|
+| what a record's `save` wrote | `load` of its class: `SonarFrames.load`, `Trajectory.load` ... | all is in memory |
+| a name, or one of several kinds of files | `load_...`: `load_scene`, `load_sonar`, `load_frames` ... | all is in memory |
+| larger than the memory | `mitsonar.open_recording`, `DataStore.open` | parts are read when they are needed |
+
+`load_frames` reads frames wherever they are: of a run, a data set or a recording. `SonarFrames.load` reads those of a run
+with their labels. A path that is not there, or holds something else, is a `MitsonarError` that says what to give."""
+
+
 def python_page() -> str:
     """Return the page of the public Python names."""
     known = {name for names in GROUPS.values() for name in names}
@@ -75,6 +89,7 @@ def python_page() -> str:
         "These names are in `mitsonar` itself, those with dots in its modules. They are loaded when they are first used: "
         "`import mitsonar` loads no Mitsuba and no torch. Errors that a user can cause are `MitsonarError`, with one "
         "sentence.",
+        OPENING,
     ]
     for title, names in groups.items():
         public = [name for name in names if name in mitsonar.__all__ or "." in name]

@@ -87,7 +87,7 @@ def notebook_markdown(source: str) -> str:
         text = "".join(cell["source"])
         parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
         if not number:
-            parts.append(f"This page shows the notebook `{source}`. Run it with Jupyter to see its figures.")
+            parts.append(f"This page shows the notebook `{source}`. Run it with Jupyter to change it.")
         parts += [part for output in cell.get("outputs", []) if (part := _result(output))]
     return "\n\n".join(parts)
 
@@ -96,7 +96,9 @@ def _result(output: CellOutput) -> str:
     """Format the output of a cell as Markdown."""
     data = output.get("data", {})
     if "image/png" in data:
-        picture = base64.b64encode(base64.b64decode(data["image/png"])).decode()
+        picture = base64.b64encode(base64.b64decode("".join(data["image/png"]))).decode()
         return f"![figure](data:image/png;base64,{picture})"
+    if "text/markdown" in data:
+        return "".join(data["text/markdown"])
     text = "".join(output.get("text", data.get("text/plain", "")))
     return f"```text\n{text.rstrip()}\n```" if text else ""

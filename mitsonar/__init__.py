@@ -28,15 +28,20 @@ if TYPE_CHECKING:
     from mitsonar.environments.sonar_env import SonarEnv
     from mitsonar.environments.sonar_vector_env import SonarVectorEnv
     from mitsonar.errors import MitsonarError, MitsonarWarning
+    from mitsonar.estimation.benchmark_tables import Comparison
+    from mitsonar.estimation.comparison_run import compare
     from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
     from mitsonar.estimation.estimator import Estimate
     from mitsonar.estimation.named_estimators import create_estimator, load_checkpoint
+    from mitsonar.geometry.scan_conversion import to_cartesian
     from mitsonar.instruments.channel_sonar import ChannelSonar
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.instruments.named_sonars import load_sonar
     from mitsonar.instruments.named_sounders import load_sounder
     from mitsonar.instruments.sounder import Sounder
+    from mitsonar.mapping.illumination import illumination
     from mitsonar.mapping.mosaic import build_mosaic
+    from mitsonar.mapping.motion_series import path_of
     from mitsonar.mapping.odometry import odometry
     from mitsonar.mapping.open_frames import load_frames
     from mitsonar.mapping.sensor_files import load_sensors, save_sensors
@@ -46,6 +51,8 @@ if TYPE_CHECKING:
     from mitsonar.motion.deforming import Deforming
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.plotting.data_sheet import sheet_figure
+    from mitsonar.plotting.map_figure import mosaic_figure, path_figure
     from mitsonar.recordings.mcap_writer import write_mcap
     from mitsonar.recordings.open_recording import open_recording
     from mitsonar.records.echogram import Echogram
@@ -56,18 +63,22 @@ if TYPE_CHECKING:
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.moving_files import load_meshes, load_motions
-    from mitsonar.simulation.scene import load_scene
+    from mitsonar.simulation.scene import load_scene, shipped_trajectory, sonar_in
     from mitsonar.simulation.sounding import SounderSimulator
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
+    from mitsonar.training.document_tables import load_tables
+    from mitsonar.training.reproduce import Effort, reproduce
     from mitsonar.worlds.sea_surface import SeaSurface
-    from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
+    from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
 
 __all__ = [
     "ChannelSimulator",
     "ChannelSonar",
+    "Comparison",
     "DataStore",
     "Deforming",
     "Echogram",
+    "Effort",
     "Estimate",
     "ImpulsePairs",
     "ImpulseResponses",
@@ -92,8 +103,11 @@ __all__ = [
     "VehicleSensors",
     "VehicleSimulator",
     "build_mosaic",
+    "compare",
     "cramer_rao_bound",
     "create_estimator",
+    "fishing_net_mesh",
+    "illumination",
     "load_checkpoint",
     "load_frames",
     "load_meshes",
@@ -104,24 +118,34 @@ __all__ = [
     "load_sensors",
     "load_sonar",
     "load_sounder",
+    "load_tables",
     "load_vehicle",
     "make_dataset",
-    "net_mesh",
+    "mosaic_figure",
     "odometry",
     "open_recording",
     "particle_mesh",
+    "path_figure",
+    "path_of",
     "range_rates",
+    "reproduce",
     "save_sensors",
+    "sheet_figure",
+    "shipped_trajectory",
     "simulated_sensors",
+    "sonar_in",
+    "to_cartesian",
     "write_mcap",
 ]
 
 _MODULES = {
     "ChannelSimulator": "simulation.channel",
     "ChannelSonar": "instruments.channel_sonar",
+    "Comparison": "estimation.benchmark_tables",
     "DataStore": "datasets.store",
     "Deforming": "motion.deforming",
     "Echogram": "records.echogram",
+    "Effort": "training.reproduce",
     "Estimate": "estimation.estimator",
     "ImpulsePairs": "datasets.response_pairs",
     "ImpulseResponses": "records.impulse_responses",
@@ -136,9 +160,9 @@ _MODULES = {
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.imaging_sonar",
     "SonarEnv": "environments.sonar_env",
-    "SonarVectorEnv": "environments.sonar_vector_env",
     "SonarFrames": "records.sonar_frames",
     "SonarPairs": "datasets.torch_pairs",
+    "SonarVectorEnv": "environments.sonar_vector_env",
     "Sounder": "instruments.sounder",
     "SounderSimulator": "simulation.sounding",
     "Soundings": "records.soundings",
@@ -146,8 +170,11 @@ _MODULES = {
     "VehicleSensors": "mapping.vehicle_sensors",
     "VehicleSimulator": "simulation.vehicle",
     "build_mosaic": "mapping.mosaic",
+    "compare": "estimation.comparison_run",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
+    "fishing_net_mesh": "worlds.water_bodies",
+    "illumination": "mapping.illumination",
     "load_checkpoint": "estimation.named_estimators",
     "load_frames": "mapping.open_frames",
     "load_meshes": "simulation.moving_files",
@@ -158,15 +185,23 @@ _MODULES = {
     "load_sensors": "mapping.sensor_files",
     "load_sonar": "instruments.named_sonars",
     "load_sounder": "instruments.named_sounders",
+    "load_tables": "training.document_tables",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",
-    "net_mesh": "worlds.water_bodies",
+    "mosaic_figure": "plotting.map_figure",
     "odometry": "mapping.odometry",
-    "particle_mesh": "worlds.water_bodies",
     "open_recording": "recordings.open_recording",
+    "particle_mesh": "worlds.water_bodies",
+    "path_figure": "plotting.map_figure",
+    "path_of": "mapping.motion_series",
     "range_rates": "records.range_rates",
+    "reproduce": "training.reproduce",
     "save_sensors": "mapping.sensor_files",
+    "sheet_figure": "plotting.data_sheet",
+    "shipped_trajectory": "simulation.scene",
     "simulated_sensors": "mapping.simulated_sensors",
+    "sonar_in": "simulation.scene",
+    "to_cartesian": "geometry.scan_conversion",
     "write_mcap": "recordings.mcap_writer",
 }
 

@@ -18,16 +18,18 @@ __all__ = [
     "MitsonarWarning",
     "argument",
     "complaint",
+    "counted",
     "explain_missing",
     "meant",
     "nearest_names",
+    "refuse_unknown",
     "shortened",
 ]
 
 EXTRAS = {
     "distributed": ("data", "making a data set on several processes"),
     "dask": ("data", "making a data set on several processes"),
-    "trimesh": ("meshes", "worlds and models"),
+    "trimesh": ("data,meshes", "worlds and models"),
     "collada": ("meshes", "reading a .dae model"),
     "lxml": ("meshes", "reading a .dae model"),
     "pxr": ("usd", "reading USD"),
@@ -49,7 +51,7 @@ EXTRAS = {
     "small_gicp": ("bench", "the estimator cfar-gicp"),
     "pystackreg": ("bench", "the estimator stackreg"),
 }
-"""Optional packages: the extra that installs each, and what needs it."""
+"""Optional packages: the extras that install each, by the tasks that need it, and what these tasks are."""
 
 LONGEST_KEY = 60
 """Letters of a key in a message; those of a stranger's file may be of any length."""
@@ -68,8 +70,8 @@ class MitsonarError(ValueError):
         """Return the message in the words of its reader.
 
         Args:
-            options: the option for each argument that :func:`argument` names, ``{"height_m": "--height"}``. Other arguments
-                keep their Python names.
+            options: the option for each argument that :func:`mitsonar.errors.argument` names,
+                ``{"height_m": "--height"}``. Other arguments keep their Python names.
         """
 
         def typed(found: re.Match[str]) -> str:
@@ -103,7 +105,8 @@ def explain_missing(error: ModuleNotFoundError) -> MitsonarError:
     if package not in EXTRAS:
         raise error
     extra, what = EXTRAS[package]
-    return MitsonarError(f"{what} needs {package}, which is not installed: pip install 'mitsonar[{extra}]'")
+    needs = "need" if what.endswith("s") else "needs"
+    return MitsonarError(f"{what} {needs} {package}, which is not installed: pip install 'mitsonar[{extra}]'")
 
 
 def nearest_names(wrong: str, names: Iterable[str]) -> str:
@@ -114,10 +117,32 @@ def nearest_names(wrong: str, names: Iterable[str]) -> str:
     return f"did you mean {' or '.join(near)}? Known: {', '.join(known)}" if near else f"known: {', '.join(known)}"
 
 
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun, for messages: ``1 frame``, ``1,200 frames``."""
+    return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
+
+
 def meant(wrong: object, names: Iterable[str]) -> str:
     """Suggest the nearest of some names, for the end of a message that lists them; empty where none is near."""
     near = difflib.get_close_matches(str(wrong).lower(), [str(name) for name in names], n=1, cutoff=0.5)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def refuse_unknown(given: Iterable[str], known: Iterable[str], owner: str) -> None:
+    """Refuse keyword arguments of other names.
+
+    Args:
+        given: names.
+        known: those that there are.
+        owner: of the arguments, for the message.
+
+    Raises:
+        MitsonarError: an unknown name, with the nearest one and all that are known.
+    """
+    names = list(known)
+    for name in given:
+        if name not in names:
+            raise MitsonarError(f"{owner} has no argument {name}: {nearest_names(name, names)}")
 
 
 def complaint(error: ValidationError, model: type[BaseModel], what: str, see: str = "") -> str:

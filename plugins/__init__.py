@@ -48,8 +48,11 @@ def _watch_variants() -> None:
 
 
 def _register(_old: str | None, new: str | None) -> None:
-    """Load the plugin modules for the variant that is set now; scalar variants cannot run plugins written in Python."""
-    if new is None or not new.startswith(("llvm", "cuda")):
+    """Load the plugin modules for the variant that is set now; in a scalar variant their names only, which refuse."""
+    if new is None:
+        return
+    if not new.startswith(("llvm", "cuda")):
+        importlib.import_module(f"{__name__}.scalar_variants").register_refusals(new)
         return
     for name in PLUGINS:
         module = sys.modules.get(f"{__name__}.{name}")

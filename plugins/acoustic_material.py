@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import mitsuba as mi
@@ -53,7 +54,8 @@ class AcousticMaterial(mi.BSDF):
         super().__init__(props)
         self.material = _material(str(props.get("material", "")))
         self.reflectance = cast(mi.Texture, props.get_texture("reflectance", SHADE))
-        self.mean = _mean(self.reflectance, number_of_property(props, "reflectance_mean", 0.0))
+        self.given_mean = number_of_property(props, "reflectance_mean", 0.0)
+        self.mean = _mean(self.reflectance, self.given_mean)
         self.mu = min(max(single_mu(self.material), FAINTEST), LOUDEST)
         shown = {"type": "twosided", "below": {"type": "diffuse", "reflectance": self.reflectance}}
         self.shown = cast(mi.BSDF, load_dict(shown))
@@ -97,6 +99,10 @@ class AcousticMaterial(mi.BSDF):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Show the reflectance to ``mi.traverse``."""
         callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+        """Read the mean of the reflectance anew, which has changed."""
+        self.mean = _mean(self.reflectance, self.given_mean)
 
     def to_string(self) -> str:
         """Return one line for Mitsuba's logs."""

@@ -9,6 +9,7 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from mitsonar.arrays import DeviceArray
+from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar, is_imaging_sonar
 from mitsonar.plugins.surfaces import Hit, Surfaces
@@ -58,6 +59,8 @@ class Echo(ADIntegrator):
     """
 
     def __init__(self, props: mi.Properties) -> None:
+        if given := list(props.keys()):  # before the base class reads max_depth, rr_depth and hide_emitters
+            raise MitsonarError(f"the integrator echo has no properties: got {', '.join(given)}; leave them out")
         super().__init__(props)  # type: ignore[no-untyped-call]  # Mitsuba's own class has no types
         self._fan: Fan | None = None
         self._edges = False

@@ -153,6 +153,18 @@ class Surfaces:
         dr.eval(tables.arrays())
         return tables
 
+    def adopt(self, now: Surfaces) -> bool:
+        """Take over the tables of the same scene as it is now.
+
+        Returns:
+            False, and nothing is taken over, where launches that were recorded with these tables do not fit the new ones.
+        """
+        if any(getattr(self, name) != getattr(now, name) for name in ("lawful", "textured", "foreign", "notes")):
+            return False
+        for name in ("materials", *self.arrays()):
+            setattr(self, name, getattr(now, name))
+        return True
+
     def turn_facets(self, mesh: mi.Mesh) -> None:
         """Read the normals of a mesh anew: its vertices have moved. Reflectivities stay."""
         first = int(self.shapes[4 * registry_index(mesh)])

@@ -294,6 +294,9 @@ class Nearby:
     def window_range(self, pose: Any, ping: int) -> tuple[float, float]:
         return 0.1, 99.0
 
+    def buried(self, pose: Any) -> str:
+        return ""
+
 
 def make_odometry(folder: Path) -> None:
     from mitsonar.estimation.estimator import Estimate

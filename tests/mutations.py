@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -83,6 +84,59 @@ def changed_text(rng: Rng, content: bytes) -> bytes:
         place, strange = int(rng.integers(len(words))), TEXTS[int(rng.integers(len(TEXTS)))]
         words[place] = strange if rng.random() < 0.6 else words[place] + strange
     return " ".join(words).encode()
+
+
+PLUGINS = {
+    "shape": "sphere rectangle disk cube cylinder ply obj shapegroup instance sdfgrid linearcurve",
+    "bsdf": "diffuse twosided mask conductor roughplastic principled blendbsdf null acoustic_material",
+    "texture": "bitmap checkerboard cell_noise perlin_noise mesh_attribute trajectory uniform volume",
+    "sensor": "imaging_sonar channel_sonar perspective orthographic distant",
+    "emitter": "constant point area envmap spot sunsky",
+    "integrator": "path echo direct volpath aov",
+}
+"""Plugins that may stand in each other's place, by the element that names them."""
+
+NUMBERS = [*("0", "-1", "1", "0.5", "2", "7", "90", "1e-30", "1e-6", "1e6", "1e11", "-1e11"), "nan", "inf", "3.4e38"]
+NUMBERS += ["2147483648", "-9223372036854775808"]
+WORDS = ["", "true", "$size", "$nothing", "none", "mud", "seabed.ply", "grain.png", ".", "/dev/null", "seabed", "x" * 300]
+"""What may stand as a value in a scene."""
+
+
+def changed_scene(rng: Rng, content: bytes) -> bytes:
+    """A scene's XML that is well formed and has one to three other plugins, properties, values or places."""
+    root = ElementTree.fromstring(content)
+    for _ in range(1 if rng.random() < 0.6 else 3):
+        parents = [element for element in root.iter() if len(element)]
+        parent = parents[int(rng.integers(len(parents)))]
+        one = parent[int(rng.integers(len(parent)))]
+        others = list(root.iter())
+        other = others[int(rng.integers(len(others)))]
+        match int(rng.choice([0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6])):
+            case 0 if one.tag in PLUGINS:
+                one.set("type", str(rng.choice(PLUGINS[one.tag].split())))
+                if rng.random() < 0.7:  # what the other plugin does not know
+                    one[:] = [inner for inner in one if inner.tag in ("transform", "bsdf", "ref")]
+            case 0 | 1 if keys := [name for name in one.attrib if name not in ("name", "type", "id")]:
+                key = str(rng.choice(keys))
+                numeric = one.get(key, "")[:1] in "-0123456789$" and rng.random() < 0.9
+                values = NUMBERS if numeric else WORDS
+                one.set(key, values[int(rng.integers(len(values)))])
+            case 2:
+                made = copy.deepcopy(one)
+                for inner in made.iter():
+                    inner.attrib.pop("id", None) if inner.tag != "ref" else None
+                parent.append(made)
+            case 3:
+                parent.remove(one)
+            case 4:
+                other.append(copy.deepcopy(one))
+            case 5 if one.get("name") and other.get("name"):
+                one.set("name", str(other.get("name")))
+            case _ if one.get("value") and other.get("value"):
+                one.set("value", str(other.get("value")))
+            case _:
+                pass
+    return ElementTree.tostring(root)
 
 
 def changed_value(rng: Rng, value: Any) -> Any:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import json
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +22,8 @@ from typing import NamedTuple
 import pytest
 import yaml
 from helpers import PROGRAM, Command
+
+import mitsonar
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -156,6 +160,20 @@ def test_what_is_not_run_says_why() -> None:
         assert text.count("<!-- notest") == sum(block.reason is not None for block in blocks_of(path)), path
         assert all(block.reason != "" for block in blocks_of(path)), path
         assert text.count("\n```sh") == sum(block.kind == "sh" for block in blocks_of(path)), path
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks" / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_use_public_names_and_store_their_results(path: Path) -> None:
+    """No module within mitsonar, no other process; results with pictures, no path of the machine that ran it."""
+    text = path.read_text(encoding="utf-8")
+    cells = [cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+    code = "\n".join("".join(cell["source"]) for cell in cells)
+    assert not re.findall(r"(?:from|import) mitsonar\.|subprocess", code)
+    assert not set(re.findall(r"mitsonar\.(\w+)", code)) - set(mitsonar.__all__)
+    assert all(cell["execution_count"] for cell in cells), "run it, and store it with its results"
+    assert '"image/png"' in text
+    assert tempfile.gettempdir() not in text
+    assert len(text) < 400_000, "store smaller pictures"
 
 
 def test_a_block_that_fails_fails_its_page(tmp_path: Path, mitsonar: Command) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import tomllib
 from collections.abc import Iterator
 from functools import cache
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 from helpers import Command, run_python
+
+from mitsonar.errors import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -272,7 +275,23 @@ def test_a_command_names_the_extra_that_it_lacks(tmp_path: Path) -> None:
     said = run_python(script % (tmp_path / "rocks"), block=("trimesh",))
     assert not (tmp_path / "rocks").exists()
     assert "trimesh" in said
-    assert "pip install 'mitsonar[meshes]'" in said
+    assert "pip install 'mitsonar[data,meshes]'" in said
+
+
+DISTRIBUTIONS = {
+    **{"dask": "distributed", "collada": "pycollada", "pxr": "usd-core", "cv2": "opencv-python-headless"},
+    **{"sklearn": "scikit-learn", "foxglove": "foxglove-sdk", "rerun": "rerun-sdk"},
+}
+"""Packages whose distribution has another name, or comes with another one."""
+
+
+@pytest.mark.parametrize("package", EXTRAS)
+def test_the_extras_of_messages_install_what_is_missing_and_are_documented(package: str) -> None:
+    extras, table = EXTRAS[package][0].split(","), (ROOT / "docs" / "start.md").read_text()
+    for extra in extras:
+        needs = {re.split(r"[<>=\[]", one)[0] for one in PROJECT["project"]["optional-dependencies"][extra]}
+        assert DISTRIBUTIONS.get(package, package) in needs, f"{package} is not in the extra {extra}"
+        assert f"| `{extra}` |" in table, f"docs/start.md does not name the extra {extra}"
 
 
 @pytest.mark.thorough

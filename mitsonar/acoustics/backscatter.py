@@ -16,21 +16,23 @@ party quotes from the named document, ``ours`` a choice or our own arithmetic.
 from __future__ import annotations
 
 import math
+import os
 from functools import cache, lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 import yaml
 from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from mitsonar.acoustics.grain_size import sediment_of
 from mitsonar.acoustics.rough_fluid import Sediment, rough_fluid_sigma
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, complaint, nearest_names, shortened
+from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.io.checked_model import CheckedModel
 from mitsonar.io.plain_data import PlainValue
 from mitsonar.io.whole_files import read_yaml
 
@@ -68,10 +70,12 @@ LARGEST_MU = {"lambert": 1 / math.pi, "lommel-seeliger": 1 / (4 * math.pi)}
 """The mu of each law at which some direction of arrival is scattered without loss."""
 
 
-class Material(BaseModel):
+class Material(CheckedModel):
     """What a surface is made of: a law of scattering with its numbers, where they hold and where they come from."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    called: ClassVar[str] = "material"
 
     name: str = Field("custom", max_length=200, description="what the material is called")
     about: str = Field("", max_length=2000, description="what it stands for")
@@ -103,10 +107,7 @@ class Material(BaseModel):
         Raises:
             MitsonarError: an unknown key, a value outside its limits, or keys that do not fit the law.
         """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "material")) from None
+        return cls(**fields)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -308,7 +309,7 @@ def material(name_or_file: str | Path) -> Material:
     """
     text = str(name_or_file)
     if not text.lower().endswith((".yaml", ".yml")):
-        if text in named_materials() or not Path(text).exists():
+        if text in named_materials() or not os.path.exists(text):
             return Material.create(**_named(text))
         raise MitsonarError(f"a material's file ends in .yaml: got {text}; rename it, or name a material")
     fields = read_yaml(text, "material file", " or a material's name")

@@ -7,17 +7,18 @@ It is kept as published, for its tables: a pixel's law depends on whether it hol
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 from scipy.special import ndtr
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, complaint, meant, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.checked_model import CheckedModel
 from mitsonar.io.whole_files import read_yaml
 
 __all__ = [
@@ -34,7 +35,7 @@ __all__ = [
 MASK = 0xFFFFFFFF
 
 
-class NoiseModel(BaseModel):
+class NoiseModel(CheckedModel):
     """Gaussian of the empty pixels and Rayleigh of the others, in fractions of the largest pixel value.
 
     This is the noise of the model ``thesis``, and no model of a real sonar's. A real receiver adds noise of one law to every
@@ -43,6 +44,8 @@ class NoiseModel(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str] = "noise"
 
     mean: float = Field(0.0, ge=0, le=1, description="mean of the Gaussian of empty pixels")
     std: float = Field(0.0, ge=0, le=1, description="its standard deviation")
@@ -344,9 +347,9 @@ def load_noise(text: str) -> NoiseModel:
             fields = read_yaml(text, "noise file")
             if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
                 raise MitsonarError(f"{text} must hold the keys mean, std, scale, each 0..1")
-            return NoiseModel(**fields)
+            return NoiseModel.model_validate(fields)
         mean, std, scale = (float(word) for word in text.split(","))
-        return NoiseModel(mean=mean, std=std, scale=scale)
+        return NoiseModel.model_validate({"mean": mean, "std": std, "scale": scale})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

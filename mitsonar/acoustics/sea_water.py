@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from mitsonar.arrays import AnyArray
-from mitsonar.errors import MitsonarError, complaint, meant, shortened
+from mitsonar.errors import MitsonarError, meant, shortened
+from mitsonar.io.checked_model import CheckedModel
 
 __all__ = [
     "FORMULAS",
@@ -34,10 +35,12 @@ SALTY_PSU = 1.0
 """Salinity below which water counts as fresh: salts then add little to the absorption [psu]."""
 
 
-class Water(BaseModel):
+class Water(CheckedModel):
     """The water that sound travels in. The default is a cool sea at its surface; ``salinity_psu`` 0 is a lake or a tank."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    called: ClassVar[str] = "water"
 
     temperature_c: float = Field(10.0, ge=-6, le=40, description="temperature [deg C]")
     salinity_psu: float = Field(35.0, ge=0, le=50, description="salinity [psu]; 0 is fresh water")
@@ -51,10 +54,7 @@ class Water(BaseModel):
         Raises:
             MitsonarError: an unknown key, a value outside its limits.
         """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "water")) from None
+        return cls(**fields)
 
 
 # ---------------------------------------------------------------- absorption

@@ -8,7 +8,16 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.sea_water import Water, absorption_db_per_m, absorption_warning
 from mitsonar.instruments.imaging_sonar import Sonar
 
-__all__ = ["absorption_line", "gain_of", "loss_notes", "loss_of", "sonar_absorption", "undone_absorption", "water_of"]
+__all__ = [
+    "absorption_line",
+    "gain_of",
+    "loss_notes",
+    "loss_of",
+    "noise_of",
+    "sonar_absorption",
+    "undone_absorption",
+    "water_of",
+]
 
 
 EXTRAPOLATED_HZ = 1e6
@@ -66,3 +75,15 @@ def undone_absorption(sonar: Sonar) -> NDArray[np.float64]:
 def gain_of(sonar: Sonar) -> NDArray[np.float64]:
     """Return the time-varying gain of intensities ``(bins,)``: R^gain_exponent, and absorption where it is undone."""
     return np.asarray(sonar.range_m**sonar.gain_exponent * undone_absorption(sonar), dtype=np.float64)
+
+
+def noise_of(sonar: Sonar) -> NDArray[np.float64]:
+    """Return the mean power of the receiver's noise in each bin, after the gain ``(bins,)``; 0 without noise.
+
+    It is relative to the source, as echoes are. Glow near the sonar counts as that of a beam halfway from the middle.
+    """
+    if sonar.noise_level_db is None:
+        return np.zeros(sonar.range_bins)
+    glow = np.maximum(0.0, sonar.near_glow_db * (1 - sonar.range_m / sonar.near_glow_m))
+    power = 10 ** ((sonar.noise_level_db - sonar.source_level_db + glow) / 10)
+    return np.asarray(power * gain_of(sonar), dtype=np.float64)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 from mitsonar.cli.odometry_command import Geometry
 
 __all__ = ["benchmarks", "odometry_benchmark"]
@@ -77,7 +76,7 @@ def odometry_benchmark(
     for sentence in report["notes"]:
         warn(sentence)
     if as_json:
-        say(json.dumps(report, indent=1))
+        say_json(report, indent=1)
         return
     for line in benchmark_lines(report["rows"]):
         say(line)

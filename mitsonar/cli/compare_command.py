@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 
 __all__ = ["compare"]
 
@@ -19,8 +18,8 @@ def compare(
     estimators: Annotated[
         str | None,
         typer.Option(
-            help="Names of estimators or checkpoints of networks, separated by commas: NAME or NAME:key=value:key=value "
-            "(default: all that need no training)."
+            help="Names of estimators, checkpoints of networks, or classes of your own (my_module:MyEstimator), separated "
+            "by commas; NAME:key=value:key=value gives options (default: all that need no training)."
         ),
     ] = None,
     noise: Annotated[
@@ -53,23 +52,29 @@ def compare(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Compare estimators on the same pairs. Failures count as zero motion. Bootstrap by scene, then sequence."""
-    from mitsonar.estimation.benchmark_tables import table_lines
-    from mitsonar.estimation.comparison_run import Asked
     from mitsonar.estimation.comparison_run import compare as compared
 
-    asked = Asked(estimators, noise, part, pairs, perturb, jitter, prior, limit, reference, seed)
-    report = compared(data, asked, out, begin=lambda what, count: progress_bar(what, count, "pairs"))
-    for sentence in report["notes"]:
+    found = compared(
+        data,
+        estimators,
+        noise=noise,
+        part=part,
+        pairs=pairs,
+        perturb=perturb,
+        jitter=jitter,
+        prior=prior,
+        limit=limit,
+        reference=reference,
+        seed=seed,
+        out=out,
+        begin=lambda what, count: progress_bar(what, count, "pairs"),
+    )
+    for sentence in found.notes:
         warn(sentence)
     if as_json:
-        say(json.dumps(report, indent=1))
+        say_json(found.report, indent=1)
         return
-    say(
-        f"{data}: {report['pairs']} pairs of {report['scenes']} scenes, {report['model']} model; sideways mm / forward mm / "
-        "yaw deg"
-    )
-    for table in report["tables"]:
-        for line in table_lines(table):
-            say(line)
+    for line in found.to_markdown().splitlines():
+        say(line)
     if out is not None:
         say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}")

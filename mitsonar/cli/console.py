@@ -4,20 +4,39 @@ from __future__ import annotations
 
 import errno
 import functools
+import inspect
+import json
+import logging
+import math
+import os
 import shlex
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import ParamSpec, TypeVar
 
 import typer
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, explain_missing
 
-__all__ = ["LaterBar", "answered", "changes_of", "command_line", "numbers", "progress_bar", "say", "say_stopped", "warn"]
+__all__ = [
+    "LaterBar",
+    "Terminated",
+    "answered",
+    "changes_of",
+    "command_line",
+    "numbers",
+    "progress_bar",
+    "say",
+    "say_json",
+    "say_stopped",
+    "warn",
+]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -28,17 +47,84 @@ def say(text: str) -> None:
     typer.echo(text)
 
 
+def say_json(value: object, indent: int = 2) -> None:
+    """Print a value as JSON. Numbers that JSON has no words for, nan and the infinities, become null."""
+    say(json.dumps(_with_nulls(value), indent=indent, allow_nan=False))
+
+
+def _with_nulls(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _with_nulls(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_nulls(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def warn(text: str) -> None:
     """Print a warning on standard error."""
     typer.echo(f"warning: {text}", err=True)
 
 
-RESUME_HINT = "the same command goes on (`render`, `odometry`, `benchmark odometry` and `train` with --resume)"
+class Terminated(KeyboardInterrupt):
+    """SIGTERM has come: a command ends as after Ctrl-C, with another code."""
 
 
-def say_stopped() -> None:
-    """Print what to do after Ctrl-C."""
-    typer.echo(f"stopped; what is whole on disk stays, {RESUME_HINT}", err=True)
+RESUMES = ("make", "reproduce")
+"""Commands that go on by themselves with what is there; others do with ``--resume``, if they can."""
+
+
+def goes_on(command: Callable[..., object]) -> str:
+    """Return the part of a sentence that says how a command goes on that was stopped; empty where it cannot."""
+    if command.__name__ in RESUMES:
+        return ": what is whole on disk stays, and the same command goes on"
+    if "resume" in inspect.signature(command).parameters:
+        return ": what is whole on disk stays, and the same command with --resume goes on"
+    return ""
+
+
+def say_stopped(command: Callable[..., object], stop: KeyboardInterrupt) -> int:
+    """Print that Ctrl-C or SIGTERM has stopped a command and how it goes on; return the code to exit with."""
+    _silence_asyncio()
+    typer.echo(f"stopped{goes_on(command)}", err=True)
+    return 128 + (signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT)
+
+
+def _silence_asyncio() -> None:
+    """Leave out what asyncio logs of writes that Zarr has begun in its own thread, and that nobody waits for any more."""
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+
+
+@contextmanager
+def _signals_stop() -> Iterator[None]:
+    """Let SIGTERM raise :class:`Terminated`, and Ctrl-C KeyboardInterrupt, whatever else comes of it.
+
+    Native code that calls Python turns the exception of a signal into one of its own, and an import that it breaks off may
+    fail in any way. A second SIGTERM ends the process at once, and so does one in a child that was forked.
+    """
+    usual: dict[int, object] = {signal.SIGTERM: signal.SIG_DFL, signal.SIGINT: signal.default_int_handler}
+    ours = [number for number, handler in usual.items() if signal.getsignal(number) is handler]
+    if threading.current_thread() is not threading.main_thread():
+        ours = []
+    owner, come = os.getpid(), list[type[KeyboardInterrupt]]()
+
+    def stop(number: int, _: FrameType | None) -> None:
+        signal.signal(number, usual[number])  # type: ignore[arg-type]
+        if os.getpid() != owner:
+            os.kill(os.getpid(), number)
+        come.append(Terminated if number == signal.SIGTERM else KeyboardInterrupt)
+        raise come[0]
+
+    for number in ours:
+        signal.signal(number, stop)
+    try:
+        yield
+    except Exception:
+        if come:
+            raise come[0] from None
+        raise
+    finally:
+        for number in ours:
+            signal.signal(number, usual[number])  # type: ignore[arg-type]
 
 
 GEOMETRY = {"height_m": "--height", "pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"}
@@ -54,7 +140,11 @@ OPTIONS: dict[str, dict[str, str]] = {
     "odometry": {**GEOMETRY, "every": "--every"},
     "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},
     "mosaic": {**GEOMETRY, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
-    "compare": {"height_m": "NAME:height_m=METRES", "pitch_rad": "NAME:pitch_deg=DEGREES"},
+    "compare": {
+        "height_m": "NAME:height_m=METRES",
+        "pitch_rad": "NAME:pitch_deg=DEGREES",
+        **{name: f"--{name}" for name in ("reference", "perturb", "jitter", "prior", "part")},
+    },
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},
     "reproduce": {"minutes": "--minutes"},
@@ -68,14 +158,14 @@ def command_line(*words: object) -> str:
 
 
 def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) -> Callable[P, R]:
-    """Wrap a command so that errors, a full disk and Ctrl-C end it with one sentence instead of a traceback.
+    """Wrap a command so that errors, a full disk, Ctrl-C and SIGTERM end it with one sentence instead of a traceback.
 
     Args:
         command: the function of the command.
         options: by argument, the option that messages name; default: those of :data:`OPTIONS`.
 
     Returns:
-        The command, which exits with code 2 after an error and with code 130 after Ctrl-C.
+        The command, which exits with code 2 after an error, with 130 after Ctrl-C and with 143 after SIGTERM.
     """
     typed = OPTIONS.get(command.__name__, {}) if options is None else options
 
@@ -84,7 +174,8 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
         warnings.filterwarnings("always", category=MitsonarWarning)
         warnings.showwarning = _show
         try:
-            return command(*args, **kwargs)
+            with _signals_stop():
+                return command(*args, **kwargs)
         except MitsonarError as error:
             typer.echo(f"error: {' '.join(error.said(typed).split())}", err=True)
         except ModuleNotFoundError as error:
@@ -92,19 +183,18 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
         except BrokenPipeError:  # the reader of our output has ended, which is no error
             raise typer.Exit(0) from None
         except OSError as error:
+            _silence_asyncio()
             where = f" ({error.filename})" if error.filename else ""
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-            stays = f"; what is whole on disk stays, {RESUME_HINT}" if full else ""
-            typer.echo(f"error: {error.strerror or error}{where}{stays}", err=True)
+            typer.echo(f"error: {error.strerror or error}{where}{goes_on(command) if full else ''}", err=True)
         except MemoryError:
             typer.echo("error: out of memory; ask for less: beams, rays or bins of the sonar, objects of a world", err=True)
         except RuntimeError as error:
             if "memory" not in str(error):
                 raise
             typer.echo("error: out of memory; lower --rays-per-launch, or the sonar's beams, rays or bins", err=True)
-        except KeyboardInterrupt:
-            say_stopped()
-            raise typer.Exit(130) from None
+        except KeyboardInterrupt as stop:
+            raise typer.Exit(say_stopped(command, stop)) from None
         raise typer.Exit(2)
 
     return wrapped

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 from mitsonar.cli.flown_path import SIX, Frame, path_for
 from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters
 from mitsonar.errors import MitsonarError
@@ -118,7 +117,7 @@ def crlb(
 
         write_whole(plot, crlb_png(report))
     if as_json:
-        say(json.dumps(report, indent=1))
+        say_json(report, indent=1)
         return
     for line in report_lines(report):
         say(line)

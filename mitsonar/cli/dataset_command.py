@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_stopped, warn
+from mitsonar.cli.console import LaterBar, answered, changes_of, command_line, progress_bar, say, say_json, say_stopped, warn
 from mitsonar.cli.flown_path import Frame
-from mitsonar.cli.frames_command import Least, Out, Picture, Polygons, To, Without, exported
+from mitsonar.cli.frames_command import (
+    LEAST_SNR_DB,
+    Classes,
+    Least,
+    LeastSnr,
+    Out,
+    Picture,
+    Polygons,
+    Shares,
+    To,
+    Without,
+    classes_of,
+    exported,
+    numbers_of,
+    shares_of,
+)
 from mitsonar.cli.odometry_command import Geometry
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
+
+if TYPE_CHECKING:
+    from mitsonar.config.data_recipe import Recipe
+    from mitsonar.datasets.generation import Made
 
 __all__ = ["datasets"]
 
@@ -24,7 +42,7 @@ Data = Annotated[str, typer.Argument(metavar="DATA.zarr", help="Folder or URL (s
 def datasets() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Make, show and check labelled data sets.", no_args_is_help=True)
-    for command in (make, info, show, check, recipes, export):
+    for command in (make, info, show, check, recipes, export, detector):
         app.command()(command)
     app.command("from-frames")(from_frames)
     return app
@@ -48,7 +66,6 @@ def make(
 ) -> None:
     """Make a data set. After a stop at any moment the same command resumes and ends with the same bytes."""
     from mitsonar.config.data_recipe import load_recipe
-    from mitsonar.datasets.generation import make_dataset
 
     described = load_recipe(recipe, changes_of(change or [], seed))
     if sequences is not None and scale is not None:
@@ -62,20 +79,89 @@ def make(
     if workers is not None and scheduler is not None:
         raise MitsonarError("--workers and --scheduler contradict each other: a scheduler has its own workers")
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
+    made = _made(described, out, sequences=sequences, workers=processes, scheduler=scheduler, verify=verify)
+    there = made.shards - made.made
+    say(
+        f"{counted(made.frames, 'frame')} in {made.url}: {counted(made.made, 'shard')} made"
+        + (f", {there} were there" if there else "")
+    )
+    say(f"show it: {command_line('dataset', 'show', made.url)}")
+
+
+def _made(recipe: Recipe, out: str, **words: object) -> Made:
+    """Make a data set with a bar; Ctrl-C ends the process at once."""
+    from mitsonar.datasets.generation import make_dataset
+
     bar = LaterBar("rendering", "frames")
-    words = {"sequences": sequences, "workers": processes, "scheduler": scheduler, "verify": verify}
     try:
         with bar:
-            made = make_dataset(described, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
-    except KeyboardInterrupt:
-        say_stopped()
+            made = make_dataset(recipe, out, **words, begun=bar.begin, progress=bar.advance)  # type: ignore[arg-type]
+    except KeyboardInterrupt as stop:
+        code = say_stopped(make, stop)
         sys.stdout.flush()
-        os._exit(130)  # threads of Zarr and dask would complain one by one
+        os._exit(code)  # threads of Zarr and dask would complain one by one
     for sentence in made.warnings:
         warn(sentence)
-    there = made.shards - made.made
-    say(f"{made.frames:,} frames in {made.url}: {made.made} shards made" + (f", {there} were there" if there else ""))
-    say(f"show it: {command_line('dataset', 'show', made.url)}")
+    return made
+
+
+@answered
+def detector(
+    scene: Annotated[
+        str,
+        typer.Argument(metavar="SCENE|RECIPE", help="Mitsuba XML file, shipped scene, or recipe whose worlds are taken."),
+    ],
+    out: Out,
+    frames: Annotated[int, typer.Option(min=1, help="Number of pictures.")] = 300,
+    to: Annotated[str, typer.Option("--to", help="coco or yolo.")] = "coco",
+    sonar: Annotated[str | None, typer.Option(help="Preset or YAML file (default: the scene's, the recipe's).")] = None,
+    height: Annotated[
+        str | None, typer.Option(help="Least and largest height over z = 0, LOW,HIGH [m] (default: 1.5,3 over the ground).")
+    ] = None,
+    pitch: Annotated[
+        str | None, typer.Option(help="Least and largest pitch, > 0 down, LOW,HIGH [deg] (default: 10,30).")
+    ] = None,
+    noise_db: Annotated[
+        str, typer.Option("--noise-db", help="What is added to the sonar's noise, in turn [dB]: 0,6,12.")
+    ] = "",
+    classes: Classes = "",
+    picture: Picture = "polar",
+    least: Least = 9,
+    least_snr_db: LeastSnr = LEAST_SNR_DB,
+    split: Annotated[str, typer.Option("--split", help="Shares of training, validation and test.")] = "0.7,0.15,0.15",
+    polygons: Polygons = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of poses, worlds and noise.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine (default: its cores).")] = None,
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="Change a key of the recipe, KEY=VALUE: sonar.quality=draft.")
+    ] = None,
+) -> None:
+    """Render random views of a scene, with boxes, in parts for training, validation and test. The same command resumes."""
+    from mitsonar.exports.detector_set import DetectorViews, detector_recipe
+
+    if to not in ("coco", "yolo"):
+        raise MitsonarError(f"--to is coco or yolo: got {to!r}; `mitsonar dataset export` writes other layouts")
+    if out.exists():
+        raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or remove it")
+    shares = shares_of(split)
+    assert shares is not None
+    raised = tuple(numbers_of(noise_db, "--noise-db", None)) if noise_db else ()
+    views = DetectorViews(frames, _interval(height, "--height"), _interval(pitch, "--pitch"), raised, shares, seed)
+    rules = classes_of(classes, None)
+    recipe, ground, notes = detector_recipe(scene, views, sonar, changes_of(change or [], None))
+    for note in notes:
+        say(note)
+    store = f"{out}.zarr"
+    made = _made(recipe, store, workers=workers or len(os.sched_getaffinity(0)))
+    say(f"{made.frames:,} frames in {made.url}: `mitsonar dataset export` writes them again with other classes")
+    exported(store, to, out, picture, [*rules, *ground], least, least_snr_db, None, polygons, None, every_class=True)
+
+
+def _interval(text: str | None, option: str) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    low, high = numbers_of(text, option, 2)
+    return low, high
 
 
 @answered
@@ -96,7 +182,7 @@ def info(
         return
     table = information(store)
     if as_json:
-        say(json.dumps(table, indent=2))
+        say_json(table)
         return
     for key, value in table.items():
         if key == "levels":
@@ -163,7 +249,7 @@ def check(data: Data) -> None:
             f"{len(faults)} faults in {data}: the `mitsonar dataset make` that made it resumes where it stopped, and with "
             "--verify makes damaged shards anew; empty frames stay until the recipe changes"
         )
-    say(f"{len(store):,} frames in {store.shards} shards: all is well")
+    say(f"{counted(len(store), 'frame')} in {counted(store.shards, 'shard')}: all is well")
 
 
 @answered
@@ -190,7 +276,10 @@ def export(
     out: Out,
     picture: Picture = "polar",
     without: Without = None,
+    classes: Classes = "",
     least: Least = 1,
+    least_snr_db: LeastSnr = LEAST_SNR_DB,
+    split: Shares = None,
     polygons: Polygons = False,
     view: Annotated[str | None, typer.Option(help="Name of the view (default: the first).")] = None,
 ) -> None:
@@ -199,7 +288,8 @@ def export(
 
     if not is_data_set(data):
         raise MitsonarError(f"no data set at {data}: {command_line('frames', 'export')} exports runs and recordings")
-    exported(data, to, out, picture, without or [], least, polygons, view)
+    rules = classes_of(classes, without)
+    exported(data, to, out, picture, rules, least, least_snr_db, shares_of(split), polygons, view)
 
 
 @answered
@@ -240,6 +330,6 @@ def from_frames(
         made = write_recorded(sources, out, begun=bar.begin, progress=bar.advance)
     for sentence in made.notes:
         warn(sentence)
-    say(f"{made.frames:,} frames in {made.sequences:,} sequences in {made.path}")
+    say(f"{counted(made.frames, 'frame')} in {counted(made.sequences, 'sequence')} in {made.path}")
     part = ["--part", "all"] if made.sequences == 1 else []
     say(f"compare estimators on it: {command_line('compare', made.path, *part)}")

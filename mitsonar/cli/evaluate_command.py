@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
+from mitsonar.errors import counted
 
 if TYPE_CHECKING:
     from mitsonar.networks.checkpoint import Checkpoint
@@ -70,12 +70,15 @@ def evaluate(
     for sentence in report["notes"]:
         warn(sentence)
     if report["scenes"] < FEWEST_SCENES:
-        warn(f"{report['scenes']} scenes only: the 95 % intervals are too narrow; evaluate on {FEWEST_SCENES} or more")
+        warn(
+            f"{counted(report['scenes'], 'scene')} only: the 95 % intervals are too narrow; evaluate on "
+            f"{FEWEST_SCENES} or more"
+        )
     lines = report_lines(report)
     if out is not None:
         save_tables(out, report)
     if as_json:
-        say(json.dumps(report, indent=1))
+        say_json(report, indent=1)
         return
     for name, value in checkpoint.rows():
         say(f"{name:18} {value}")

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from mitsonar.cli.console import numbers, warn
 from mitsonar.errors import MitsonarError, meant
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sounder import Sounder
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["FRAMES", "SIX", "SPEED", "Frame", "path_for", "warn_of_speed"]
+__all__ = ["FRAMES", "SIX", "SPEED", "Frame", "path_for", "poses_line", "under_vehicle", "warn_of_speed"]
 
 SIX = "x,y,z,pitch,roll,heading in m and deg"
 FRAMES = (
@@ -26,6 +31,9 @@ FRAMES = (
 SPEED = "Speed from --from to --to [m/s] (default: a frame every 1 / frame_rate_hz)."
 FAST_M_S = 5.0
 """Speed above which the vehicle's is told [m/s]: few underwater vehicles reach it."""
+
+TILTED_DEG = 10.0
+"""Pitch or roll of a vehicle above which an instrument that looks down from it is warned of [deg]."""
 
 Frame = Annotated[
     str,
@@ -83,6 +91,47 @@ def path_for(
         raise MitsonarError("--speed needs --from and --to that lie apart: they are one place; leave --speed out")
     rate_hz = 1 / frame_period_s(sonar) if speed is None else (poses - 1) * speed / away
     return Trajectory.between(*ends, poses, rate_hz)
+
+
+def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Trajectory:
+    """Return the path of the vehicle that carries an instrument, for a path that may be that of a forward-looking sonar.
+
+    The trajectories of shipped scenes are those of a sonar that looks ahead and down: an instrument that looks down or aside
+    rides on the level vehicle below it. Of other paths a warning tells where such an instrument is tilted.
+    """
+    if sounder.looks_ahead:
+        return path
+    if str(file) == "shipped":
+        level = path.poses.copy()
+        level[:, 3:5] = 0.0
+        return type(path)(level, path.time_s)
+    pitch, roll = (math.degrees(float(angle)) for angle in np.median(path.poses[:, 3:5], axis=0))
+    if max(abs(pitch), abs(roll)) > TILTED_DEG:
+        warn(
+            f"the vehicle flies at pitch {pitch:.3g}, roll {roll:.3g} deg, and the {sounder.kind} on it looks down or aside "
+            "from a level one: the path must be the vehicle's, not that of a sonar on it; where the vehicle "
+            "is level, give pitch 0"
+        )
+    return path
+
+
+def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) -> str:
+    """Say whose poses a path holds, with the usual attitude, and how instruments are mounted.
+
+    Args:
+        path: of the sonar or of the vehicle.
+        mounts: poses in the vehicle by name [m, rad]; none of instruments that say themselves where they are. None: the
+            path is that of the sonar itself.
+    """
+    pitch = math.degrees(float(np.median(path.poses[:, 3])))
+    if mounts is None:
+        return f"poses: of the sonar, at pitch {pitch:.3g} deg"
+    shown = [
+        f"{name} pitch {math.degrees(mount[3]):.3g}, heading {math.degrees(mount[5]):.3g} deg"
+        for name, mount in ((name, np.asarray(mount, dtype=float)) for name, mount in mounts.items())
+    ]
+    on_it = f"; mounted on it: {'; '.join(shown)}" if shown else ""
+    return f"poses: of the vehicle, at pitch {pitch:.3g} deg{on_it}"
 
 
 def _ends(sonar: Sonar, frames: int) -> int:

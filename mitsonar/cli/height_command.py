@@ -12,7 +12,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
 from mitsonar.cli.render_command import NOISE
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.io.whole_files import write_whole
 
@@ -84,7 +84,10 @@ def height(
         if pitch_deg is None
         else f"pitch {pitch_deg:g} deg from the command line, which the frames cannot verify"
     )
-    say(f"{len(estimates):,} frames by {by} ({given}), {lost:,} invalid" + (f", in {out}" if out is not None else ""))
+    say(
+        f"{counted(len(estimates), 'frame')} by {by} ({given}), {lost:,} invalid"
+        + (f", in {out}" if out is not None else "")
+    )
     if lost == len(estimates):
         warn(
             "no height was found: check the pitch, and that the window shows ground; the estimate needs echoes that fall off"

@@ -10,7 +10,7 @@ import typer
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
 from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.render_command import NOISE
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 __all__ = ["image"]
 
@@ -47,6 +47,6 @@ def image(
         )
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{report.frames} frames of {source.sonar.range_bins} bins in {folder}")
+    say(f"{counted(report.frames, 'frame')} of {counted(source.sonar.range_bins, 'bin')} in {folder}")
     if report.pictures:
         say(f"pictures: {report.pictures[0]}")

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
-from mitsonar.cli.flown_path import SIX, Frame
+from mitsonar.cli.flown_path import SIX, Frame, poses_line
 from mitsonar.cli.render_command import scene_parameters
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, counted, meant
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,7 +40,8 @@ def impulse(
     ] = None,
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     trajectory: Annotated[
-        str | None, typer.Option(help="Poses to fly: a TUM or CSV file, or a course (square, stairs, zigzag, circle ...).")
+        str | None,
+        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or a course (square, stairs, zigzag, circle ...)."),
     ] = None,
     frame: Frame = "mitsonar",
     model: Annotated[
@@ -85,7 +86,11 @@ def impulse(
     for sentence in report.warnings:
         warn(sentence)
     names = ", ".join(receiver.name for receiver in sonar.receivers)
-    say(f"{report.pings} pings ({sonar.model} model, {sonar.name}: {names}) of {sonar.taps} taps in {folder}")
+    say(
+        f"{counted(report.pings, 'ping')} ({sonar.model} model, {sonar.title}: {names}) of "
+        f"{counted(sonar.taps, 'tap')} in {folder}"
+    )
+    say(poses_line(flown, {}))
     spread = report.spread
     say(
         f"spread factor {spread.factor:.3g}: delays over {1e3 * spread.delay_s:.3g} ms, Doppler shifts over "

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
 from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.odometry_command import Frames, Geometry
 from mitsonar.cli.render_command import NOISE
-from mitsonar.errors import MitsonarError, meant
-from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.errors import MitsonarError, counted, meant
+from mitsonar.io.run_directory import kind_of_run, refuse_to_replace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,9 +66,15 @@ def mosaic(
     from mitsonar.mapping.geotiff import save_geotiff
     from mitsonar.mapping.illumination import illumination
     from mitsonar.mapping.mosaic import Mosaic, build_mosaic
+    from mitsonar.mapping.odometry_run import ODOMETRY
     from mitsonar.mapping.open_frames import is_recording
     from mitsonar.mapping.open_source import Reading, frames_for, with_assumed_plane
 
+    if kind_of_run(frames) == ODOMETRY.name:
+        raise MitsonarError(
+            f"{frames} is the folder of an odometry, and mosaic takes the frames first, the odometry second: "
+            f"{command_line('mosaic', trajectory, frames, '-o', out)}"
+        )
     quality = _checked_out(out, true, overwrite)
     Mosaic(cell_mm / 1e3, blend, centre_beams=centre_beams)  # type: ignore[arg-type]  # refused before frames are read
     paths, path_height = _paths(trajectory, true, frame)
@@ -106,9 +112,9 @@ def mosaic(
             illumination=light,
         )
     if len(index) < len(source):
-        warn(f"{len(source) - len(index):,} of {len(source):,} frames have no pose at their time and were left out")
+        warn(f"left out without a pose at their time: {len(source) - len(index):,} of {counted(len(source), 'frame')}")
     if found.frames_without_ground:
-        warn(f"{found.frames_without_ground:,} of {found.frames:,} frames show no ground and were left out")
+        warn(f"left out since they show no ground: {found.frames_without_ground:,} of {counted(found.frames, 'frame')}")
     if quality is None:
         save_geotiff(out, found)
     else:
@@ -116,7 +122,7 @@ def mosaic(
     rows, columns = found.mean.shape
     spread = float(np.nanmedian(found.std)) if np.isfinite(found.std).any() else float("nan")
     say(
-        f"{found.frames:,} frames along the {laid_along} path: {rows:,} x {columns:,} cells of {cell_mm:g} mm, "
+        f"{counted(found.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of {cell_mm:g} mm, "
         f"{rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; median standard deviation {spread:.4f}"
     )
     say(f"mosaic: {out}" + (f", quality: {quality}" if quality else " (bands: mean, standard deviation, count)"))

@@ -12,7 +12,7 @@ import typer
 from mitsonar.cli.console import answered, numbers, progress_bar, say, warn
 from mitsonar.cli.flown_path import SIX, Frame
 from mitsonar.cli.render_command import NOISE
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 __all__ = ["Frames", "Geometry", "odometry"]
 
@@ -42,9 +42,9 @@ def odometry(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="zero, ecc, flow, phase, direct, corrnet, or a checkpoint; NAME:key=value:key=value. Of several "
-            "checkpoints, separated by commas, the one trained nearest to the height is used. For impulse responses: "
-            "zero, correlation, likelihood. Default: direct, or likelihood."
+            help="zero, ecc, flow, phase, direct, corrnet, a checkpoint, or a class of your own as my_module:MyEstimator; "
+            "NAME:key=value:key=value. Of several checkpoints, separated by commas, the one trained nearest to the height "
+            "is used. For impulse responses: zero, correlation, likelihood. Default: direct, or likelihood."
         ),
     ] = None,
     smooth: Annotated[str, typer.Option(help="none, spline or kalman. Invalid motions are bridged in any case.")] = "none",
@@ -116,7 +116,7 @@ def odometry(
     measured, table.md, table.json, path.png, run.json, and estimates.jsonl, from which --resume continues. With --loops
     also loops.csv.
     """
-    from mitsonar.estimation.named_estimators import estimator_from
+    from mitsonar.estimation.named_estimators import create_estimator
     from mitsonar.mapping.bag_sensors import open_sensors
     from mitsonar.mapping.closure import loop_starts
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
@@ -131,7 +131,7 @@ def odometry(
     images = record_at(frames) is SonarFrames
     estimator = estimator or ("direct" if images else "likelihood")
     try:
-        method = estimator_from(estimator)
+        method = create_estimator(estimator)
     except MitsonarError:
         if images:
             frames_for(frames, reading)  # faults of the frames are reported first
@@ -172,5 +172,5 @@ def odometry(
     count, lost = len(found.estimates), int((~found.believed).sum())
     if found.graph is not None and found.graph.sensors:
         say(f"sensors: {', '.join(found.graph.sensors)}")
-    say(f"{count:,} motions by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
+    say(f"{counted(count, 'motion')} by {estimator} ({method.inputs}), {lost} invalid and bridged, in {out}")
     say(f"picture: {out / 'path.png'}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
-from mitsonar.cli.console import answered, progress_bar, say, warn
+from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 from mitsonar.cli.odometry_command import Geometry
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.io.run_directory import refuse_to_replace
 
 if TYPE_CHECKING:
@@ -65,13 +64,16 @@ def info(
         found = handedness_of(recording.part(), None if turn_deg is None else math.radians(turn_deg))
     if as_json:
         told = {} if found is None else {"handedness": found._asdict()}
-        say(json.dumps({**summary, **told}, indent=2))
+        say_json({**summary, **told})
         return
     for line in summary_lines(summary):
         say(line)
     if found is not None:
         why = f" ({found.reason})" if found.reason else ""
-        say(f"handedness             {found.verdict}{why}: correlation {found.correlation:.2f} over {found.pairs} pairs")
+        say(
+            f"handedness             {found.verdict}{why}: "
+            f"correlation {found.correlation:.2f} over {counted(found.pairs, 'pair')}"
+        )
 
 
 @answered
@@ -120,7 +122,7 @@ def video(
     with progress_bar("drawing", len(chosen), "frames") as progress:
         speed = rate or min(1000.0, found)
         count = write_fan_video(chosen.chunks(), out, speed, span_db=span_db, overwrite=overwrite, progress=progress)
-    say(f"{count:,} frames at {speed:.4g} a second in {out}")
+    say(f"{counted(count, 'frame')} at {speed:.4g} a second in {out}")
 
 
 def convert(
@@ -129,7 +131,11 @@ def convert(
     part: PartNumber = None,
     topic: TopicName = None,
     geometry: Geometry = None,
-    picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: png or jpeg.")] = "png",
+    picture: Annotated[str, typer.Option(help="Format of the fans in an MCAP file: jpeg or png.")] = "jpeg",
+    full: Annotated[
+        bool, typer.Option("--full", help="MCAP: samples bit for bit, float32 where they are, and labels (default: 8 bit).")
+    ] = False,
+    labels: Annotated[bool, typer.Option("--labels", help="MCAP: the points of the labels, where there are.")] = False,
     beams: Annotated[
         int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
     ] = None,
@@ -142,6 +148,8 @@ def convert(
 
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
+    if (full or labels) and out.suffix != ".mcap":
+        raise MitsonarError(f"--full and --labels are of MCAP files: got {out}; leave them out")
     if resume and out.suffix:
         raise MitsonarError("--resume is for folders: files are whole or absent")
     recording = _opened(file, topic, geometry)
@@ -149,16 +157,17 @@ def convert(
     chosen = recording.part(part)
     if len(recording.parts) > 1:
         number = recording.longest if part is None else part
-        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {len(recording):,} frames")
+        say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {counted(len(recording), 'frame')}")
     made = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":
-            write_mcap(chosen.chunks(), out, picture=picture, overwrite=overwrite, progress=progress)
+            words = {"picture": picture, "full": full, "labels": labels, "overwrite": overwrite}
+            write_mcap(chosen.chunks(), out, **words, progress=progress)  # type: ignore[arg-type]
         elif out.suffix == ".aris":
             _to_aris(chosen, out, beams=beams, overwrite=overwrite, progress=progress)
         else:
             made = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
-    say(f"{len(chosen):,} frames in {made}")
+    say(f"{counted(len(chosen), 'frame')} in {made}")
 
 
 def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, warn_of_speed
-from mitsonar.errors import MitsonarError
+from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, poses_line, warn_of_speed
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.moving_files import Said
 
-__all__ = ["NOISE", "instrument_for", "moving_said", "render", "scene_parameters", "sonar_changes"]
+__all__ = ["NOISE", "check_above_ground", "instrument_for", "moving_said", "render", "scene_parameters", "sonar_changes"]
 
 NOISE = (
     "Almanza-Medina's noise: none, low, high, m,s,g (fractions of the maximum) or a YAML file; no realism, it shows which "
@@ -33,7 +35,10 @@ def render(
     start: Annotated[str | None, typer.Option("--from", help=f"First pose: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
     speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="Poses to fly: a TUM or CSV file, or `shipped`.")] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="Poses of the sonar, or with --vehicle of the vehicle: a TUM or CSV file, or `shipped`."),
+    ] = None,
     frame: Frame = "mitsonar",
     sonar: Annotated[str | None, typer.Option(help="Preset (`mitsonar presets`) or YAML file.")] = None,
     model: Annotated[str | None, typer.Option(help="coherent (as of most presets), physical or thesis.")] = None,
@@ -118,6 +123,7 @@ def render(
     simulator = Simulator(
         loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
     )
+    check_above_ground(loaded, path, simulator.motion is not None, simulator)
     origin |= {"mirrors": True} if mirrors else {}
     origin |= {"moving": digests_of(said)} if said else {}
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
@@ -126,11 +132,35 @@ def render(
         report = run(simulator, path, folder, outputs, origin=origin, overwrite=overwrite, resume=resume, progress=progress)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{report.frames} frames ({instrument.model} model, {instrument.name}) in {folder}")
+    say(f"{counted(report.frames, 'frame')} ({instrument.model} model, {instrument.title}) in {folder}")
+    say(poses_line(path))
     if line := absorption_line(instrument):
         say(line)
     if report.pictures:
         say(f"pictures: {report.pictures[0]}" + (f" ... {report.pictures[-1].name}" if len(report.pictures) > 1 else ""))
+
+
+def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Simulator | None = None) -> None:
+    """Refuse a path below the ground or inside an object, from where the sonar sees nothing; warn where it sees something.
+
+    Args:
+        scene: the Mitsuba scene.
+        path: of the sonar or vehicle.
+        moving: whether bodies move, which is not judged.
+        simulator: of the sonar, tells whether it sees anything; None: only warn.
+    """
+    from mitsonar.simulation.clearance import buried_in
+
+    found = None if moving else buried_in(scene, path.poses)
+    if found is None:
+        return
+    frames = f"pose {found.frame}" if found.frames == 1 else f"pose {found.frame}, the first of {found.frames:,} such poses,"
+    if simulator is not None:
+        echoes, sonar = simulator.film_echoes(path.poses[found.frame], found.frame), simulator.sonar
+        if not ((echoes.hit > 0) & (echoes.far_m >= sonar.range_min) & (echoes.near_m < sonar.range_max)).any():
+            raise MitsonarError(f"{frames} {found.text}, and sees nothing from there: correct --from, --to or --trajectory")
+    if not found.inside:  # a tank is an object, too
+        warn(f"{frames} {found.text}: its frames show the ground from below")
 
 
 def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said] = ()) -> list[Said]:

@@ -68,10 +68,10 @@ def reproduce(
             reproduced(
                 table, out, effort, rows=wanted, workers=processes, accelerator=accelerator, devices=devices, watch=watch
             )
-    except KeyboardInterrupt:
-        say_stopped()
+    except KeyboardInterrupt as stop:
+        code = say_stopped(reproduce, stop)
         sys.stdout.flush()
-        os._exit(130)  # threads of Zarr and dask would complain one by one
+        os._exit(code)  # threads of Zarr and dask would complain one by one
     say((out / "table.md").read_text(encoding="utf-8").rstrip())
     say(f"\ntables: {out / 'table.md'}, {out / 'table.json'}; figure: {out / f'table-{table}.png'}")
 

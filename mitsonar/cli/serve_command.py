@@ -15,7 +15,7 @@ import typer
 from mitsonar.cli.console import answered, say
 from mitsonar.cli.flown_path import SIX, Frame, path_for
 from mitsonar.cli.render_command import NOISE, instrument_for, scene_parameters, sonar_changes
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.live.live_loop import LivePublisher
@@ -63,7 +63,7 @@ def serve(
     simulator = Simulator(loaded, instrument)
     mailbox, served = PoseMailbox(), 0
     publisher = _ros_node(mailbox) if ros else _foxglove(mailbox, host, port)
-    say(f"{instrument.name}, {instrument.model} model, {instrument.beams} beams x {instrument.range_bins} bins: ready")
+    say(f"{instrument.title}, {instrument.model} model, {instrument.beams} beams x {instrument.range_bins} bins: ready")
     try:
         with _set_by_signals() as ends:
             for _ in live_pings(simulator, mailbox, publisher, path, rate_hz=hertz, noise=drawn, seed=seed or 0, ends=ends):
@@ -72,7 +72,7 @@ def serve(
                     break
     finally:
         publisher.close()
-    say(f"{served} pings")
+    say(f"{counted(served, 'ping')}")
 
 
 @contextmanager

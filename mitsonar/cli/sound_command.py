@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from mitsonar.cli.console import answered, progress_bar, say, warn
-from mitsonar.cli.flown_path import SIX, SPEED, Frame, path_for, warn_of_speed
-from mitsonar.cli.render_command import moving_said, scene_parameters, sonar_changes
+from mitsonar.cli.flown_path import SIX, SPEED, Frame, path_for, poses_line, under_vehicle, warn_of_speed
+from mitsonar.cli.render_command import check_above_ground, moving_said, scene_parameters, sonar_changes
+from mitsonar.errors import counted
 
 __all__ = ["sound"]
 
@@ -28,7 +29,10 @@ def sound(
     start: Annotated[str | None, typer.Option("--from", help=f"First pose of the vehicle: {SIX}.")] = None,
     end: Annotated[str | None, typer.Option("--to", help=f"Last pose: {SIX}.")] = None,
     speed: Annotated[float | None, typer.Option(help=SPEED)] = None,
-    trajectory: Annotated[Path | None, typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`.")] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="Poses of the vehicle: a TUM or CSV file, or `shipped`, level below the sonar of the scene."),
+    ] = None,
     frame: Frame = "mitsonar",
     model: Annotated[str | None, typer.Option(help="coherent, with speckle and noise, or physical.")] = None,
     quality: Annotated[str | None, typer.Option(help="draft, standard or fine: rays by the error wanted.")] = None,
@@ -49,6 +53,7 @@ def sound(
     from mitsonar.mapping.sounding_run import run_sounder
     from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.moving_bodies import MovingBodies
+    from mitsonar.motion.pose import Pose
     from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.scene import find_scene, load_scene
     from mitsonar.simulation.sounding import SounderSimulator
@@ -62,10 +67,12 @@ def sound(
     parameters = scene_parameters(parameter or [])
     loaded = load_scene(scene, **parameters)
     flown = path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame, speed)
+    flown = under_vehicle(flown, sounder, trajectory)
     warn_of_speed(flown, end, speed)
     said = moving_said(loaded, moving or [], named)
     bodies = MovingBodies.of(read_said(said), named, flown)
     simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)
+    check_above_ground(loaded, flown, bool(said))
     origin: dict[str, Any] = {"scene": str(scene), "scene_sha256": file_digest(find_scene(scene)), "parameters": parameters}
     origin |= {"moving": digests_of(said)} if said else {}
     options: dict[str, Any] = {"frame": named, "overwrite": overwrite, "resume": resume}
@@ -74,5 +81,6 @@ def sound(
         report = run_sounder(simulator, flown, folder, origin=origin, progress=progress, **options)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{len(flown)} pings ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
-    say(f"{report.found:,} of {report.beams:,} beams have an echo; files: {', '.join(report.files)}")
+    say(f"{counted(len(flown), 'ping')} ({sounder.kind}, {sounder.name}, {sounder.fan.model} model) in {folder}")
+    say(poses_line(flown, {name: Pose.from_degrees(mount) for name, mount in sounder.mounts.items()}))
+    say(f"echoes in {report.found:,} of {counted(report.beams, 'beam')}; files: {', '.join(report.files)}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mitsonar.cli.console import answered, changes_of, say
+from mitsonar.cli.console import Terminated, answered, changes_of, say
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -97,24 +97,31 @@ def train(
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Let Ctrl-C stop training after its step, with its state saved, and a second Ctrl-C at once.
+    """Let Ctrl-C or SIGTERM stop training after its step, with its state saved, and a second one at once.
 
     Yields the function that returns whether to stop.
     """
-    asked = threading.Event()
+    asked, come = threading.Event(), list[int]()
 
     def first(number: int, frame: FrameType | None) -> None:
+        come.append(number)
         asked.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     if threading.current_thread() is not threading.main_thread():
         yield asked.is_set
         return
-    before = signal.signal(signal.SIGINT, first)
+    before = {number: signal.signal(number, first) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield asked.is_set
+    except KeyboardInterrupt:
+        if come == [signal.SIGTERM]:
+            raise Terminated from None
+        raise
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class TrainingBar:

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mitsonar.cli.console import progress_bar, say, warn
-from mitsonar.errors import MitsonarError
+from mitsonar.cli.flown_path import poses_line
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
@@ -63,7 +64,7 @@ def render_vehicle(
     from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, sensors_in
 
-    sensors = sensors_in(scene, Pose(*path.poses[0])) if vehicle is None else vehicle.sensors
+    sensors = sensors_in(scene, Pose.from_row(path.poses[0])) if vehicle is None else vehicle.sensors
     changed = {}
     for name, one in sensors.items():
         instrument: Any = one.instrument
@@ -77,4 +78,8 @@ def render_vehicle(
         report = run_vehicle(simulator, path, folder, outputs, origin=origin, progress=progress, **begun)
     for sentence in report.warnings:
         warn(sentence)
-    say(f"{len(path)} poses, {len(report.sensors)} sensors ({', '.join(report.sensors)}) in {folder}, a folder each")
+    say(poses_line(path, {name: one.mount for name, one in changed.items()}))
+    say(
+        f"{counted(len(path), 'pose')}, "
+        f"{counted(len(report.sensors), 'sensor')} ({', '.join(report.sensors)}) in {folder}, a folder each"
+    )

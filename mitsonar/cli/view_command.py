@@ -10,7 +10,7 @@ import typer
 from mitsonar.cli.console import answered, command_line, progress_bar, say, warn
 from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.render_command import scene_parameters
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from mitsonar.live.rerun_recording import Shown
@@ -65,7 +65,8 @@ def view(
     if boxed:
         names = ", ".join(boxed[:5]) + (" ..." if len(boxed) > 5 else "")
         warn(f"of {len(boxed)} shapes only the box is drawn, of instances and of meshes that are too large: {names}")
-    said = f"{frames:,} frames, {len(shown.shapes)} shapes, {len(shown.estimated)} estimated paths"
+    said = f"{counted(frames, 'frame')}, {counted(len(shown.shapes), 'shape')}"
+    said += f", {counted(len(shown.estimated), 'estimated path')}"
     if html is not None:
         write_page(html)
         say(f"{said}: {html}; serve it: python -m http.server -d {html}")

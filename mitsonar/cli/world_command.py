@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 
 from mitsonar.cli.console import answered, command_line, say, warn
 from mitsonar.cli.help_texts import with_plain_brackets
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -27,6 +27,9 @@ Click = Any
 
 FieldValue = int | float | str
 """Value of an option, before the numbers of a tuple are parsed."""
+
+SMALLEST_M, LARGEST_M = 0.05, 100.0
+"""Sizes of a model beyond which its unit is probably no metre [m]: most objects of the sea floor lie between."""
 
 Out = Annotated[Path, typer.Option("-o", "--out", help="Folder to make, with scene.xml, meshes/ and textures/.")]
 
@@ -141,8 +144,11 @@ def mesh(
     from mitsonar.worlds.user_mesh import mesh_world
 
     world = mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m)
-    if not 0.05 <= world.size_m <= 500:
-        warn(f"the model is {world.size_m:.3g} m large: --scale is the unit of the file in metres, 0.001 for millimetres")
+    if not SMALLEST_M <= world.size_m <= LARGEST_M:
+        warn(
+            f"the model is {world.size_m:.3g} m large with --scale {scale:g}, the metres of a unit of the file: give "
+            "--scale 0.001 where the unit is a millimetre, 0.0254 where it is an inch"
+        )
     _write(world, out)
 
 
@@ -212,4 +218,4 @@ def _joint_values(pairs: list[str]) -> dict[str, float]:
 def _write(world: World, out: Path) -> None:
     scene = world.write(out)
     say(world.about)
-    say(f"{world.faces:,} triangles in {scene}; render it with: {command_line('render', scene, '--cartesian')}")
+    say(f"{counted(world.faces, 'triangle')} in {scene}; render it with: {command_line('render', scene, '--cartesian')}")

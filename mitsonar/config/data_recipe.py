@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
 
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
@@ -37,7 +40,7 @@ __all__ = [
 
 _Made = TypeVar("_Made", bound=RecipePart)
 
-ADDED = ("recorded", "mirrors", "bodies")
+ADDED = ("recorded", "mirrors", "bodies", "noise_db", "visible_labels")
 """Keys that are not written where they are null or empty."""
 
 
@@ -79,6 +82,14 @@ class Recipe(RecipePart):
     )
     bodies: list[str] = Field(
         default_factory=list, max_length=10_000, description="bodies that move, whose poses and velocities are stored"
+    )
+    visible_labels: bool = Field(
+        False, description="labels of what pictures show: beyond half-power beams too, above noise and -40 dB (coherent)"
+    )
+    noise_db: list[Annotated[float, Field(ge=-100, le=100)]] = Field(
+        default_factory=list,
+        max_length=1000,
+        description="what scenes add to the sonar's noise_level_db, in turn [dB] (coherent); default: nothing",
     )
 
     @model_serializer(mode="wrap")
@@ -159,6 +170,15 @@ class Recipe(RecipePart):
             raise MitsonarError("labels are pixels: store images or both with them")
         if any(view.sonar.ping_groups > 1 for view in self.views):
             raise MitsonarError("a ping of a data set has one pose: leave out ping_groups, or set it to 1")
+        if self.noise_db and (self.instrument.model != "coherent" or self.instrument.noise_level_db is None):
+            raise MitsonarError(
+                f"noise_db changes noise_level_db of the model coherent: the sonar is of the model {self.instrument.model} "
+                f"with noise_level_db {self.instrument.noise_level_db}; give it both, or leave noise_db out"
+            )
+        if self.visible_labels and self.instrument.model != "coherent":
+            raise MitsonarError(
+                f"visible_labels is of the model coherent: got {self.instrument.model}, whose pictures show what is labelled"
+            )
         if len(set(self.bodies)) < len(self.bodies):
             raise MitsonarError(f"bodies are named once each: got {shortened(self.bodies)}")
         if self.recorded is None:
@@ -180,9 +200,12 @@ class Recipe(RecipePart):
             "pixel": "uint8",
             "gain": None,
             "bodies": [],
+            "noise_db": [],
+            "visible_labels": False,
         }
         other = [name for name, value in plain.items() if getattr(self, name) != value]
-        other += ["flight.footprint_fov_deg"] if self.flight.footprint_fov_deg is not None else []
+        of_images = {"footprint_fov_deg": None, "pitch_deg": None}
+        other += [f"flight.{name}" for name, value in of_images.items() if getattr(self.flight, name) != value]
         if other:
             raise MitsonarError(
                 f"{other[0]} belongs to images: leave it out of a recipe with channel, whose receivers have their own "
@@ -267,6 +290,11 @@ class Recipe(RecipePart):
             )
         return create_family(str(fields.pop("family")), **fields)
 
+    def noise_raised_db(self, scene: ArrayLike) -> NDArray[np.float64]:
+        """Return what scenes add to the sonar's noise, by their numbers ``(...)`` [dB]."""
+        numbers = np.asarray(scene)
+        return np.asarray(np.array(self.noise_db or [0.0])[numbers % max(1, len(self.noise_db))], dtype=np.float64)
+
     def level_of(self, view: View) -> str:
         """Return how pixels of a view stand for levels: that of recorded frames, or of its sonar."""
         return view.sonar.value_coding if self.recorded is None else self.recorded.level
@@ -347,4 +375,4 @@ def _find_files(fields: Keys, folder: Path) -> None:
         *(g.get("world") for g in (groups if isinstance(groups, list) else []) if isinstance(g, dict)),
     ]:
         if isinstance(world, dict) and isinstance(world.get("file"), str):
-            world["file"] = str((folder / world["file"]).resolve())
+            world["file"] = os.path.realpath(folder / world["file"])

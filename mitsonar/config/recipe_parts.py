@@ -7,7 +7,16 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from mitsonar.config.recipe_keys import Keys
 from mitsonar.errors import shortened
@@ -97,8 +106,15 @@ def _from_0(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
+def _box(corners: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(low < high for low, high in zip(corners[:3], corners[3:], strict=True)):
+        raise ValueError(f"a box is x, y, z of its least corner, then of its largest: got {corners}")
+    return corners
+
+
 _NotBelow0 = Annotated[Interval, AfterValidator(_from_0)]
 _Angle = Annotated[float, Field(gt=0, le=180)]
+_Box = Annotated[tuple[float, float, float, float, float, float], AfterValidator(_box)]
 
 
 class Flight(RecipePart):
@@ -116,9 +132,28 @@ class Flight(RecipePart):
     footprint_fov_deg: tuple[_Angle, _Angle] | None = Field(
         None, description="field of view whose footprint stays inside the scene [deg]; default: the sonar's"
     )
+    pitch_deg: Interval | None = Field(
+        None, description="pitch of the vehicle, low,high [deg], > 0 down, drawn for each sequence; null: level"
+    )
+    keep_out: list[_Box] = Field(
+        default_factory=list, max_length=10_000, description="boxes without the vehicle: x, y, z of two corners [m]"
+    )
     runs: list[Literal["legs", "diagonal", "turn", "sideways_50", "sideways_54"]] = Field(
         default=["legs", "diagonal", "turn"], min_length=1, description="runs of each scene"
     )
+
+    @model_serializer(mode="wrap")
+    def _without_absent(self, handler: SerializerFunctionWrapHandler) -> Keys:
+        """Leave out what later versions added where it is not used: stores and checkpoints keep their digests."""
+        return {key: value for key, value in handler(self).items() if key not in ("pitch_deg", "keep_out") or value}
+
+    @model_validator(mode="after")
+    def _pitched(self) -> Self:
+        if self.pitch_deg is not None and not (self.pitch_deg[0] >= -90 and self.pitch_deg[1] <= 90):
+            raise ValueError(f"pitch_deg must lie in -90..90: got {self.pitch_deg[0]:g},{self.pitch_deg[1]:g}")
+        if (self.pitch_deg or self.keep_out) and self.kind != "random":
+            raise ValueError(f"pitch_deg and keep_out are of random flights: got flight.kind {self.kind}")
+        return self
 
     @property
     def heights(self) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from functools import cached_property
 from importlib.resources import files
 from importlib.util import find_spec
@@ -294,7 +295,7 @@ def load_training_recipe(name_or_file: str | Path, changes: Keys | None = None) 
     for key, value in (changes or {}).items():
         set_key(fields, key, value)
     if isinstance(fields.get("data"), str) and fields["data"].lower().endswith((".yaml", ".yml")):
-        fields["data"] = str((path.parent / fields["data"]).resolve())  # named from where the recipe is
+        fields["data"] = os.path.realpath(path.parent / fields["data"])  # named from where the recipe is
     return training_recipe_from(fields)
 
 

@@ -151,8 +151,11 @@ def _outside(store: DataStore, vehicle: NDArray[np.float64], scene: NDArray[np.i
     half = {number: recipe.family(one.group).half_m for number, one in store.scenes.items()}
     limit = np.array([half[int(number)] for number in scene])
     farthest = -np.inf
-    for height in np.unique(vehicle[:, 2]):
-        mine = vehicle[:, 2] == height
-        corners = np.abs(footprints_at(vehicle[mine], store.modality.reach(float(height))))
+    # where no pose of the vehicle is stored, it differs from the sonar's by the mount's pitch alone
+    lean = 0.0 if "vehicle_pose" in store.group else recipe.mount.pose.pitch
+    flown = np.column_stack([vehicle[:, 2], np.round(vehicle[:, 3] - lean, 9)])
+    for height, pitch in np.unique(flown, axis=0):
+        mine = (flown == (height, pitch)).all(axis=1)
+        corners = np.abs(footprints_at(vehicle[mine], store.modality.reach(float(height), float(pitch))))
         farthest = max(farthest, float((corners.max(axis=(1, 2)) - limit[mine]).max()))
     return farthest

@@ -69,15 +69,16 @@ def ground_at(
 
 
 def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
-    """Compute the geometry of frames at their attitude over the ground; see :func:`ground_at`."""
-    return ground_at(
-        frames.range_m,
-        frames.bearing_rad,
-        frames.sonar.bearing,
-        attitude.height_m,
-        attitude.pitch_rad,
-        attitude.roll_rad,
-    )
+    """Compute the geometry of frames at their attitude over the ground; see :func:`ground_at`.
+
+    Of two frames at known attitudes, ``points`` are those of the first frame, ``turn`` and ``height`` those of the second.
+    """
+    axes = frames.range_m, frames.bearing_rad, frames.sonar.bearing
+    table = ground_at(*axes, attitude.height_m, attitude.pitch_rad, attitude.roll_rad)
+    if len(attitude.apart) == 2:
+        first, second = (ground_at(*axes, *attitude.of_frame(number)) for number in range(2))
+        table |= {"points": first["points"], "place": first["place"], "turn": second["turn"], "height": second["height"]}
+    return table
 
 
 def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:

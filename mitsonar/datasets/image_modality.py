@@ -45,6 +45,10 @@ PER_FRAME = {
 }
 
 
+MOST_DROPPED = 0.5
+"""Part of a ping's rays that the window of a recipe may drop: a recipe that states its window means it."""
+
+
 class ImageModality:
     """Images of a recipe with a sonar; see :class:`~mitsonar.datasets.modality.Modality`."""
 
@@ -109,13 +113,13 @@ class ImageModality:
         """Return 2: estimators of images are compared on pairs."""
         return 2
 
-    def reach(self, height: float) -> NDArray[np.float64]:
+    def reach(self, height: float, pitch: float = 0.0) -> NDArray[np.float64]:
         """Compute the footprint ``(n, 2)`` [m], or that of the field of view that the flight names.
 
         Raises:
             MitsonarError: the ground is out of range.
         """
-        return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg)
+        return footprint(self.sonar, self.recipe.mount.pose, height, self.recipe.flight.footprint_fov_deg, pitch)
 
     def _stored(self, kind: str, view: str, shape: tuple[int, ...], dims: tuple[str, ...]) -> StoredArray:
         """Return an array of this kind for a view."""
@@ -165,6 +169,8 @@ class ImageModality:
 
     def warnings(self, read: Read) -> list[str]:
         """Warn of motions far below a bin, of returns outside the window, and of a gain that is too high."""
+        from mitsonar.simulation.tally import NEGLIGIBLE  # a stored set is read without a simulator
+
         sentences = []
         flight, bin_mm = self.recipe.flight, 1e3 * self.sonar.bin_m
         largest_mm = max(flight.sideways_mm, flight.forward_mm)
@@ -174,11 +180,12 @@ class ImageModality:
                 "flight.sideways_mm and forward_mm are in millimetres"
             )
         dropped, saturated = (read(name).astype(np.int64) for name in ("dropped", "saturated"))
-        if dropped.any():
-            rays = self.sonar.rays
+        rays, stated = self.sonar.rays, {"range_min", "range_max"} <= set(self.recipe.sonar or {})
+        if dropped.mean() > (MOST_DROPPED if stated else NEGLIGIBLE) * rays:
             sentences.append(
                 f"{dropped.mean():,.0f} returns a ping ({100 * dropped.mean() / rays:.2g} % of {rays:,} rays) lie outside "
-                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped, as the window says"
+                f"the window {self.sonar.range_min:g}..{self.sonar.range_max:g} m and were dropped: set sonar.range_min "
+                "and range_max"
             )
         pixels = sum(len(view.bearing_rad) * view.sonar.range_bins for view in self.recipe.views)
         if saturated.mean() > 0.01 * pixels:
@@ -205,7 +212,9 @@ def _limits(kind: str, values: Values, beams: int) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=8)
-def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None) -> NDArray[np.float64]:
+def footprint(
+    sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, float] | None = None, pitch: float = 0.0
+) -> NDArray[np.float64]:
     """Compute a sonar's footprint on the ground z = 0: corners ``(n, 2)``, starboard and forward of the vehicle [m].
 
     Args:
@@ -213,6 +222,7 @@ def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, fl
         mount: pose of the sonar on the vehicle.
         height: of the vehicle [m].
         fov_deg: azimuth and elevation in place of the sonar's own [deg].
+        pitch: of the vehicle [rad], > 0 down.
 
     Raises:
         MitsonarError: the ground is out of range.
@@ -221,5 +231,5 @@ def footprint(sonar: Sonar, mount: Pose, height: float, fov_deg: tuple[float, fl
     outer = max(math.radians(azimuth) / 2, sonar.bearing_rad[-1] + sonar.beam_width_rad / 2 if fov_deg is None else 0)
     b, e = np.meshgrid(np.linspace(-outer, outer, RAYS), np.radians(np.linspace(-elevation, elevation, RAYS)) / 2)
     local = directions(sonar.bearing, b.ravel(), e.ravel())
-    eye = mounted(Pose(0, 0, height), mount)[0]
+    eye = mounted(Pose(0, 0, height, pitch), mount)[0]
     return ground_reach(eye[:3], vehicle_rotation(eye).apply(local), sonar.range_max)

@@ -152,10 +152,11 @@ class Modality(Protocol):
     def sample_frames(self) -> int:
         """Return the number of records of a sample in a comparison."""
 
-    def reach(self, height: float) -> Array:
-        """Compute the footprint of a level vehicle at a height [m]: corners ``(n, 2)`` on the ground z = 0.
+    def reach(self, height: float, pitch: float = 0.0) -> Array:
+        """Compute the footprint of a vehicle at a height [m] and a pitch [rad], > 0 down.
 
-        The corners are starboard and forward of the vehicle [m].
+        Returns:
+            Corners ``(n, 2)`` on the ground z = 0, starboard and forward of the vehicle [m].
 
         Raises:
             MitsonarError: no ground is seen.

@@ -19,7 +19,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.worlds.world import Family, stream
+from mitsonar.worlds.world import Family, draw, stream
 
 __all__ = ["Plan", "Scene", "Sequence", "footprints_at", "scenes_of", "sequences_of"]
 
@@ -184,27 +184,46 @@ def _sequence(
     height = low + (high - low) * float(draws[0])
     largest = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, math.radians(flight.yaw_deg)])
     motion = Motion(*(largest * (2 * draws[1:] - 1)))
-    corners = _corners(recipe, height, _drive(Pose(0, 0, height), motion, flight.pings))
+    pitch = 0.0
+    if flight.pitch_deg is not None:
+        pitch = math.radians(float(draw(rng, flight.pitch_deg)))
+    driven = _drive(Pose(0, 0, height), motion, flight.pings)
+    corners = _corners(recipe, height, pitch, driven)
     for _ in range(TRIES):
         position = _positions(flight, half, rng, last)
         heading = np.pi * (2 * rng.random(CANDIDATES) - 1)
         sin, cos = np.sin(heading)[:, None], np.cos(heading)[:, None]
         x, y = corners.T[0] * cos + corners.T[1] * sin, corners.T[1] * cos - corners.T[0] * sin
         outermost = np.maximum(np.abs(x + position[:, :1]), np.abs(y + position[:, 1:])).max(axis=1)
-        found = int((outermost <= half).argmax())
-        if outermost[found] <= half:
-            start = Pose(float(position[found, 0]), float(position[found, 1]), height, 0, 0, float(heading[found]))
+        fits = outermost <= half
+        here = slice(-flight.pings, None)  # the last of the corners are the pings themselves
+        fits &= ~_kept_out(flight, x[:, here] + position[:, :1], y[:, here] + position[:, 1:], height)
+        found = int(fits.argmax())
+        if fits[found]:
+            start = Pose.from_row(
+                (float(position[found, 0]), float(position[found, 1]), height, pitch, 0, float(heading[found]))
+            )
             return _drive(start, motion, flight.pings)
     raise MitsonarError(
         f"no place for a sequence found in {TRIES * CANDIDATES:,} tries: its footprint reaches "
         f"{np.hypot(*corners.T).max():.3g} m from the vehicle, the scene {half:g} m from its middle, jumps "
-        f"{flight.jump_m or 'anywhere'}; use a larger scene, smaller jumps, a nearer range_max or a lower height"
+        f"{flight.jump_m or 'anywhere'}{', boxes are kept out' if flight.keep_out else ''}; use a larger scene, smaller "
+        "jumps, a nearer range_max or a lower height"
     )
 
 
-def _corners(recipe: Recipe, height: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
+def _kept_out(flight: Flight, x: NDArray[np.float64], y: NDArray[np.float64], height: float) -> NDArray[np.bool_]:
+    """Mark the candidates with a ping ``(candidates, pings)`` [m] in a box that is kept out ``(candidates,)``."""
+    inside = np.zeros(len(x), dtype=bool)
+    for left, near, low, right, far, high in flight.keep_out:
+        if low <= height <= high:
+            inside |= ((left <= x) & (x <= right) & (near <= y) & (y <= far)).any(axis=1)
+    return inside
+
+
+def _corners(recipe: Recipe, height: float, pitch: float, driven: NDArray[np.float64]) -> NDArray[np.float64]:
     """Compute positions and footprints of all pings ``(n, 2)`` [m], relative to the first ping and in its axes."""
-    reach = modality_of(recipe).reach(height)
+    reach = modality_of(recipe).reach(height, pitch)
     return np.concatenate([footprints_at(driven, reach).reshape(-1, 2), driven[:, :2]])
 
 

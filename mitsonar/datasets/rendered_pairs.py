@@ -7,7 +7,7 @@ import multiprocessing
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ from mitsonar.datasets.batches import Batch, Device, RawSample
 from mitsonar.datasets.modality import Values
 from mitsonar.datasets.plan import Scene, sequences_of, world_seed
 from mitsonar.datasets.scene_rendering import SceneRenderer, calibrate
-from mitsonar.datasets.torch_pairs import Samples
-from mitsonar.errors import MitsonarError
+from mitsonar.datasets.torch_pairs import ArrangementOptions, Samples
+from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import mounted
 from mitsonar.simulation.variant import ensure_variant, release_memory, use_threads
@@ -62,8 +62,10 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         sequences_a_world: int = 1000,
         buffer: int = 500,
         gain: float | None = None,
-        **arrangement: Any,
+        **arrangement: Unpack[ArrangementOptions],
     ) -> None:
+        own = ("seed", "length", "sequences_a_world", "buffer", "gain")
+        refuse_unknown(arrangement, (*own, *ArrangementOptions.__annotations__), type(self).__name__)
         recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
         Samples.__init__(self, recipe, seed=seed, **arrangement)
         if recipe.flight.kind != "random":
@@ -73,6 +75,10 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         own_seed = int(np.random.SeedSequence([self.seed, 9]).generate_state(1)[0] // 2)
         self.worlds = recipe_from({**recipe.model_dump(), "seed": own_seed})  # a copy would keep cached values
         self.length, self.sequences_a_world, self.buffer, self.gain = length, sequences_a_world, buffer, gain
+
+    def __repr__(self) -> str:
+        length = "endless" if self.length is None else f"{self.length:,}"
+        return f"RenderedPairs({length} samples of {self.frames} frames, rendered of {self.recipe.name}, seed {self.seed})"
 
     def __iter__(self) -> Iterator[Batch]:
         for sample in self.raw():

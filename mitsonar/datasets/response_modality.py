@@ -68,7 +68,7 @@ class ResponseModality:
         """Return the number of pings of a sample, as the recipe has it."""
         return self.recipe.frames
 
-    def reach(self, height: float) -> NDArray[np.float64]:
+    def reach(self, height: float, pitch: float = 0.0) -> NDArray[np.float64]:
         """Compute the corners ``(n, 2)`` of what the receivers cover of the ground [m].
 
         Raises:

@@ -72,7 +72,7 @@ class ImpulseSamples:
         leak: Leak = "none",
         one_a_sequence: bool = False,
     ) -> None:
-        self.store = DataStore.open(url)
+        self.store, self._part = DataStore.open(url), part
         self.recipe = self.store.recipe
         self.sonar = self.recipe.channel_sonar
         self.frames = self.recipe.frames if frames is None else frames
@@ -94,6 +94,13 @@ class ImpulseSamples:
 
     def __len__(self) -> int:
         return len(self.first)
+
+    def __repr__(self) -> str:
+        receivers = len(self.arrange.receivers)
+        return (
+            f"{type(self).__name__}({len(self):,} samples of {self.frames} pings at {receivers} receivers, "
+            f"part {self._part}, {self.recipe.name}: {self.store.place.url})"
+        )
 
     def frame_numbers(self, index: int) -> slice:
         """Return the pings of a sample, as numbered in the store."""

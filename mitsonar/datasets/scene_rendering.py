@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.acoustics.sonar_losses import noise_of
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
@@ -19,8 +20,9 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.labels import labels_above
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, to_image
-from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.scene import load_scene, shape_names_in
 from mitsonar.simulation.variant import release_memory
 
 if TYPE_CHECKING:
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
     from mitsonar.simulation.moving_scene import SceneMotion
 
 __all__ = ["FRAMES_A_SCENE", "SceneRenderer", "calibrate", "loaded_world", "refuse_worlds"]
+
+VISIBLE = 1e-4
+"""Expected level of a cell with a visible label, at least, as a part of full scale; it must exceed the noise too."""
 
 FRAMES_A_SCENE = 10_000_000
 """A ping's number is its scene's number times this, plus its position in the scene: jitter does not depend on the size of
@@ -48,13 +53,31 @@ class SceneRenderer:
         world, sonar = loaded_world(recipe, scene), instrument_in(recipe, scene)
         self.simulator = Simulator(world, sonar, views=recipe.views, mirrors=recipe.mirrors)
         self.bodies = body_places(recipe, self.simulator.motion)
+        self._labeller: Simulator | None = None
+        if recipe.labels and recipe.visible_labels:  # the expected levels, over all that the patterns receive
+            patterns = {"pattern": sonar.beam_pattern, "elevation_pattern": sonar.vertical_pattern}
+            self._labeller = Simulator(world, sonar.replace(model="physical", **patterns))
 
     @staticmethod
     def settled(recipe: Recipe) -> Fields:
-        """Compute the gain of the data set and its inverse; see :func:`calibrate`."""
+        """Compute the gain of the data set and its inverse, and with labels of shapes the names of those of scene files.
+
+        See :func:`calibrate`. The names are a list for each group of scenes; it is empty for worlds that are built.
+        """
         refuse_worlds(recipe)
         gain = calibrate(recipe)
-        return {"gain": gain, "level_scale": 1 / gain}
+        found: Fields = {"gain": gain, "level_scale": 1 / gain}
+        groups = range(len(recipe.scenes))
+        if "shape_id" in recipe.labels and any(recipe.family(group).called == "scene" for group in groups):
+            known: dict[str, list[str]] = {}
+            for group in groups:
+                family = recipe.family(group)
+                if repr(family) not in known:
+                    world = Scene(0, group, world_seed(recipe.seed, 0), 1)
+                    named = family.called == "scene"
+                    known[repr(family)] = list(shape_names_in(loaded_world(recipe, world))) if named else []
+            found["shape_names"] = [known[repr(recipe.family(group))] for group in groups]
+        return found
 
     def render_views(self, poses: NDArray[np.float64], first: int, *, labels: bool = False) -> Iterator[list[RenderedPings]]:
         """Render levels of frames ``first``, ``first + 1`` ... of the scene, in batches with a part for each view.
@@ -74,9 +97,17 @@ class SceneRenderer:
             gain: of the data set.
         """
         values = self._empty(len(poses))
-        for batch in self.render_views(poses, first, labels=bool(self.recipe.labels)):
+        for batch in self.render_views(poses, first, labels=bool(self.recipe.labels) and self._labeller is None):
             start = batch[0].first - (self.scene.number * FRAMES_A_SCENE + first)
             self._fill({name: array[start : start + len(batch[0])] for name, array in values.items()}, batch, gain)
+        if self._labeller is not None:
+            number = self.scene.number * FRAMES_A_SCENE + first
+            for pings in self._labeller.pings(poses, first=number, labels=True, time_s=self._time_s(first, len(poses))):
+                here = slice(pings.first - number, pings.first - number + len(pings))
+                floor = np.maximum(VISIBLE, gain * noise_of(self.simulator.sonar))[:, None]
+                for label, shown in labels_above(pings, gain, floor).items():
+                    if label in self.recipe.labels:
+                        values[label][here] = shown
         if self.bodies:
             states = self.simulator.bodies(self._time_s(first, len(poses)))
             assert states.poses is not None
@@ -113,16 +144,22 @@ class SceneRenderer:
                 if f"vector{suffix}" in values:
                     values[f"vector{suffix}"][number] = image.sum(axis=1, dtype=np.float64)
                     values[f"nonzero{suffix}"][number] = np.count_nonzero(image, axis=1)
-            for label in self.recipe.labels:
+            for label in pings.labels and self.recipe.labels:
                 values[f"{label}{suffix}"][:] = pings.labels[label]
 
 
 def instrument_in(recipe: Recipe, scene: Scene) -> Sonar:
-    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it."""
+    """Return the sonar of a scene: that of speckle has a seed of each scene, since its scatterers are hashed by it.
+
+    Where the recipe has ``noise_db``, the noise of a scene is raised.
+    """
     sonar = recipe.instrument
     if sonar.model != "coherent":
         return sonar
-    return sonar.replace(seed=int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0]))
+    seed = int(np.random.SeedSequence([recipe.seed, scene.number]).generate_state(1)[0])
+    if sonar.noise_level_db is None or not recipe.noise_db:
+        return sonar.replace(seed=seed)
+    return sonar.replace(seed=seed, noise_level_db=sonar.noise_level_db + float(recipe.noise_raised_db(scene.number)))
 
 
 def body_places(recipe: Recipe, motion: SceneMotion | None) -> list[int]:

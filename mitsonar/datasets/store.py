@@ -22,7 +22,7 @@ from mitsonar.datasets.store_attributes import check_attributes
 from mitsonar.errors import MitsonarError, shortened
 from mitsonar.io.plain_data import check_plain
 from mitsonar.io.provenance import other_versions
-from mitsonar.io.storage import Storage
+from mitsonar.io.storage import Storage, refuse_codecs
 from mitsonar.records.columns import FEW_ROWS, rows_that_fit
 
 __all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
@@ -113,7 +113,8 @@ class DataStore:
             known = attributes.get("format")
             check_plain(attributes, "its zarr.json")
         except Exception as error:  # a damaged file, or a storage that does not answer, may raise anything
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            nothing = isinstance(error, zarr.errors.GroupNotFoundError)
+            reason = "it is no Zarr group" if nothing else " ".join(str(error).split())[:200] or type(error).__name__
             raise MitsonarError(
                 f"no data set at {storage.url}: {reason}; give what `mitsonar dataset make` or `dataset from-frames` wrote"
             ) from None
@@ -143,6 +144,10 @@ class DataStore:
                 "again, it continues where it stopped"
             )
         return store
+
+    def __repr__(self) -> str:
+        state, sequences = "" if self.finished else ", not finished", int(self.about["sequences"])
+        return f"DataStore({len(self):,} frames in {sequences:,} sequences, {self.recipe.name}{state}: {self.place.url})"
 
     # ---------------------------------------------------------------- reading
 
@@ -179,6 +184,8 @@ class DataStore:
             try:
                 with zarr.config.set({"array.write_empty_chunks": True}):  # a missing file is a missing shard
                     found = self.group[name]
+                if isinstance(found, zarr.Array):
+                    refuse_codecs(found)
             except Exception as error:  # no metadata, or damaged ones
                 raise MitsonarError(
                     f"{self.place.url}/{name}/zarr.json is damaged or gone ({type(error).__name__}): remove the data set "

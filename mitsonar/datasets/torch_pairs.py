@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +20,40 @@ from mitsonar.datasets.ground_nodes import ground_of
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import motions
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["Samples", "SonarPairs"]
+__all__ = ["ArrangementOptions", "SampleOptions", "Samples", "SonarPairs"]
 
 GROUND = "ground/"
 """Prefix of the names of the ground's geometry in a raw sample."""
 
 KEPT_BYTES = 2**28
 """Largest array of vectors that is kept in memory once it has been read."""
+
+
+class ArrangementOptions(TypedDict, total=False):
+    """Options of samples of images and vectors; see :class:`SonarPairs`."""
+
+    frames: int | None
+    views: str | list[str] | None
+    kind: str | None
+    layout: str
+    coordinates: str
+    cartesian_rows: int
+    noise: str | NoiseModel | Sequence[str | NoiseModel]
+    labels: str
+    ground: bool
+    range_levels: int | None
+    halves: bool
+
+
+class SampleOptions(ArrangementOptions, total=False):
+    """The same, and the seed."""
+
+    seed: int
 
 
 class Samples(Batches):
@@ -215,9 +237,11 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         part: str = "train",
         split: AnySplit = None,
         one_a_sequence: bool = False,
-        **arrangement: Any,
+        **arrangement: Unpack[SampleOptions],
     ) -> None:
-        self.store = DataStore.open(url)
+        own = ("part", "split", "one_a_sequence")
+        refuse_unknown(arrangement, (*own, *SampleOptions.__annotations__), type(self).__name__)
+        self.store, self._part = DataStore.open(url), part
         Samples.__init__(self, self.store.recipe, **arrangement)
         self.chosen = Part.of(self.store, part, split, self.frames, seed=self.seed, one_a_sequence=one_a_sequence)
         self.split, self.first = self.chosen.split, self.chosen.first
@@ -225,6 +249,12 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         self.pose, self.motion = self.chosen.pose, self.chosen.motion
         self._grounds: dict[int, RawSample] = {}
         self._whole: dict[str, Values] = {}
+
+    def __repr__(self) -> str:
+        return (
+            f"SonarPairs({len(self):,} samples of {self.frames} frames, part {self._part}, {self.arrange.kind} of "
+            f"{', '.join(list(self.arrange.views)[:4])}, {self.recipe.name}: {self.store.place.url})"
+        )
 
     def __len__(self) -> int:
         return len(self.first)

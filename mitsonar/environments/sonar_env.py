@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -18,7 +18,7 @@ from mitsonar.environments.sonar_spaces import (
     observation_space,
     observed,
 )
-from mitsonar.environments.sonar_task import SonarTask
+from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.moving_bodies import Moving
@@ -51,17 +51,23 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         *,
         moving: Moving | None = None,
         render_mode: str | None = None,
-        **task: Any,
+        **task: Unpack[TaskFields],
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
-        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create(task))
+        self.fleet = SonarFleet(scene, sonar, 1, moving, SonarTask.create({**task}, own=("moving", "render_mode")))
         self.render_mode = render_mode
         self.action_space, self.observation_space = action_space(), observation_space(self.fleet)
         self._image: NDArray[np.uint8] | None = None
 
+    def __repr__(self) -> str:
+        return f"SonarEnv({self.fleet.sonar}; observes {', '.join(self.fleet.task.observe)}, {self.fleet.step_s:g} s a step)"
+
+    def __str__(self) -> str:
+        return repr(self)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode; return the first observation, and what else is known of the vehicle."""
+        """Begin an episode; return the first observation, and the info: the ``pose`` (6,) [m, rad]."""
         super().reset(seed=seed, options=options)
         self.fleet.renew(np.array([True]), [self.np_random])
         image, altitude_m = self.fleet.look()
@@ -72,8 +78,9 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         """Move by the action ``(4,)``, then ping.
 
         Returns:
-            Observation, reward, whether the vehicle collided or left its bounds, whether the episode is cut off, and what
-            else is known.
+            observation, reward, terminated, truncated, info, as Gymnasium has them: terminated where the vehicle collided or
+            left its bounds, truncated after ``max_steps``. The info holds ``pose`` (6,) [m, rad], ``clearance_m``,
+            ``collided`` and ``outside``.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -84,16 +91,16 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         fleet = self.fleet
         moved = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
         self._image = moved.image[0]
-        told = {
+        info = {
             "pose": moved.poses[0].copy(),
             "clearance_m": float(moved.clearance_m[0]),
             "collided": bool(moved.collided[0]),
             "outside": bool(moved.outside[0]),
         }
-        cut = fleet.task.max_steps is not None and int(fleet.steps[0]) >= fleet.task.max_steps
-        ended = told["collided"] or told["outside"]
+        terminated = info["collided"] or info["outside"]
+        truncated = fleet.task.max_steps is not None and int(fleet.steps[0]) >= fleet.task.max_steps
         reward = float(fleet.rewards(moved)[0])
-        return _first(observed(fleet, moved.image, moved.altitude_m)), reward, ended, cut, told
+        return _first(observed(fleet, moved.image, moved.altitude_m)), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of the last ping's fan ``(rows, columns, 3)``, forward up; None before it, or without a mode."""

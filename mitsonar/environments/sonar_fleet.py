@@ -24,6 +24,8 @@ from mitsonar.simulation.scene import load_scene, sonar_in
 if TYPE_CHECKING:
     import mitsuba as mi
 
+    from mitsonar.simulation.clearance import Clearance
+
 __all__ = ["SonarFleet", "SonarSource"]
 
 SonarSource: TypeAlias = "Simulator | mi.Scene | str | Path"
@@ -77,13 +79,20 @@ class SonarFleet:
         self.step_s = 1 / self.sonar.frame_rate_hz if task.step_s is None else task.step_s
         from mitsonar.simulation.clearance import Clearance  # now that the simulator has set a variant
 
-        self.clearance = Clearance(self.simulator.tracer)
+        self._clearance = Clearance(self.simulator.tracer)
         self._span = self._start_of(task)
         self._check_start()
         self.gain = self._gain() if task.gain is None else task.gain
         self.poses = np.repeat(self._span[:1], count, axis=0)
         self.steps = np.zeros(count, dtype=np.int64)
         self._first = np.zeros(count, dtype=np.int64)
+
+    @property
+    def clearance(self) -> Clearance:
+        """Return what measures the clearance in the scene as it is now."""
+        if self._clearance.tracer is not self.simulator.tracer:  # the simulator has followed a change of the scene
+            self._clearance = type(self._clearance)(self.simulator.tracer)
+        return self._clearance
 
     def _start_of(self, task: SonarTask) -> Table:
         """Return the poses between which episodes begin."""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self, TypeAlias
+from typing import Any, Self, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, nearest_names, refuse_unknown
 
-__all__ = ["OBSERVABLE", "Reward", "SonarTask", "Transition"]
+__all__ = ["OBSERVABLE", "Reward", "SonarTask", "TaskFields", "Transition"]
 
 Table: TypeAlias = NDArray[np.float64]
 
@@ -52,6 +52,22 @@ class Transition:
 
 Reward: TypeAlias = Callable[[Transition], ArrayLike]
 """Gives the reward of each vehicle ``(n,)``, or one number for all."""
+
+
+class TaskFields(TypedDict, total=False):
+    """Fields of a :class:`SonarTask` as arguments of an environment."""
+
+    start: ArrayLike | None
+    bounds: Sequence[Sequence[float]] | NDArray[Any] | None
+    max_velocity: tuple[float, float, float, float]
+    step_s: float | None
+    clearance_m: float
+    max_steps: int | None
+    observe: tuple[str, ...]
+    reward: Reward | None
+    gain: float | None
+    noise: NoiseModel | None
+    altimeter_m: float
 
 
 @dataclass(frozen=True)
@@ -126,16 +142,13 @@ class SonarTask:
                 raise MitsonarError(f"start is x, y, z [m], pitch, roll, heading in rad: got {shown}; are these degrees?")
 
     @classmethod
-    def create(cls, given: dict[str, Any]) -> Self:
-        """Create a task from its fields by name.
+    def create(cls, given: dict[str, Any], own: Sequence[str] = ()) -> Self:
+        """Create a task from its fields by name; ``own`` are other arguments of an environment, for the message.
 
         Raises:
             MitsonarError: an unknown field, or a value that is not allowed.
         """
-        known = [field.name for field in fields(cls)]
-        for name in given:
-            if name not in known:
-                raise MitsonarError(f"an environment has no argument {name}: {nearest_names(name, known)}")
+        refuse_unknown(given, (*(field.name for field in fields(cls)), *own), "an environment")
         return cls(**given)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -22,7 +22,7 @@ from mitsonar.environments.sonar_spaces import (
     observation_space,
     observed,
 )
-from mitsonar.environments.sonar_task import SonarTask, Table, Transition
+from mitsonar.environments.sonar_task import SonarTask, Table, TaskFields, Transition
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.moving_bodies import Moving
@@ -64,7 +64,7 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         moving: Moving | None = None,
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        **task: Any,
+        **task: Unpack[TaskFields],
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise MitsonarError(f"render_mode is rgb_array or None: got {render_mode!r}")
@@ -72,7 +72,13 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         name = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if name not in modes:
             raise MitsonarError(f"autoreset_mode is {' or '.join(modes)}: got {name!r}")
-        self.fleet = SonarFleet(scene, sonar, num_envs, moving, SonarTask.create(task))
+        self.fleet = SonarFleet(
+            scene,
+            sonar,
+            num_envs,
+            moving,
+            SonarTask.create({**task}, own=("num_envs", "moving", "render_mode", "autoreset_mode")),
+        )
         self.num_envs, self.render_mode, self._mode = num_envs, render_mode, modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.single_action_space, self.single_observation_space = action_space(), observation_space(self.fleet)
@@ -81,6 +87,12 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         self._generators: list[np.random.Generator] = [seeding.np_random()[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, dtype=bool)
         self._image: NDArray[np.uint8] | None = None
+
+    def __repr__(self) -> str:
+        sonar, task = self.fleet.sonar, self.fleet.task
+        return (
+            f"SonarVectorEnv({self.num_envs} of {sonar}; observes {', '.join(task.observe)}, {self.fleet.step_s:g} s a step)"
+        )
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -107,13 +119,15 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         self.fleet.renew(which, self._generators)
         self._ended[which] = False
         self._image, altitude_m = self.fleet.look()
-        return observed(self.fleet, self._image, altitude_m), _told({"pose": self.fleet.poses.copy()}, which)
+        return observed(self.fleet, self._image, altitude_m), _masked({"pose": self.fleet.poses.copy()}, which)
 
     def step(self, actions: ArrayLike) -> tuple[Observation, Table, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Move all vehicles by their actions ``(num_envs, 4)``, then ping in one launch.
 
         Returns:
-            Observations, rewards, which collided or left their bounds, which are cut off, and what else is known.
+            observations, rewards, terminated, truncated, infos, as Gymnasium has them, each ``(num_envs, ...)``: terminated
+            where a vehicle collided or left its bounds, truncated after ``max_steps``. The infos hold ``pose``,
+            ``clearance_m``, ``collided`` and ``outside``, and a mask of each with ``_`` before its name.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -127,10 +141,10 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         moved = fleet.advance(actions, renewed, self._generators)
         self._image = moved.image
         rewards = np.where(renewed, 0.0, fleet.rewards(moved))
-        ended = (moved.collided | moved.outside) & ~renewed
-        cut = (fleet.steps >= (np.inf if fleet.task.max_steps is None else fleet.task.max_steps)) & ~renewed
-        self._ended = ended | cut
-        return observed(fleet, moved.image, moved.altitude_m), rewards, ended, cut, _known_of(moved, ~renewed)
+        terminated = (moved.collided | moved.outside) & ~renewed
+        truncated = (fleet.steps >= (np.inf if fleet.task.max_steps is None else fleet.task.max_steps)) & ~renewed
+        self._ended = terminated | truncated
+        return observed(fleet, moved.image, moved.altitude_m), rewards, terminated, truncated, _infos(moved, ~renewed)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each fan ``(rows, columns, 3)``, forward up; None before a ping, or without a mode."""
@@ -140,13 +154,13 @@ class SonarVectorEnv(VectorEnv[Observation, Array, Array]):
         return tuple(fan_picture(fan, image) for image in self._image)
 
 
-def _known_of(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
+def _infos(moved: Transition, which: NDArray[np.bool_]) -> dict[str, Any]:
     """Return what is known of the vehicles beside their observations."""
-    whole = _told({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
+    whole = _masked({"pose": moved.poses.copy()}, np.ones(len(which), dtype=bool))
     table = {"clearance_m": moved.clearance_m.copy(), "collided": moved.collided.copy(), "outside": moved.outside.copy()}
-    return whole | _told(table, which)
+    return whole | _masked(table, which)
 
 
-def _told(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
+def _masked(values: dict[str, Array], which: NDArray[np.bool_]) -> dict[str, Any]:
     """Return arrays by name, each with the mask of the vehicles that it holds for, as Gymnasium has it."""
     return values | {f"_{name}": which.copy() for name in values}

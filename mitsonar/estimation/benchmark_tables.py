@@ -2,14 +2,97 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
+from mitsonar.errors import counted
 from mitsonar.estimation.estimator import PlainTable
+from mitsonar.io.whole_files import write_whole
+from mitsonar.motion.motion_errors import AXES
 
-__all__ = ["FEWEST_SCENES", "Cells", "markdown", "table_lines"]
+__all__ = ["FEWEST_SCENES", "Cells", "Comparison", "markdown", "table_lines"]
 
 FEWEST_SCENES = 10
 """Fewest scenes for clustered intervals; with fewer they are much too narrow."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a comparison of estimators found. Printed, it is its tables as Markdown, which a notebook shows as tables.
+
+    Attributes:
+        report: the content of ``table.json``: the settings; ``notes``, sentences that the reader needs; ``tables``, one a
+            level of noise and variation; their ``rows`` are :class:`~mitsonar.estimation.benchmark.BenchmarkRow` as JSON.
+    """
+
+    report: PlainTable
+
+    @property
+    def rows(self) -> list[PlainTable]:
+        """Return a row for each method, level of noise and variation: ``noise``, ``variation``, and numbers and texts.
+
+        What has three numbers, sideways and forward [mm] and yaw [deg], is three entries: ``rmse_sideways_mm`` ... None
+        where a number is not known.
+        """
+        return [
+            {"noise": table["noise"], "variation": table["variation"], **_flat(row)}
+            for table in self.report["tables"]
+            for row in table["rows"]
+        ]
+
+    @property
+    def notes(self) -> list[str]:
+        """Return sentences that the reader needs."""
+        return list(self.report["notes"])
+
+    def columns(self) -> dict[str, list[object]]:
+        """Return the columns of :attr:`rows` by name, as ``pandas.DataFrame`` takes them."""
+        rows = self.rows
+        return {name: [row[name] for row in rows] for name in rows[0]}
+
+    def to_markdown(self) -> str:
+        """Return the tables as ``mitsonar compare`` prints them."""
+        report = self.report
+        head = (
+            f"{report['data']}: {counted(report['pairs'], 'pair')} of {counted(report['scenes'], 'scene')}, "
+            f"{report['model']} model; sideways mm / forward mm / yaw deg"
+        )
+        return "\n".join([head, *(line for table in report["tables"] for line in table_lines(table))])
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """Return :attr:`rows` as CSV, and write it to a file if one is given."""
+        text, rows = io.StringIO(), self.rows
+        writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        if path is not None:
+            write_whole(path, text.getvalue().encode())
+        return text.getvalue()
+
+    def __str__(self) -> str:
+        return self.to_markdown()
+
+    def _repr_markdown_(self) -> str:
+        return self.to_markdown()
+
+
+def _flat(row: PlainTable) -> PlainTable:
+    """Return a row with an entry for each number."""
+    flat: PlainTable = {}
+    for name, value in row.items():
+        if isinstance(value, list):
+            ends = [axis.name if name in UNITLESS else f"{axis.name}_{axis.unit}" for axis in AXES]
+            flat |= {f"{name}_{end}": one for end, one in zip(ends, value, strict=True)}
+        else:
+            flat[name] = value
+    return flat
+
+
+UNITLESS = ("slope", "skill", "over_limit")
+"""Entries of a row that have no unit."""
 
 
 def table_lines(table: PlainTable) -> list[str]:

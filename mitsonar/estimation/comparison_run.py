@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
 from mitsonar.datasets.response_samples import ImpulseSamples
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError, meant
+from mitsonar.errors import MitsonarError, argument, counted, meant
 from mitsonar.estimation.benchmark import (
     VARIATIONS,
     Answers,
@@ -28,48 +30,37 @@ from mitsonar.estimation.benchmark import (
     rows_of,
     with_prior,
 )
-from mitsonar.estimation.benchmark_tables import FEWEST_SCENES
+from mitsonar.estimation.benchmark_tables import FEWEST_SCENES, Comparison
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
-from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
 from mitsonar.io.provenance import digest, versions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import cluster_resamples, in_units
 
-__all__ = ["Asked", "compare"]
+__all__ = ["Estimators", "compare"]
 
 Array = NDArray[np.float64]
 Begin = Callable[[str, int], AbstractContextManager[Callable[[int], object]]]
 """Called with what begins and how many pairs it has; while it is open, its value is called with how many more are done."""
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What is compared; see ``mitsonar compare --help``.
+Estimators: TypeAlias = str | Sequence[EstimatorLike] | Mapping[str, EstimatorLike] | None
+"""Estimators of a comparison: a text with commas, a list, or by the names of their rows."""
 
-    Attributes:
-        estimators: their names, commas between them; None: all that need no training.
-        noise: levels, commas between them, or ``;``.
-        part: of the data set; None: the one that training does not use.
-        pairs: at most so many; None: all.
-        perturb: rows in which estimators get wrong inputs.
-        jitter: a row with jittered rays.
-        prior: rows with the prior of the size of motions.
-        limit: pairs over which the Cramer-Rao lower bound is computed; 0: none.
-        reference: the method that others are compared with; None: the last.
-        seed: of noise, choice of pairs and bootstrap.
-    """
 
-    estimators: str | None = None
-    noise: str = "none"
-    part: str | None = None
-    pairs: int | None = None
-    perturb: bool = False
-    jitter: bool = False
-    prior: bool = False
-    limit: int = 10
-    reference: str | None = None
-    seed: int = 0
+class _Asked(NamedTuple):
+    """What is compared, beside data and estimators; see :func:`compare`."""
+
+    noise: str
+    part: str | None
+    pairs: int | None
+    perturb: bool
+    jitter: bool
+    prior: bool
+    limit: int
+    reference: str | None
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -99,24 +90,48 @@ class Bench:
 
 
 def compare(
-    data: str, asked: Asked, out: str | Path | None = None, begin: Begin = lambda what, pairs: nullcontext(lambda done: None)
-) -> PlainTable:
+    data: str | Path,
+    estimators: Estimators = None,
+    *,
+    noise: str = "none",
+    part: str | None = None,
+    pairs: int | None = None,
+    perturb: bool = False,
+    jitter: bool = False,
+    prior: bool = False,
+    limit: int = 10,
+    reference: str | None = None,
+    seed: int = 0,
+    out: str | Path | None = None,
+    begin: Begin = lambda what, pairs: nullcontext(lambda done: None),
+) -> Comparison:
     """Run all estimators on the same pairs and report their errors; invalid estimates count as zero motion.
 
     Args:
         data: path or URL of a data set.
-        asked: what is compared.
+        estimators: what :func:`~mitsonar.estimation.named_estimators.create_estimator` takes: one text with commas between
+            them, a list, or a dictionary by the names of the rows; default: all that need no training.
+        noise: levels, commas between them, or ``;``.
+        part: of the data set; default: the one that training does not use.
+        pairs: at most so many; default: all.
+        perturb: add rows in which estimators get wrong inputs.
+        jitter: add a row with jittered rays.
+        prior: add rows with the prior of the size of motions.
+        limit: pairs over which the Cramer-Rao lower bound is computed; 0: none.
+        reference: the method that others are compared with; default: the last.
+        seed: of noise, choice of pairs and bootstrap.
         out: folder for estimates, ``table.md`` and ``table.json``; an interrupted comparison in it resumes.
         begin: called with each stage, for progress.
 
     Returns:
-        The content of ``table.json``: the settings; ``notes``, sentences that the reader needs; ``tables``, one a level of
-        noise and variation, whose ``rows`` hold what :class:`~mitsonar.estimation.benchmark.BenchmarkRow` holds.
+        The errors of each method at each level of noise and variation: print it, or read its ``rows``.
 
     Raises:
         MitsonarError: unknown names, too few pairs, or another comparison in the folder.
     """
-    bench = _bench(data, asked)
+    asked = _Asked(noise, part, pairs, perturb, jitter, prior, limit, reference, seed)
+    data = str(data)
+    bench = _bench(data, estimators, asked)
     settings = _settings(bench, asked)
     kept = kept_answers(out, settings)
     variations = _variations(asked)
@@ -139,17 +154,17 @@ def compare(
         bounds = _bounds(bench, level, asked.limit, kept, begin)
         tables += [_table(bench, asked, level, variation, answers[level, variation], bounds) for variation in variations]
     scenes = len(np.unique(bench.scenes))
-    notes = [f"{scenes} scenes only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
+    notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
     report = {"data": data, "model": modality_of(bench.first.recipe).sonar.model, **settings, "scenes": scenes}
     report |= {"notes": notes if scenes < FEWEST_SCENES else [], "tables": tables, **versions(("mitsonar",))}
     kept.finish(report)
-    return report
+    return Comparison(report)
 
 
 # ---------------------------------------------------------------- what is asked
 
 
-def _bench(data: str, asked: Asked) -> Bench:
+def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     """Open the samples and create the estimators.
 
     Raises:
@@ -157,26 +172,26 @@ def _bench(data: str, asked: Asked) -> Bench:
     """
     recipe = DataStore.open(data).recipe
     modality = modality_of(recipe)
-    names = (asked.estimators or modality.estimators).split(",")
-    methods = {text: estimator_from(text) for text in dict.fromkeys(names) if text}
+    methods = _methods(modality.estimators if estimators is None else estimators)
     if not methods or (asked.reference is not None and asked.reference not in methods):
         raise MitsonarError(
-            f"--reference must be one of {', '.join(methods) or 'the estimators'}: got {asked.reference!r}"
+            f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {asked.reference!r}"
             f"{meant(asked.reference, methods)}"
         )
+    perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))
     if not modality.variations and (asked.perturb or asked.jitter or asked.prior):
-        raise MitsonarError("--perturb, --jitter and --prior are for data sets of images: leave them out")
+        raise MitsonarError(f"{perturb}, {jitter} and {prior} are for data sets of images: leave them out")
     if recipe.recorded is not None and (asked.perturb or asked.jitter):
-        raise MitsonarError("--perturb and --jitter render anew, and recorded frames have no world: leave them out")
+        raise MitsonarError(f"{perturb} and {jitter} render anew, and recorded frames have no world: leave them out")
     words = list(dict.fromkeys(asked.noise.split(";" if ";" in asked.noise else ",")))
     levels = {word: modality.noise_model(word) for word in words}
     options = {"part": asked.part or recipe.split.unseen, "one_a_sequence": recipe.recorded is None, "seed": asked.seed}
     samples = {level: samples_of(modality, data, noise=level, **options) for level in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
-        raise MitsonarError("a comparison needs two pairs or more: give --part all, or a larger data set")
+        raise MitsonarError(f"a comparison needs two pairs or more: give {argument('part')} all, or a larger data set")
     if asked.jitter and first.recipe.instrument.jittered:
-        raise MitsonarError("the rays of this data set move already: --jitter is for Almanza-Medina's model")
+        raise MitsonarError(f"the rays of this data set move already: {jitter} is for Almanza-Medina's model")
     numbers = chosen(len(first), asked.pairs, asked.seed)
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
@@ -184,7 +199,24 @@ def _bench(data: str, asked: Asked) -> Bench:
     return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]])
 
 
-def _settings(bench: Bench, asked: Asked) -> PlainTable:
+def _methods(estimators: str | Sequence[EstimatorLike] | Mapping[str, EstimatorLike]) -> dict[str, AnyEstimator]:
+    """Create the estimators by the names of their rows: texts as they are, others by their classes."""
+    if isinstance(estimators, Mapping):
+        return {name: create_estimator(one) for name, one in estimators.items()}
+    if isinstance(estimators, str):
+        estimators = [text for text in dict.fromkeys(estimators.split(",")) if text]
+    methods: dict[str, AnyEstimator] = {}
+    for one in estimators:
+        name = (
+            os.fspath(one) if isinstance(one, str | os.PathLike) else (one if isinstance(one, type) else type(one)).__name__
+        )
+        if name in methods:
+            raise MitsonarError(f"two estimators are named {name}: give a dictionary, with a name for each")
+        methods[name] = create_estimator(one)
+    return methods
+
+
+def _settings(bench: Bench, asked: _Asked) -> PlainTable:
     """Return what decides the estimates; levels of noise may be added later."""
     chosen_of, recipe = bench.first.chosen, bench.first.recipe
     recipe_text = json.dumps(recipe.model_dump(), default=str)
@@ -199,7 +231,7 @@ def _settings(bench: Bench, asked: Asked) -> PlainTable:
     }
 
 
-def _variations(asked: Asked) -> list[str]:
+def _variations(asked: _Asked) -> list[str]:
     changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if asked.perturb else []
     return ["as told", *changed, *(["jitter"] if asked.jitter else [])]
 
@@ -227,7 +259,7 @@ def _bounds(bench: Bench, level: str, limit: int, kept: AnswerFolder, begin: Beg
 
 
 def _table(
-    bench: Bench, asked: Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
+    bench: Bench, asked: _Asked, level: str, variation: str, answers: dict[str, Answers], bounds: dict[str, Array]
 ) -> PlainTable:
     """Return the errors of all methods, as JSON can hold them."""
     found = dict(answers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -25,6 +26,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "Excess",
+    "Options",
     "PlainTable",
     "Record",
     "ambiguity",
@@ -74,6 +76,9 @@ FEWEST_BLOCKS = 8.0
 LARGEST_REUSED = 2**24
 """Bytes of the largest arrays whose memory is kept."""
 
+Options = dict[str, Any]
+"""Options of an estimator by name."""
+
 PlainTable = dict[str, Any]
 """What JSON holds, by key: texts, numbers, lists, tables and None."""
 
@@ -101,6 +106,20 @@ class Estimate:
     valid: bool = True
     reason: str = ""
     about: PlainTable = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        if not self.valid:
+            return f"Estimate(rejected: {self.reason[:160]})"
+        motion = f"sideways {self.motion.sideways:+.4g} m, forward {self.motion.forward:+.4g} m"
+        return f"Estimate({motion}, yaw {math.degrees(self.motion.yaw):+.4g} deg{self._deviations})"
+
+    @property
+    def _deviations(self) -> str:
+        """Return the standard deviations in words, where they are known."""
+        if self.covariance is None:
+            return ""
+        sideways, forward, yaw = np.sqrt(np.diag(self.covariance))
+        return f"; std {sideways:.2g} m, {forward:.2g} m, {math.degrees(yaw):.2g} deg"
 
 
 def rejected(reason: str) -> Estimate:
@@ -186,7 +205,9 @@ def blank(image: NDArray[np.float32]) -> bool:
 
 
 def correlation_of(first: Real, second: Real) -> float:
-    """Return the correlation coefficient of two arrays of one shape; 0 where either is constant."""
+    """Return the correlation coefficient of two arrays of one shape; 0 where either is constant or empty."""
+    if not first.size:
+        return 0.0
     a, b = first - first.mean(), second - second.mean()
     size = float(np.sqrt(np.vdot(a, a) * np.vdot(b, b)))
     return float(np.vdot(a, b)) / size if size > 0 else 0.0

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeAlias, cast
+
+import numpy as np
 
 from mitsonar.errors import MitsonarError, explain_missing, meant, nearest_names
 from mitsonar.estimation.channel.correlation import Correlation
 from mitsonar.estimation.channel.likelihood import Likelihood
-from mitsonar.estimation.estimator import AnyEstimator
+from mitsonar.estimation.estimator import AnyEstimator, Options
 from mitsonar.estimation.external.cfar_gicp import CfarGicp
 from mitsonar.estimation.external.fourier_mellin import FourierMellin
-from mitsonar.estimation.external.python_class import PythonClass, names_python_class
+from mitsonar.estimation.external.own_estimator import HasEstimate, checked_options, created, own_class, own_estimator
 from mitsonar.estimation.external.stackreg import StackReg
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.estimation.image.ecc import Ecc
@@ -25,14 +28,16 @@ from mitsonar.estimation.zero import Zero
 from mitsonar.networks.shipped import SHIPPED, shipped_path
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from mitsonar.networks.checkpoint import Checkpoint
 
 __all__ = [
     "ESTIMATORS",
     "EXTERNAL",
     "NAMES",
+    "EstimatorLike",
     "create_estimator",
-    "estimator_from",
     "estimators_for",
     "load_checkpoint",
     "names_checkpoint",
@@ -59,8 +64,8 @@ EXTERNAL: dict[str, type[AnyEstimator]] = {
 
 UNTRAINED = ESTIMATORS | EXTERNAL
 
-Options = dict[str, Any]
-"""Options of an estimator by name: numbers, or yes and no."""
+EstimatorLike: TypeAlias = "str | os.PathLike[str] | HasEstimate | type[HasEstimate] | nn.Module | type[nn.Module]"
+"""What :func:`create_estimator` makes an estimator of."""
 
 NAMES = (*UNTRAINED, *SHIPPED)
 
@@ -70,52 +75,84 @@ def estimators_for(record: type) -> tuple[str, ...]:
     return tuple(name for name, made in ESTIMATORS.items() if made.consumes in (record, object))
 
 
-def create_estimator(name: str, **options: object) -> AnyEstimator:
-    """Create the estimator of that name.
+def create_estimator(estimator: EstimatorLike, **options: object) -> AnyEstimator:
+    """Create an estimator: of mitsonar by name, of a checkpoint, or one of your own.
+
+    Args:
+        estimator: one of
+
+            - a name, ``direct``; a checkpoint or the folder of a training run, ``out/posenet``; a class of your own,
+              ``my_module:MyEstimator``. Options may follow, ``direct:height_m=2.5:pitch_deg=30``, angles as ``..._deg``. Of
+              several checkpoints with commas between them, the one trained nearest to the height of the frames is used;
+            - a class with a method ``estimate(frames)`` or ``estimate(frames, prior=None)`` that returns an
+              :class:`~mitsonar.estimation.estimator.Estimate`, or an object of it;
+            - a ``torch.nn.Module`` that takes images ``(batch, 2, bins, beams)`` in 0..1 and returns sideways, forward [m]
+              and yaw [rad] ``(batch, 3)``. With the option ``samples``, the ``SonarPairs`` of its training, it takes and
+              returns what it did there.
+        options: of the estimator, by the names of its arguments, angles as ``..._rad``.
 
     Raises:
-        MitsonarError: unknown name or option; no torch for a trained one.
+        MitsonarError: unknown name or option, no such checkpoint or one that cannot be used, no torch for it, a class that
+            cannot be created or has no ``estimate``.
     """
-    if name not in NAMES:
-        raise MitsonarError(f"unknown estimator {name!r}: {nearest_names(name, NAMES)}")
-    try:
-        return _maker(name)(**options)
-    except TypeError as error:
-        raise MitsonarError(f"estimator {name}: {error}") from None
+    if isinstance(estimator, str):
+        return _from_text(estimator, options)
+    if isinstance(estimator, os.PathLike):
+        return _made(os.fspath(estimator), _trained(os.fspath(estimator)), options)
+    if isinstance(estimator, type) and _is_ours(estimator):
+        return _made(estimator.__name__, cast(Callable[..., AnyEstimator], estimator), options)
+    if isinstance(estimator, type):
+        return own_estimator(created(estimator, options, estimator.__name__), {})
+    if _is_ours(type(estimator)) and not options and hasattr(estimator, "estimate"):
+        return cast(AnyEstimator, estimator)
+    return own_estimator(estimator, options)
 
 
-def estimator_from(text: str) -> AnyEstimator:
-    """Create an estimator from a text of the command line.
+def _is_ours(kind: type) -> bool:
+    """Return whether a class is one of mitsonar's own."""
+    return kind.__module__.partition(".")[0] == "mitsonar"
 
-    The text is a name, a checkpoint or the folder of a training run, or one of them with options:
-    ``NAME:key=value:key=value``, angles as ``..._deg``; or a Python class, ``my_module:MyEstimator``. Of several checkpoints
-    with commas between them, the one trained nearest to the height of the frames is used.
 
-    Raises:
-        MitsonarError: unknown name or option, not a number, no such checkpoint or one that cannot be used.
-    """
-    if "," in text and not Path(text).exists():
-        return _nearest([part.strip() for part in text.split(",") if part.strip()])
+def _from_text(text: str, options: Options) -> AnyEstimator:
+    """Create the estimator that a text names; see :func:`create_estimator`."""
+    if "," in text and not os.path.exists(text):
+        return _nearest([part.strip() for part in text.split(",") if part.strip()], options)
     name, *words = text.split(":")
     if name in NAMES:
-        return create_estimator(name, **options_from(name, words, _maker(name)))
-    if names_python_class(text):
-        return PythonClass(text)
+        made = _maker(name)
+        return _made(name, made, {**options_from(name, words, made), **options})
+    own = own_class(text, options)
+    if own is not None:
+        return own
     if not names_checkpoint(name):
         names = nearest_names(name, NAMES)
         other = "a checkpoint, the folder of a training run, or a class as my_module:MyEstimator"
         raise MitsonarError(f"unknown estimator {name!r}: {names}; or give {other}")
     made = _trained(name)
-    return made(**options_from(name, words, made))
+    return _made(name, made, {**options_from(name, words, made), **options})
 
 
-def _nearest(texts: list[str]) -> AnyEstimator:
+def _made(name: str, made: Callable[..., AnyEstimator], options: Options) -> AnyEstimator:
+    """Create an estimator from options by the names of its arguments.
+
+    Raises:
+        MitsonarError: an option that it does not take, or a value that is no number where one is needed.
+    """
+    for key, value in checked_options(name, options, made).items():
+        kind = str(inspect.signature(made).parameters[key].annotation)
+        is_number = isinstance(value, int | float | np.number) or (value is None and "None" in kind)
+        if kind.removesuffix(" | None") in ("float", "bool", "int") and not is_number:
+            raise MitsonarError(f"{name}: {key} must be a number: got {value!r}")
+    return made(**options)
+
+
+def _nearest(texts: list[str], options: Options) -> AnyEstimator:
     """Create the ensemble of several checkpoints.
 
     Raises:
         MitsonarError: fewer than two, or estimators that are not networks.
     """
-    made = [estimator_from(text) for text in texts]
+    made = [_from_text(text, options) for text in texts]
     plain = [text for text, one in zip(texts, made, strict=True) if not one.digest]
     if plain or len(made) < 2:
         fault = f"{plain[0]} was not trained at a height" if plain else f"got {len(made)}"
@@ -145,7 +182,7 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
 
 def names_checkpoint(name: str) -> bool:
     """Return whether a word of the command line is a path, not a name."""
-    return "/" in name or "." in name or Path(name).is_dir()
+    return "/" in name or "." in name or os.path.isdir(name)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.datasets.split import deal, world_of
+from mitsonar.config.data_recipe import Split
+from mitsonar.datasets.scene_names import names_of_scenes
+from mitsonar.datasets.split import PARTS, deal, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.mapping.open_frames import is_data_set, open_frames, view_in
@@ -40,6 +43,7 @@ class ExportSource:
         part: of each frame, ``train``, ``validation`` or ``test`` ``(frames,)``, as the recipe splits; else ``train``.
         read: reads frames with labels.
         about: what made them, for metadata.
+        raised_db: by which the noise of each frame is above that of the sonar ``(frames,)`` [dB].
     """
 
     name: str
@@ -51,6 +55,11 @@ class ExportSource:
     part: NDArray[np.str_]
     read: Read
     about: str = ""
+    raised_db: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.raised_db):
+            object.__setattr__(self, "raised_db", np.zeros(self.frames))
 
     def pieces(self) -> Iterator[tuple[int, SonarFrames]]:
         """Yield the frames a few at a time, with the number of the first."""
@@ -60,23 +69,36 @@ class ExportSource:
             yield first, self.read(slice(first, min(first + many, self.frames)))
 
 
-def open_export(where: str | Path, *, view: str | None = None) -> ExportSource:
+def open_export(
+    where: str | Path, *, view: str | None = None, split: tuple[float, float, float] | None = None
+) -> ExportSource:
     """Open the frames at a path or URL for export: all sequences of a data set, a run, or a recording.
 
     Args:
         where: a data set, ``frames.npz``, ``frames.zarr``, the folder of a run, or a recording.
         view: of a data set; default: the first.
+        split: shares of training, validation and test. Sequences or scenes of a data set are dealt out, as its recipe says;
+            frames of a run or a recording are cut into three stretches of time. Default: the recipe's; of a run all frames
+            are for training.
 
     Raises:
-        MitsonarError: no frames there.
+        MitsonarError: no frames there, shares that do not add up to 1, too few sequences or frames for them.
     """
+    if split is not None and not (min(split) >= 0 and abs(sum(split) - 1) < 1e-6):
+        raise MitsonarError(f"--split is three shares that add up to 1, 0.7,0.15,0.15 for example: got {split}")
     if is_data_set(where):
-        return _of_data_set(str(where), view)
+        return _of_data_set(str(where), view, split)
+    source = _of_frames(where, view)
+    return source if split is None else replace(source, part=_stretches(source.frames, split))
+
+
+def _of_frames(where: str | Path, view: str | None) -> ExportSource:
+    """Take the frames of a run or of a recording."""
     if view is not None:
         raise MitsonarError(f"{where} is no data set: --view chooses among the views of one; leave it out")
     path = Path(where)
-    if path.is_dir():
-        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+    if os.path.isdir(path):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
         path = found[0] if found else path
     if path.suffix == ".npz":
         return _in_memory(SonarFrames.load(path), str(where))
@@ -124,31 +146,67 @@ def _labels_of_zarr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return stored, {"shape_names": like.shape_names, "object_names": like.object_names}
 
 
-def _of_data_set(url: str, view: str | None) -> ExportSource:
-    """Take all frames of one view of a data set."""
+def _stretches(frames: int, split: tuple[float, float, float]) -> NDArray[np.str_]:
+    """Cut frames into a stretch for each part, in the order of time.
+
+    Raises:
+        MitsonarError: fewer frames than parts.
+    """
+    wanted = [share > 0 for share in split]
+    ends = np.rint(np.cumsum(split) * frames).astype(int)
+    counts = np.maximum(np.diff(ends, prepend=0), wanted)
+    counts[int(np.argmax(split))] -= counts.sum() - frames
+    if (counts[wanted] < 1).any():
+        raise MitsonarError(
+            f"{frames} frames are too few for training, validation and test of {split}: give more, or another --split"
+        )
+    return np.repeat(np.array(PARTS, dtype="<U10"), counts)
+
+
+def _of_data_set(url: str, view: str | None, split: tuple[float, float, float] | None) -> ExportSource:
+    """Take all frames of one view of a data set.
+
+    Raises:
+        MitsonarError: too few sequences or scenes for a split that was given.
+    """
     store = DataStore.open(url)
     chosen = view_in(store, view)
     labels = {label: f"{label}{store.recipe.suffix(chosen.name)}" for label in store.recipe.labels}
+    scene = np.asarray(store.read("scene"))
+    names, places = names_of_scenes(store) if "shape_id" in labels else ((), {})
 
     def read(part: slice) -> SonarFrames:
         told: dict[str, Any] = {label: store.read(array, part) for label, array in labels.items()}
+        for number in np.unique(scene[part]) if places else ():
+            own = scene[part] == number
+            told["shape_id"][own] = places[int(number)][told["shape_id"][own]]
         return replace(
             chosen.like,
             image=store.read(chosen.array, part),
             time_s=store.read("time_s", part),
             poses=store.read("pose", part),
             height_m=store.read("height_m", part),
+            shape_names=names,
             **told,
         )
 
     sequence = np.asarray(store.read("sequence"), dtype=np.int64)
     about = str(store.about["recipe"].get("about") or store.recipe.name)
-    return ExportSource(url, len(store), sequence, read(slice(0, 0)), tuple(labels), True, _parts(store), read, about)
+    raised = store.recipe.noise_raised_db(scene)
+    parts = _parts(store, split)
+    return ExportSource(url, len(store), sequence, read(slice(0, 0)), tuple(labels), True, parts, read, about, raised)
 
 
-def _parts(store: DataStore) -> NDArray[np.str_]:
-    """Return the part of each frame by the recipe's split; a split of samples does not divide frames."""
+def _parts(store: DataStore, shares: tuple[float, float, float] | None) -> NDArray[np.str_]:
+    """Return the part of each frame by the recipe's split, or by shares; a split of samples does not divide frames.
+
+    Raises:
+        MitsonarError: too few sequences or worlds for shares that were given.
+    """
     parts, split = _all_train(len(store)), store.recipe.split
+    if shares is not None:
+        by = "sequence" if split.by == "sample" else split.by
+        split = Split(by=by, seed=split.seed, **dict(zip(PARTS, shares, strict=True)))
     if split.by == "sample":
         return parts
     sequence = np.asarray(store.read("sequence"), dtype=np.int32)
@@ -158,6 +216,8 @@ def _parts(store: DataStore) -> NDArray[np.str_]:
             if getattr(split, name) > 0:
                 parts[deal(world, sequence, split, name)] = name
     except MitsonarError as error:  # too few sequences or worlds for its parts
+        if shares is not None:
+            raise
         warnings.warn(f"all frames are for training: {error}", MitsonarWarning, stacklevel=2)
         return _all_train(len(store))
     return parts

@@ -13,7 +13,7 @@ from mitsonar.config.data_recipe import Recipe, recipe_from
 from mitsonar.datasets.modality import Values
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.datasets.store import PACKAGES, DataStore
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.exports.export_folder import new_folder
 from mitsonar.exports.recorded_frames import FramesWithPoses, Stretch, as_pixels
 from mitsonar.io.provenance import versions
@@ -209,7 +209,7 @@ def _notes(sources: Sequence[FramesWithPoses], sequences: int) -> list[str]:
     """Return what the user should know, a sentence each."""
     notes = [f"{one.name}: {note}" for one in sources for note in one.notes]
     notes += [
-        f"{one.name}: {one.left_out:,} frames are left out, without a pose, of another geometry, or with no neighbour"
+        f"{one.name}: left out: {counted(one.left_out, 'frame')} without a pose, of another geometry, or with no neighbour"
         for one in sources
         if one.left_out
     ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.exports.export_source import ExportSource
-from mitsonar.exports.labelled_pictures import LabelledPictures, class_names
+from mitsonar.exports.labelled_pictures import LabelledPictures
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Shot", "as_json", "pose_of", "refuse_unlabelled", "refuse_unposed", "regions_of", "shots"]
@@ -62,12 +62,12 @@ def refuse_unposed(source: ExportSource) -> None:
 
 def regions_of(shot: Shot, pictures: LabelledPictures, source: ExportSource) -> dict[str, list[object]]:
     """Return boxes, classes and names of a frame's regions as plain lists; empty where there are no labels."""
-    names = class_names(source.like)
-    found = pictures.regions(shot.frames, shot.index) if "shape_id" in source.labels else []
+    raised_db = float(source.raised_db[shot.number])
+    found = pictures.regions(shot.frames, shot.index, raised_db) if "shape_id" in source.labels else []
     return {
         "bbox": [list(region.box) for region in found],
         "category": [region.kind for region in found],
-        "name": [names.get(region.kind, f"shape {region.kind}") for region in found],
+        "name": [pictures.classes[region.kind] for region in found],
         "object": [region.number for region in found],
     }
 

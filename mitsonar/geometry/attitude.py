@@ -8,8 +8,9 @@ agree. Where the last echoes tell a much smaller height, the ground rises, and t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Attitude", "attitude_of"]
 
-AGREEING = 0.25
-"""Largest difference of first echoes and given height, as part of the given height. Beyond it one of them is wrong."""
+DOUBTFUL = 3.0
+"""Standard deviations of both beyond which first echoes contradict a given height, and do not count."""
+
+SAME = 1e-9
+"""Differences of heights [m] and angles [rad] of frames that are none."""
 
 STD_MEASURED, STD_GIVEN = 0.02, 0.05
 """Standard deviation of the height over the visible surface, as part of it: with first echoes, and without."""
@@ -40,6 +44,14 @@ STD_RISING = 0.29
 """Standard deviation of the height over rising ground besides, as part of that difference: it may be any between both."""
 
 
+class Apart(NamedTuple):
+    """Height [m], pitch and roll [rad] of a frame, less those of the mean of the frames."""
+
+    height_m: float
+    pitch_rad: float
+    roll_rad: float
+
+
 @dataclass(frozen=True)
 class Attitude:
     """Height and attitude of the sonar over the visible surface.
@@ -51,8 +63,10 @@ class Attitude:
         roll_rad: > 0 puts starboard down.
         reason: why the given geometry is rejected; empty where it is not.
         even: whether first echoes show ground without relief.
-        told_m: height over the ground as it was told [m]; None: it was not.
-        first: what first echoes tell; None: they did not tell the height.
+        given_m: height over the ground as given [m]; None: it was not.
+        first: height by first echoes; None where they do not show it, or contradict the height as given.
+        doubt: how first echoes contradict the height as given, which counts nevertheless; empty where they do not.
+        apart: height, pitch and roll of each frame, less their mean; empty where they are not known, or all the same.
     """
 
     height_m: float
@@ -60,24 +74,36 @@ class Attitude:
     pitch_rad: float
     roll_rad: float = 0.0
     reason: str = ""
+    doubt: str = ""
     even: bool = False
-    told_m: float | None = None
+    given_m: float | None = None
     first: FirstEchoes | None = None
+    apart: tuple[Apart, ...] = ()
 
     @property
     def floor_m(self) -> float:
-        """Height over the floor, where the fan begins to light it [m]: as told, but there may be a rock straight below."""
-        return self.height_m if self.told_m is None else max(self.told_m, self.height_m)
+        """Height over the floor, where the fan begins to light it [m]: as given, but there may be a rock straight below."""
+        return self.height_m if self.given_m is None else max(self.given_m, self.height_m)
 
     @property
     def tops_m(self) -> float:
         """Height of the contrast above the mean of the first echoes [m]; 0 where they did not tell the height."""
         return 0.0 if self.first is None else self.first.tops_m
 
-    def ground(self, frames: SonarFrames) -> GroundGeometry:
-        """Return the level ground that the cells of the frames show from this height and attitude."""
-        bearing = frames.sonar.bearing
-        return GroundGeometry(frames.range_m, frames.bearing_rad, bearing, self.height_m, self.pitch_rad, self.roll_rad)
+    @property
+    def about(self) -> dict[str, str]:
+        """Return what an estimate must report of the attitude: a doubt, if there is one."""
+        return {"doubt": self.doubt} if self.doubt else {}
+
+    def of_frame(self, number: int, lift_m: float = 0.0) -> tuple[float, float, float]:
+        """Return height [m], pitch and roll [rad] of one of the frames, over ground that is raised by ``lift_m``."""
+        apart = self.apart[number] if self.apart else Apart(0.0, 0.0, 0.0)
+        return self.height_m + apart.height_m - lift_m, self.pitch_rad + apart.pitch_rad, self.roll_rad + apart.roll_rad
+
+    def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:
+        """Return the level ground that the cells show, of the mean of the frames or of one of them."""
+        pose = (self.height_m, self.pitch_rad, self.roll_rad) if number is None else self.of_frame(number)
+        return GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, *pose)
 
 
 def attitude_of(
@@ -122,34 +148,58 @@ def attitude_of(
             f"{name} needs height and pitch: the frames hold no height, and their window shows no first echoes; give "
             f"{argument('height_m')}"
         )
-    level = _over_level(found.first, given, pitch, roll)
-    return level if level.reason else _over_rising(level, found)
+    attitude = (
+        _over_rising(found, given, pitch, roll) if _rises(found, given) else _over_level(found.first, given, pitch, roll)
+    )
+    return replace(attitude, apart=_apart(frames))
 
 
-def _over_level(first: FirstEchoes | None, told_m: float | None, pitch: float, roll: float) -> Attitude:
-    """Return the attitude over level ground, whose height first echoes tell, or else somebody."""
-    if told_m is not None:
-        told = Attitude(told_m, STD_GIVEN * told_m, pitch, roll)
-        if first is None:
-            return told
-        if abs(first.height_m - told_m) > AGREEING * told_m:
-            reason = f"first echoes tell a height of {first.height_m:.2f} m, not {told_m:.2f} m: height or pitch is wrong"
-            return replace(told, reason=reason)
-    assert first is not None
+def _rises(found: EchoHeights, given_m: float | None) -> bool:
+    """Return whether the far end of the light lies so much higher than its near end that the ground must rise."""
+    if found.last_clear_m is None:
+        return False
+    first_m = found.first.height_m + found.first.tops_m if found.first is not None else given_m
+    assert first_m is not None
+    even = found.first is not None and found.first.even
+    return first_m - found.last_clear_m > (RISING_EVEN if even else RISING) * first_m
+
+
+def _over_rising(found: EchoHeights, given_m: float | None, pitch: float, roll: float) -> Attitude:
+    """Return the attitude over ground that rises: the mean height of both ends of the light counts."""
+    assert found.ends_m is not None
+    assert found.last_m is not None
+    first = found.first
+    first_m = first.height_m + first.tops_m if first is not None else given_m
+    assert first_m is not None
+    std = float(np.hypot(STD_MEASURED * found.ends_m, STD_RISING * (first_m - found.last_m)))
+    return Attitude(found.ends_m, std, pitch, roll, even=first is not None and first.even, given_m=given_m, first=first)
+
+
+def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, roll: float) -> Attitude:
+    """Return the attitude over level ground: the height as given, by first echoes, or both by their weights."""
+    if first is None:
+        assert given_m is not None
+        return Attitude(given_m, STD_GIVEN * given_m, pitch, roll, given_m=given_m)
     std = STD_MEASURED * first.height_m
-    return Attitude(first.height_m, std, pitch, roll, even=first.even, told_m=told_m, first=first)
+    measured = Attitude(first.height_m, std, pitch, roll, even=first.even, given_m=given_m, first=first)
+    if given_m is None:
+        return measured
+    given_std = STD_GIVEN * given_m
+    if abs(first.height_m - given_m) > DOUBTFUL * math.hypot(given_std, std):
+        doubt = f"first echoes give a height of {first.height_m:.2f} m, not {given_m:.2f} m"
+        std = math.hypot(given_std, first.height_m - given_m)
+        return replace(measured, height_m=given_m, height_std_m=std, even=False, first=None, doubt=doubt)
+    weight = given_std**2 / (given_std**2 + std**2)
+    height = given_m + weight * (first.height_m - given_m)
+    return replace(measured, height_m=height, height_std_m=given_std * math.sqrt(1 - weight))
 
 
-def _over_rising(level: Attitude, found: EchoHeights) -> Attitude:
-    """Return the attitude over the mean of both ends of the light, where they show that the ground rises."""
-    if found.last_m is None or found.ends_m is None:
-        return level
-    first_m = level.height_m + level.tops_m
-    apart = first_m - found.last_m
-    if apart <= (RISING_EVEN if level.even else RISING) * first_m:
-        return level
-    std = float(np.hypot(STD_MEASURED * found.ends_m, STD_RISING * apart))
-    return replace(level, height_m=found.ends_m, height_std_m=std)
+def _apart(frames: SonarFrames) -> tuple[Apart, ...]:
+    """Return height, pitch and roll of each frame less their mean, by the poses; empty where they are all the same."""
+    if frames.poses is None or not np.isfinite(frames.poses[:, 2:5]).all():
+        return ()
+    apart = frames.poses[:, 2:5] - frames.poses[:, 2:5].mean(axis=0)
+    return () if (np.abs(apart) < SAME).all() else tuple(Apart(*(float(value) for value in row)) for row in apart)
 
 
 def _mean_lean(frames: SonarFrames) -> NDArray[np.float64] | None:

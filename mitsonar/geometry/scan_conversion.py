@@ -113,7 +113,7 @@ def cartesian_map(range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -
 
 
 def to_cartesian(image: ArrayLike, range_m: ArrayLike, bearing_rad: ArrayLike, rows: int = 800) -> CartesianImage:
-    """Convert one image ``(bins, beams)`` to a fan in metres; see :func:`cartesian_map`.
+    """Convert one image ``(bins, beams)`` to a fan in metres; see :func:`~mitsonar.geometry.scan_conversion.cartesian_map`.
 
     Raises:
         MitsonarError: shapes that do not fit, or ranges or bearings that do not rise.

@@ -8,11 +8,12 @@ from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, shortened
 from mitsonar.instruments.imaging_sonar import FieldValue, Instrument
+from mitsonar.io.checked_model import CheckedModel
 
 __all__ = [
     *("LOOKS", "NUMPY", "PADDING", "ChannelModel", "ChannelSonar"),
@@ -40,7 +41,7 @@ class Maths(NamedTuple):
 NUMPY = Maths(np.arcsin, np.arctan2, np.cos, np.clip, np.where)
 
 
-class FieldOfView(BaseModel):
+class FieldOfView(CheckedModel):
     """Field of view of a transducer in the vehicle's axes (starboard, forward, up), and its sensitivity.
 
     Shapes: ``rectangular``, ``across_deg`` wide across a vertical plane and ``along_deg`` in it; ``circular``, a cone of
@@ -51,6 +52,8 @@ class FieldOfView(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str] = "field of view"
 
     shape: Literal["rectangular", "circular", "all"] = Field("rectangular", description="of the field of view")
     heading_deg: float = Field(0.0, ge=-360, le=360, description="where it looks: 0 forward, 90 to starboard [deg]")
@@ -104,10 +107,12 @@ class FieldOfView(BaseModel):
         return 0.5 + 0.5 * maths.cos(ramp * math.pi)
 
 
-class Hydrophone(BaseModel):
+class Hydrophone(CheckedModel):
     """A receiver: its name, its position from the transmitter in the vehicle's axes, and its field of view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str] = "receiver"
 
     name: str = Field(min_length=1, description="of the receiver")
     position: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="starboard, forward, up [m]")
@@ -158,7 +163,7 @@ class ChannelSonar(Instrument):
     ``channel_sonar`` (docs/guides/impulse-responses.md).
 
     Raises:
-        MitsonarError: through :meth:`create` and :meth:`replace`, for an unknown key or a value outside its limits.
+        MitsonarError: an unknown key, or a value outside its limits.
     """
 
     called: ClassVar[str] = "channel sonar"
@@ -192,6 +197,14 @@ class ChannelSonar(Instrument):
     seed: int = Field(0, ge=0, lt=2**31, description="of the places and weights of scatterers without cells")
     transmitter: FieldOfView = Field(FieldOfView(shape="all"), description="its field of view")
     receivers: tuple[Hydrophone, ...] = Field(default_factory=four_receivers, min_length=1, description="the receivers")
+
+    def __repr__(self) -> str:
+        names = [one.name for one in self.receivers]
+        shown = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+        return (
+            f"ChannelSonar({self.name}: {self.carrier_hz / 1e3:g} kHz, band {self.bandwidth_hz / 1e3:g} kHz, {len(names)} "
+            f"receivers ({shown}), {self.taps} taps, to {self.range_max:g} m, model {self.model})"
+        )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

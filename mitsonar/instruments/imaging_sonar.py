@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.aperture import Aperture, Pattern, Shading
 from mitsonar.instruments.ping_groups import GroupOrder, check_groups, scans
 from mitsonar.instruments.pulse import Pulse
 from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
+from mitsonar.io.checked_model import CheckedModel
 
 __all__ = ["RAYS", "Bearing", "Coding", "FieldValue", "Instrument", "Model", "Sonar"]
 
@@ -53,19 +53,25 @@ def _rays_across(given: dict[str, FieldValue]) -> int:
     return rays_across(given["quality"], width, fov, given["range_max"])
 
 
-class Instrument(BaseModel):
-    """Base of all instruments. :meth:`create` answers a mistake with one sentence."""
+UNNAMED = "custom"
+"""Name of an instrument that was given none."""
+
+
+class Instrument(CheckedModel):
+    """Base of all instruments."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    called: ClassVar[str]
-    see: ClassVar[str]
-
-    name: str = Field("custom", description="what the instrument is called")
+    name: str = Field(UNNAMED, description="what the instrument is called")
 
     if TYPE_CHECKING:  # each has its own, at its own position among the keys
         model: str
         frame_rate_hz: float
+
+    @property
+    def title(self) -> str:
+        """Return the name for titles and sentences; of an instrument without one, what it is: ``unnamed sonar``."""
+        return f"unnamed {self.called}" if self.name == UNNAMED else self.name
 
     @classmethod
     def create(cls, **fields: FieldValue) -> Self:
@@ -74,10 +80,7 @@ class Instrument(BaseModel):
         Raises:
             MitsonarError: an unknown key, a value outside its limits.
         """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, cls.called, cls.see)) from None
+        return cls(**fields)
 
     def replace(self, **fields: FieldValue) -> Self:
         """Return a copy with some fields changed; all fields are checked.
@@ -86,6 +89,9 @@ class Instrument(BaseModel):
             MitsonarError: an unknown key, a value outside its limits.
         """
         return self.create(**{**self.model_dump(), **fields})
+
+    def __str__(self) -> str:
+        return repr(self)
 
 
 class Sonar(Instrument):
@@ -124,7 +130,8 @@ class Sonar(Instrument):
     seed: int = Field(0, ge=0, lt=2**63, description="seed of the jitter")
     model: Model = Field(
         "physical",
-        description="coherent: with speckle, beams and pulse; physical: expected levels; thesis: Almanza-Medina's",
+        description="coherent: with speckle, beams and pulse, as presets of real sonars have it; physical: expected levels, "
+        "the default since coherent needs a frequency_hz; thesis: Almanza-Medina's",
     )
     bounces: int = Field(
         1, ge=1, le=3, description="largest number of reflections of a path: 1, 2 or 3 (docs/guides/multipath.md)"
@@ -227,6 +234,13 @@ class Sonar(Instrument):
     )
     coding_db: float = Field(80.0, gt=0, le=300, description="span of the coding dB, from value 0 to 1 [dB]")
     coding_gamma: float = Field(0.5, gt=0, le=4, description="of the coding gamma: value = amplitude^gamma")
+
+    def __repr__(self) -> str:
+        carrier = "" if self.frequency_hz is None else f", {self.frequency_hz / 1e3:g} kHz"
+        return (
+            f"Sonar({self.name}: {self.beams} beams over {self.azimuth_fov_deg:g} deg, {self.range_bins} bins over "
+            f"{self.range_min:g}..{self.range_max:g} m{carrier}, model {self.model})"
+        )
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -8,6 +8,7 @@ limits.
 
 from __future__ import annotations
 
+import os
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -74,14 +75,14 @@ def load_sonar(name_or_file: str | Path) -> Sonar:
         MitsonarError: unknown preset (with the nearest names), unreadable file, unknown key, value out of limits.
     """
     text = str(name_or_file)
-    if "," in text and not Path(text).exists():
+    if "," in text and not os.path.exists(text):
         first, *over = (part.strip() for part in text.split(","))
         sonar = load_sonar(first)
         for one in over:
             sonar = sonar.replace(**{key: value for key, value in fields_in(one).items() if key != "name"})
         return sonar
     if not text.lower().endswith((".yaml", ".yml")):
-        if text in named_sonars() or not Path(text).exists():
+        if text in named_sonars() or not os.path.exists(text):
             return preset(text)
         raise MitsonarError(f"a sonar's file ends in .yaml: got {text}; rename it, or name a preset")
     fields = fields_in(text)

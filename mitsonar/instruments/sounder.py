@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from mitsonar.errors import MitsonarError, complaint, nearest_names
+from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.beam_directions import directions
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.checked_model import CheckedModel
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 
 __all__ = ["KINDS", "Kind", "Sounder"]
@@ -28,17 +29,20 @@ Mount = tuple[float, float, float, float, float, float]
 """Place of a fan in the vehicle: starboard, forward, up [m], pitch, roll, heading [deg]."""
 
 
-class Sounder(BaseModel):
+class Sounder(CheckedModel):
     """An instrument made of equal fans. All of them ping at once, and do not hear each other.
 
     ``rows`` above 1 stacks fans on each mount, ``elevation_fov_deg`` of the fan apart: a 2-D array. With the bearing
     ``cone`` the rows share their cones, as those of such an array do.
 
     Raises:
-        MitsonarError: through :meth:`create`, for an unknown key or a value outside its limits.
+        MitsonarError: an unknown key, or a value outside its limits.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    called: ClassVar[str] = "instrument"
+    see: ClassVar[str] = SEE
 
     name: str = Field("custom", description="what the instrument is called")
     kind: Kind = Field(description="what is made of its echoes")
@@ -68,10 +72,7 @@ class Sounder(BaseModel):
                 f"unknown instrument key {wrong[0]}: {nearest_names(wrong[0], own | set(Sonar.model_fields))}"
             )
         fan = Sonar.create(**{key: value for key, value in fields.items() if key not in own or key == "name"})
-        try:
-            return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})
-        except ValidationError as error:
-            raise MitsonarError(complaint(error, cls, "instrument", SEE)) from None
+        return cls(fan=fan, **{key: value for key, value in fields.items() if key in own})
 
     def replace(self, **fields: Any) -> Self:
         """Return a copy with some keys changed, of its own or of the fan; all are checked.
@@ -84,6 +85,12 @@ class Sounder(BaseModel):
         kept = self.model_dump(exclude={"fan"}) | {key: fields[key] for key in own & set(fields)}
         wrong = {key: value for key, value in fields.items() if key not in own and key not in Sonar.model_fields}
         return self.create(**{**fan.model_dump(include=fan.model_fields_set), **kept, **wrong})
+
+    def __repr__(self) -> str:
+        return f"Sounder({self.name}, {self.kind}: {len(self.channels)} fans ({', '.join(self.channels[:4])}) of {self.fan})"
+
+    def __str__(self) -> str:
+        return repr(self)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -117,7 +124,7 @@ class Sounder(BaseModel):
             return bases
         step = math.radians(self.fan.elevation_fov_deg)
         pitch = (np.arange(self.rows) + 0.5 - self.rows / 2) * step  # the first row looks up
-        rows = [mounted(bases, Pose(0, 0, 0, float(one))) for one in pitch]
+        rows = [mounted(bases, Pose.from_row((0, 0, 0, float(one), 0, 0))) for one in pitch]
         return np.stack(rows, axis=1).reshape(-1, 6)
 
     @property
@@ -125,9 +132,14 @@ class Sounder(BaseModel):
         """Return the unit vectors of the fans' axes ``(channels, 3)`` as (starboard, forward, up) of the vehicle."""
         return np.asarray(vehicle_rotation(self.mount_poses).apply([0.0, 1.0, 0.0]))
 
+    @property
+    def looks_ahead(self) -> bool:
+        """Return whether all fans look ahead, so that the instrument's poses are those of a forward-looking sonar."""
+        return bool((self.axes[:, 1] > math.cos(math.radians(45))).all())
+
     def fan_poses(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the poses of all fans in the world ``(pings, channels, 6)`` for poses of the vehicle ``(pings, 6)``."""
-        return np.stack([mounted(poses, Pose(*mount)) for mount in self.mount_poses], axis=1)
+        return np.stack([mounted(poses, Pose.from_row(mount)) for mount in self.mount_poses], axis=1)
 
     def directions(self) -> NDArray[np.float64]:
         """Return the beams' axes in the frame of their fan ``(beams, 3)`` as (starboard, forward, up)."""

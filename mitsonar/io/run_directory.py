@@ -19,7 +19,7 @@ from mitsonar.io.plain_data import check_plain, finite_number, whole_number
 from mitsonar.io.provenance import plain_json, refuse_other, shown, versions
 from mitsonar.io.whole_files import read_json, write_json
 
-__all__ = ["RUN_FILE", "RunDirectory", "RunKind", "refuse_to_replace"]
+__all__ = ["RUN_FILE", "RunDirectory", "RunKind", "kind_of_run", "refuse_to_replace"]
 
 RUN_FILE = "run.json"
 
@@ -118,6 +118,9 @@ class RunDirectory:
         """
         if not (Path(path) / RUN_FILE).is_file():
             raise MitsonarError(f"{path} holds no {kind.name}: there is no {Path(path) / RUN_FILE}")
+        there = kind_of_run(path)
+        if there not in ("", kind.name):
+            raise MitsonarError(f"{path} holds no {kind.name} but a run of another kind, {there}: give another folder")
         return _read(Path(path), kind)
 
     def start(self, **notes: Any) -> None:
@@ -195,6 +198,15 @@ def refuse_to_replace(*paths: Path, overwrite: bool, option: str = "-o") -> None
     for path in paths:
         if path.exists() and not (overwrite and path.is_file()):
             raise MitsonarError(f"{path} exists and is kept as it is: choose another {option}, or give --overwrite")
+
+
+def kind_of_run(path: str | Path) -> str:
+    """Return the name of the kind of run in a folder, ``odometry``; empty where there is none, or its file is damaged."""
+    try:
+        kind = read_json(Path(path) / RUN_FILE, check=False).get("kind")
+    except MitsonarError:
+        return ""
+    return kind if isinstance(kind, str) else ""
 
 
 def _holds_a_run(path: Path) -> bool:

@@ -12,6 +12,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import zarr
 from fsspec.core import url_to_fs
@@ -21,7 +22,7 @@ from zarr.abc.store import Store
 from mitsonar.errors import MitsonarError
 from mitsonar.io.plain_data import finite_number, parse_json
 
-__all__ = ["Storage"]
+__all__ = ["Storage", "refuse_codecs"]
 
 LOCK = "writer.json"
 LOCK_FILE = "writer.lock"
@@ -32,6 +33,26 @@ HEARTBEAT_S = 20.0
 
 STALE_S = 90.0
 """A writer whose file is older has ended."""
+
+
+CODECS = ("BytesCodec", "BloscCodec", "Crc32cCodec", "GzipCodec", "ShardingCodec", "TransposeCodec", "ZstdCodec")
+"""Codecs of Zarr that only rearrange bytes. Others come from packages that happen to be installed, or unpickle."""
+
+
+def refuse_codecs(array: zarr.Array[Any]) -> None:
+    """Refuse an array whose pieces are decoded by other codecs than :data:`CODECS`; nothing of it is decoded before.
+
+    Raises:
+        ValueError: it is.
+    """
+    rest: list[Any] = list(getattr(array.metadata, "codecs", ()))
+    if array.metadata.zarr_format != 3:
+        raise ValueError("it is of version 2 of Zarr's format, whose pieces may hold pickles")
+    while rest:
+        codec = rest.pop()
+        rest += [*getattr(codec, "codecs", ()), *getattr(codec, "index_codecs", ())]
+        if not (type(codec).__module__.startswith("zarr.codecs.") and type(codec).__name__ in CODECS):
+            raise ValueError(f"its pieces need the codec {type(codec).__name__[:40]}, which is not read")
 
 
 class Storage:

@@ -39,6 +39,9 @@ LARGEST_YAML = 2**20
 INFLATION = 1032
 """Largest factor by which deflated data can grow."""
 
+LAST_LETTER = 0x10FFFF
+"""Largest number of a letter in Unicode."""
+
 MOST_PARTS = 10_000
 """Arrays of an npz file, at most."""
 
@@ -179,16 +182,26 @@ def read_yaml(path: str | Path, what: str, also: str = "") -> PlainValue:
     try:
         return parse_yaml(content.decode("utf-8"), str(path))
     except UnicodeDecodeError as error:
-        raise MitsonarError(f"{path} is not YAML: {error}") from None
+        raise MitsonarError(f"{path} is not YAML: byte {error.start:,} is no text in UTF-8") from None
 
 
 def read_npz(path: str | Path) -> dict[str, FileArray]:
     """Read the arrays of an npz file by name: numbers and texts. Each is checked against its size in the file first.
 
     Raises:
-        ValueError: a list of parts, a size or a type that cannot be.
+        ValueError: nothing there, a folder, an empty file, another kind of file; a list of parts, a size or a type that
+            cannot be.
         Exception: damaged bytes raise errors of many kinds. The caller puts them into words.
     """
+    try:
+        with Path(path).open("rb") as raw:
+            begin = raw.read(1)
+    except OSError as error:
+        raise ValueError(f"{error.strerror or error}") from None
+    if not begin:
+        raise ValueError("it is empty")
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is no npz file, or was cut off")
     with zipfile.ZipFile(path) as file:  # read each part to its end: only then is its checksum tested
         parts = file.infolist()
         if any(entry.comment for entry in parts):  # a damaged length of a comment hides other parts
@@ -237,5 +250,9 @@ def _array_in(content: bytes, name: str) -> FileArray:
     if any(length < 0 for length in shape) or math.prod(shape) * kind.itemsize != len(content) - part.tell():
         raise ValueError(f"{name} says that its shape is {str(shape)[:60]}, its bytes are {len(content) - part.tell():,}")
     values = np.frombuffer(content, kind, math.prod(shape), part.tell()) if kind.itemsize and math.prod(shape) else None
+    if values is not None and kind.kind == "U":
+        letters = values.view(np.dtype(np.uint32).newbyteorder(kind.byteorder))
+        if (letters > LAST_LETTER).any():  # NumPy makes a text of them, which ends others' readers
+            raise ValueError(f"{name} holds text that is not Unicode")
     made = np.zeros(shape, kind) if values is None else values.reshape(shape, order="F" if fortran_order else "C")
     return np.array(made)  # writable

@@ -23,6 +23,9 @@ __all__ = ["SONAR_FRAME", "WORLD_FRAME", "FoxgloveServer"]
 
 SONAR_FRAME, WORLD_FRAME, POSE_TOPIC = "sonar", "world", "/pose"
 
+FAREWELL_S = 1.0
+"""How long :meth:`FoxgloveServer.close` waits for the clients' farewell [s]."""
+
 NUMBERS = ("number", "dropped", "pose_ns", "published_ns", "render_ms", "latency_ms")
 TIMING = {
     "type": "object",
@@ -105,8 +108,10 @@ class FoxgloveServer:
         self._server.publish_status(sentence, foxglove.StatusLevel.Warning)
 
     def close(self) -> None:
-        """End all connections."""
-        self._server.stop()
+        """End all connections, and wait a moment for it: a client that no longer reads never takes leave."""
+        stopping = threading.Thread(target=self._server.stop, daemon=True)
+        stopping.start()
+        stopping.join(FAREWELL_S)
 
 
 class _Poses(ServerListener):

@@ -135,4 +135,4 @@ def _ping(frames: SonarFrames, number: int, delivered: Delivered, source: str, r
 def _played(path: Trajectory, number: int) -> Delivered:
     """Return the pose of a path that is played in a circle."""
     pose = path.poses[number % len(path)]
-    return Delivered(AskedPose(Pose(*(float(value) for value in pose))), time.time_ns(), 0)
+    return Delivered(AskedPose(Pose.from_row(float(value) for value in pose)), time.time_ns(), 0)

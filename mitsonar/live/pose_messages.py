@@ -64,8 +64,8 @@ def asked_pose(message: bytes) -> AskedPose:
             f"a pose has no key {shortened(unknown[0])}{meant(unknown[0], SIX)}: give {', '.join(SIX)} in m and deg, or pose"
         )
     mark = table.get("id")
-    if not isinstance(mark, int | float | str | None):
-        raise MitsonarError(f"id of a pose is a number or a text: got {shortened(mark)}")
+    if not isinstance(mark, int | float | str | None) or (isinstance(mark, float) and not math.isfinite(mark)):
+        raise MitsonarError(f"id of a pose is a finite number or a text: got {shortened(mark)}")
     if "pose" in table:
         both = [key for key in SIX if key in table]
         if both:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -78,9 +79,9 @@ def recording_at(
 
 def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
     """Return what reads the labels of a run; None where it has none."""
-    if path.is_dir() and path.suffix != ".zarr":
-        path = next(one for one in (path / "frames.npz", path / "frames.zarr") if one.exists())
-    if path.is_file():
+    if os.path.isdir(path) and path.suffix != ".zarr":
+        path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
+    if os.path.isfile(path):
         frames = SonarFrames.load(path)
         kept = {name: getattr(frames, name) for name in LABELS if getattr(frames, name) is not None}
         return (lambda index: {name: values[index] for name, values in kept.items()}) if kept else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from array import array
 from collections.abc import Iterator
@@ -43,13 +44,13 @@ def open_sensors(path: str | Path) -> VehicleSensors:
         MitsonarError: unreadable, or without readings.
     """
     where = Path(path)
-    if where.is_dir() and not is_ros_bag(where, b""):
-        if not (where / TRAJECTORY).is_file():
+    if os.path.isdir(where) and not is_ros_bag(where, b""):
+        if not os.path.isfile(where / TRAJECTORY):
             raise MitsonarError(f"{path} holds no {TRAJECTORY}: give a CSV file of sensors, a folder with one, or a ROS bag")
         return load_sensors(where / TRAJECTORY)
     try:
         first = b""
-        if where.is_file():
+        if os.path.isfile(where):
             with where.open("rb") as file:
                 first = file.read(64)
     except OSError as error:

@@ -130,7 +130,7 @@ def checked_poses(poses: ArrayLike | None) -> NDArray[np.float64]:
 
 def fan_of(frames: SonarFrames, pose: NDArray[np.float64], height: float) -> FrameFan:
     """Return the geometry of a frame at a pose and a height [m] over the ground."""
-    at = Pose(*pose)
+    at = Pose.from_row(pose)
     ground = GroundGeometry(frames.range_m, frames.bearing_rad, frames.sonar.bearing, float(height), at.pitch, at.roll)
     return FrameFan(ground, math.radians(frames.sonar.elevation_fov_deg) / 2)
 

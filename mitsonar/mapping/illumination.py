@@ -29,15 +29,16 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
     """Return how brightly each cell of the image is lit over even ground ``(bins, beams)``, with mean 1; 1 beyond ground.
 
     It is the mean of frames that show different ground, smoothed within the lit part of the image. The height and the pitch
-    of the sonar must stay about the same. :data:`ILLUMINATION_FRAMES` frames, spread over the run, suffice.
+    of the sonar must stay about the same. :data:`~mitsonar.mapping.illumination.ILLUMINATION_FRAMES`
+    frames, spread over the run, suffice.
 
     Args:
         frames: a sample of the run.
-        poses: as in :meth:`Mosaic.add`.
-        height_m: as in :meth:`Mosaic.add`.
+        poses: as in :meth:`~mitsonar.mapping.mosaic.Mosaic.add`.
+        height_m: as in :meth:`~mitsonar.mapping.mosaic.Mosaic.add`.
 
     Raises:
-        MitsonarError: as :meth:`Mosaic.add`; the frames show no ground, or nothing.
+        MitsonarError: as :meth:`~mitsonar.mapping.mosaic.Mosaic.add`; the frames show no ground, or nothing.
     """
     table, heights = poses_and_heights(frames, poses, height_m)
     mean = levels_of(frames).mean(axis=0)

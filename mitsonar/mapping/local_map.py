@@ -202,7 +202,7 @@ def _images(source: FrameSource, numbers: Index) -> Iterator[tuple[SonarFrames, 
 
 def _predicted(before: Array, estimate: Estimate, attitude: Array) -> Array:
     """Return the pose after a motion, at the height and attitude that are told."""
-    pose = np.array(compose(Pose(*(float(value) for value in before)), estimate.motion))
+    pose = np.array(compose(Pose.from_row(float(value) for value in before), estimate.motion))
     pose[2:5] = attitude[2:5]
     return pose
 

@@ -286,7 +286,7 @@ def _nearest(searched: _Searched, key: int, second: int, motion: Motion) -> _Can
 
 def _composed(pose: Array, motion: Motion) -> Array:
     """Return x, y, heading after a motion (eq. 3.4)."""
-    after = compose(Pose(pose[0], pose[1], 0.0, 0.0, 0.0, pose[2]), motion)
+    after = compose(Pose.from_row((pose[0], pose[1], 0.0, 0.0, 0.0, pose[2])), motion)
     return np.array([after.x, after.y, after.heading])
 
 

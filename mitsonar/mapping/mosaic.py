@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
+from mitsonar.errors import MitsonarError, argument, counted, nearest_names
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.mapping.frame_footprint import (
     LONGEST_SIDE,
@@ -278,7 +278,7 @@ class Mosaic:
             raise MitsonarError(self._empty())
 
     def _empty(self) -> str:
-        added = f"{self.frames} frames added, {self.frames_without_ground} of them show no ground"
+        added = f"{counted(self.frames, 'frame')} added, without ground in {self.frames_without_ground:,}"
         return f"the mosaic is empty: {added}; check height, pitch and window"
 
     @property
@@ -340,14 +340,19 @@ def build_mosaic(
         frames: of one sonar, all at once or in consecutive chunks.
         poses: of the sonar in the whole run ``(n, 6)`` [m, rad]: an estimated path; default: those of the frames.
         height_m: over the ground ``(n,)`` or one for all [m]; default: those of the frames.
-        cell_m: see :class:`Mosaic`.
-        blend: see :class:`Mosaic`.
-        centre_beams: see :class:`Mosaic`.
-        most_cells: see :class:`Mosaic`.
-        illumination: see :class:`Mosaic`.
+        cell_m: edge of a cell [m].
+        blend: ``weighted``: all beams, with weights that fall to 0 at the edges of the fan; ``centre``: the plain mean of
+            the ``centre_beams`` in the middle.
+        centre_beams: for ``centre``.
+        most_cells: largest number of cells.
+        illumination: of :func:`mitsonar.mapping.illumination.illumination` ``(bins, beams)``. Images are divided by it.
+
+    Returns:
+        The map; see :class:`mitsonar.mapping.mosaic.Mosaic`.
 
     Raises:
-        MitsonarError: as :meth:`Mosaic.add`; more or fewer frames than poses; no frame that shows ground.
+        MitsonarError: frames without poses or height, or that do not fit;
+            more or fewer frames than poses; no frame that shows ground.
     """
     mosaic = Mosaic(cell_m, blend, centre_beams=centre_beams, most_cells=most_cells, illumination=illumination)
     table = None if poses is None else checked_poses(poses)

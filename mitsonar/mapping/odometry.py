@@ -17,8 +17,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, argument, nearest_names
-from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.errors import MitsonarError, argument, counted, nearest_names
+from mitsonar.estimation.estimator import Estimate
+from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import GraphPath, LoopTask, errors_along, graph_path
@@ -109,12 +110,12 @@ class Odometry:
         if self.series.covariances is None:
             return None
         by_map = np.array([one.about.get("map") == USED for one in self.estimates], dtype=bool)
-        return pose_covariances(self.series, Pose(*self.path.poses[0]), correlated=self.correlated, alone=by_map)
+        return pose_covariances(self.series, Pose.from_row(self.path.poses[0]), correlated=self.correlated, alone=by_map)
 
     def rows(self) -> list[Row]:
         """Return name, value and unit of all results: the one table for console, file and README."""
         count = len(self.estimates)
-        rows: list[Row] = [("motions", count, ""), ("motions not believed, bridged", count - int(self.believed.sum()), "")]
+        rows: list[Row] = [("motions", count, ""), ("motions rejected, bridged", count - int(self.believed.sum()), "")]
         by_map = [one.about["map"] for one in self.estimates if "map" in one.about]
         if by_map:
             rows.append(("motions by the local map", by_map.count(USED), ""))
@@ -136,7 +137,7 @@ class Odometry:
         rows += _by_axis("RMSE of always answering zero", errors.zero)
         rows += [(f"slope over the true {axis.name}", float(s), "") for axis, s in zip(AXES, errors.slope, strict=True)]
         if np.isfinite(errors.nees):
-            rows.append(("squared motion error over its covariance, a third", errors.nees, ""))
+            rows.append(("NEES (1 is honest)", errors.nees, ""))
         return rows + [(name, float(value), unit) for name, value, unit in assess(self.path, self.true).rows()]
 
     def warnings(self) -> list[str]:
@@ -144,16 +145,24 @@ class Odometry:
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
         told = []
-        for reasons, what in ((lost, "are not believed and were bridged"), (without, "are those of pairs of frames")):
+        for reasons, what in ((lost, "were rejected and bridged"), (without, "are those of pairs of frames")):
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
-                told.append(f"{len(reasons)} of {len(self.estimates)} motions ({part:.0f} %) {what}: {_usual(reasons)}")
+                told.append(
+                    f"{len(reasons)} of {counted(len(self.estimates), 'motion')} ({part:.0f} %) {what}: {_usual(reasons)}"
+                )
+        doubts = [str(one.about["doubt"]) for one in self.estimates if "doubt" in one.about]
+        if doubts:
+            told.append(
+                f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
+                f"counts all the same: {_usual(doubts)}; check height and pitch"
+            )
         return told
 
 
 def odometry(
     frames: Source | SonarFrames,
-    estimator: AnyEstimator,
+    estimator: EstimatorLike,
     *,
     smooth: Smoothing = "none",
     scale: ArrayLike | Literal["fit"] | None = None,
@@ -178,10 +187,12 @@ def odometry(
 
     Args:
         frames: of one run.
-        estimator: estimates the motion between two frames.
+        estimator: estimates the motion between two frames; any that
+            :func:`~mitsonar.estimation.named_estimators.create_estimator` takes: a name, a checkpoint, one of your own.
         smooth: see above.
         scale: factors for sideways, forward, yaw ``(3,)``; ``fit``: by least squares of valid against true motions.
-        start: the first pose; default: the true one, or the origin with the height, pitch and roll of the first frame.
+        start: the first pose; default: the true one, or the origin with the height of the first frame. Along the path
+            heights, pitch and roll are those of the frames, where known.
         every: use every so many frames only.
         closure: motions over which loops are closed; covariances are raised to what the loops leave over. 0: none.
         sensors: of the vehicle: they tell estimators where to begin, and join in a pose graph.
@@ -199,6 +210,7 @@ def odometry(
             motion, ``fit`` without true poses, loops of records that are not sonar frames, smoothing of a pose graph.
     """
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
+    estimator = create_estimator(estimator)
     numbers = _frames_used(source, smooth, scale, every, closure)
     time_s, shown = source.time_s[numbers], _ground_shown(source, sensors, smooth, loops, local_map)
     if local_map and shown is not None:
@@ -225,6 +237,7 @@ def odometry(
             measured, bridged, first, start_known=known_start, sensors=sensors, loops=task, source=shown, by_map=by_map
         )
         series, path = graph.series, graph.path
+    path = _with_known(path, source, numbers, by_sensors=sensors is not None and sensors.rises(time_s) is not None)
     heights = height_profile(source, numbers, pairs, sensors, path)
     alike = (
         None if shown is None or smooth != "none" or graph is not None else errors_along(series.motions, canvas_of(shown))
@@ -284,9 +297,29 @@ def _scale_factors(
 def _start(source: Source, first: int) -> Pose:
     """Return the true first pose, or what is known of it."""
     if source.poses is not None:
-        return Pose(*(float(value) for value in source.poses[first]))
+        return Pose.from_row(float(value) for value in source.poses[first])
     height = 0.0 if source.height_m is None else float(np.nan_to_num(source.height_m[first]))
     return Pose(0.0, 0.0, height, source.pitch_rad or 0.0)
+
+
+def _with_known(path: Trajectory, source: Source, numbers: Index, *, by_sensors: bool) -> Trajectory:
+    """Return a path along which height, pitch and roll change as those of its frames do, where known: motions are planar.
+
+    Args:
+        path: poses at the frames; heights and angles count from its first pose.
+        source: of the records.
+        numbers: of the frames.
+        by_sensors: whether a depth sensor has given the heights already.
+    """
+    known = source.attitudes(numbers) if isinstance(source, FrameSource) else None
+    known = source.poses[numbers] if known is None and source.poses is not None else known
+    if known is None or not np.isfinite(known[:, 2:5]).all():
+        return path
+    poses = path.poses.copy()
+    poses[:, 3:5] += known[:, 3:5] - known[0, 3:5]
+    if source.poses is not None and not by_sensors:
+        poses[:, 2] += known[:, 2] - known[0, 2]
+    return Trajectory(poses, path.time_s)
 
 
 def _by_axis(what: str, values: Array) -> list[Row]:
@@ -305,7 +338,7 @@ def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
     if estimates and not any(estimate.valid for estimate in estimates):
         reasons = _usual([estimate.reason for estimate in estimates])
         raise MitsonarError(
-            f"none of {len(estimates)} motions is believed, so that there is no path ({reasons}): check what the estimator "
+            f"none of {len(estimates)} motions is valid, so that there is no path ({reasons}): check what the estimator "
             "is given (height, attitude, window or receivers), or try another one"
         )
     return MotionSeries.from_estimates(estimates, time_s)
@@ -345,4 +378,4 @@ def _usual(reasons: list[str]) -> str:
     """Return the most frequent reasons; reasons that differ in their numbers only count as one."""
     kinds = Counter(re.sub(r"-?\d+(\.\d+)?", "#", reason) for reason in reasons).most_common(3)
     example = {re.sub(r"-?\d+(\.\d+)?", "#", reason): reason for reason in reversed(reasons)}
-    return "; ".join(f"{count} times such as {example[kind]!r}" for kind, count in kinds)
+    return "; ".join(f"{counted(count, 'time')} such as {example[kind]!r}" for kind, count in kinds)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
-from mitsonar.estimation.named_estimators import EXTERNAL, estimator_from
+from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
 from mitsonar.io.plain_data import parse_json
 from mitsonar.io.provenance import digest, versions
 from mitsonar.io.run_directory import RunDirectory, RunKind
@@ -57,7 +57,7 @@ class Wanted:
         sets: names of :data:`~mitsonar.mapping.benchmark_sets.SETS`, or paths of recordings and runs.
         textures: of :data:`~mitsonar.mapping.benchmark_sets.TEXTURES`, for simulated sets.
         noises: of :data:`~mitsonar.mapping.benchmark_sets.NOISES`, for simulated sets.
-        methods: as :func:`~mitsonar.estimation.named_estimators.estimator_from` takes them; none: :data:`METHODS`, without
+        methods: as :func:`~mitsonar.estimation.named_estimators.create_estimator` takes them; none: :data:`METHODS`, without
             those whose packages are not installed.
         frames: of each set at most; None: :data:`FRAMES` of a simulated one, all of a recording.
         geometry: file that tells how the pictures of recordings are laid out.
@@ -125,7 +125,7 @@ def benchmark_odometry(
 def _methods(wanted: Wanted) -> tuple[dict[str, AnyEstimator], list[str]]:
     """Create the estimators by name. Of those that were not asked for, leave out those that cannot be, with a note."""
     if wanted.methods:
-        asked = {name: estimator_from(name) for name in dict.fromkeys(wanted.methods)}
+        asked = {name: create_estimator(name) for name in dict.fromkeys(wanted.methods)}
         other = [name for name, estimator in asked.items() if estimator.consumes not in (SonarFrames, object)]
         if other:
             raise MitsonarError(f"{other[0]} does not read frames of one view: the benchmark takes {', '.join(METHODS)}")
@@ -133,7 +133,7 @@ def _methods(wanted: Wanted) -> tuple[dict[str, AnyEstimator], list[str]]:
     made, notes = {}, []
     for name in METHODS:
         try:
-            made[name] = estimator_from(name)
+            made[name] = create_estimator(name)
         except MitsonarError as error:
             notes.append(f"no row of {name}: {error}")
     return made, notes

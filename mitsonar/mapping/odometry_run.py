@@ -35,7 +35,7 @@ from mitsonar.plotting.map_figure import path_figure, save_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["OdometryFolder", "run_odometry", "table_lines"]
+__all__ = ["ODOMETRY", "OdometryFolder", "run_odometry", "table_lines"]
 
 ODOMETRY = RunKind(
     "odometry",

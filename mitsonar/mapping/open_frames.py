@@ -12,7 +12,7 @@ from zipfile import is_zipfile
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.recordings.open_recording import format_of, known_formats, open_recording
 from mitsonar.recordings.recording import Pixels
@@ -56,23 +56,29 @@ def open_frames(
         return _of_data_set(str(where), sequence, view)
     if sequence is not None or view is not None:
         raise MitsonarError(f"{where} is no data set or recording: sequence and view choose among theirs; leave them out")
-    if path.is_dir() and not (path / "zarr.json").is_file():
-        found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+    if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
+        found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
         if not found:
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {FINDING}")
         path = found[0]
-    return _of_zarr(path, str(where)) if path.is_dir() else _of_npz(path, str(where))
+    return _of_zarr(path, str(where)) if os.path.isdir(path) else _of_npz(path, str(where))
 
 
 def load_frames(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None
 ) -> SonarFrames:
-    """Load all frames at a path or URL into memory, with true poses where they are known; see :func:`open_frames`.
+    """Load all frames at a path or URL into memory, with true poses where they are known.
 
     Labels are not loaded: :meth:`mitsonar.SonarFrames.load` loads those of a run.
 
+    Args:
+        where: ``frames.npz``, ``frames.zarr``, the folder of a run that holds either, a data set, or a recording.
+        sequence: of a data set, or part of a recording; default: the longest; of several, the first.
+        view: of a data set, or topic of a ROS bag; default: the first, or the only one.
+        geometry: file that tells how the pictures of a recording are laid out.
+
     Raises:
-        MitsonarError: no frames there; a sequence or view that is not there.
+        MitsonarError: no frames there; a sequence or view that is not there; a geometry that is not needed.
     """
     source = open_frames(where, sequence=sequence, view=view, geometry=geometry)
     return replace(source.read(np.arange(len(source))), poses=source.poses, attitude_rad=source.attitude_rad)
@@ -83,7 +89,7 @@ def is_data_set(where: str | Path) -> bool:
     path = Path(where)
     if "://" in str(where):
         return True
-    if not (path / "zarr.json").is_file():
+    if not os.path.isfile(path / "zarr.json"):
         return False
     import zarr
 
@@ -106,7 +112,8 @@ def _of_recording(path: Path, number: int | None, view: str | None, geometry: st
     part, which = recording.part(number), ""
     if len(recording.parts) > 1:
         chosen = recording.longest if number is None else number
-        which = f"part {chosen} of {len(recording.parts):,}{', the longest' if number is None else ''}: {len(part):,} frames"
+        longest = ", the longest" if number is None else ""
+        which = f"part {chosen} of {len(recording.parts):,}{longest}: {counted(len(part), 'frame')}"
     return FrameSource.of_part(part, str(path), which)
 
 
@@ -116,9 +123,9 @@ def _of_npz(path: Path, name: str) -> FrameSource:
     Raises:
         MitsonarError: nothing there, a file of another kind, or a damaged one.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         raise MitsonarError(f"there are no frames at {path}: {FINDING}")
-    if path.is_file() and os.access(path, os.R_OK) and not is_zipfile(path):
+    if os.path.isfile(path) and os.access(path, os.R_OK) and not is_zipfile(path):
         empty = path.stat().st_size == 0
         reason = "it is empty" if empty else "it is neither a whole frames.npz nor a recording that mitsonar reads"
         raise MitsonarError(f"cannot read frames {path}: {reason}; {FINDING}: {known_formats()}")
@@ -148,7 +155,7 @@ def _of_zarr(path: Path, name: str) -> FrameSource:
     if times.ndim == 1:
         check_column(times, "time_s", COLUMNS["time_s"], {"frames": done}, str(path))
     if done < image.shape[0]:
-        message = f"{path} is not finished: {done:,} of {image.shape[0]:,} frames are there"
+        message = f"{path} is not finished: {done:,} of {counted(image.shape[0], 'frame')} written"
         warnings.warn(message, MitsonarWarning, stacklevel=3)
     poses, attitude, height = table.get("poses"), table.get("attitude_rad"), table.get("height_m")
 
@@ -228,7 +235,8 @@ def sequence_in(store: DataStore, sequence: int | None = None) -> tuple[slice, i
     if not (0 <= number < len(lengths) and lengths[number]):
         raise MitsonarError(f"{store.place.url} has no sequence {number}: it has {len(lengths):,}, numbered from 0")
     first = int(np.argmax(sequences == number))
-    which = f"sequence {number} of {len(lengths):,}{', the longest' if sequence is None else ''}: {lengths[number]:,} frames"
+    longest = ", the longest" if sequence is None else ""
+    which = f"sequence {number} of {len(lengths):,}{longest}: {counted(int(lengths[number]), 'frame')}"
     return slice(first, first + int(lengths[number])), number, which
 
 

@@ -105,6 +105,7 @@ def _made_beside(
 ) -> Generator[tuple[range, list[Estimate]]]:
     """Estimate in new processes; this one reads the frames."""
     with _one_thread_each():
+        others, whole = multiprocessing.active_children(), False
         pool = ProcessPoolExecutor(
             min(workers, max(1, len(batches))), multiprocessing.get_context("spawn"), _begin_worker, (estimator,)
         )
@@ -119,11 +120,15 @@ def _made_beside(
             while waiting:
                 first, answers = waiting.popleft()
                 yield first, answers.result()
+            whole = True
         except BrokenProcessPool:
             raise MitsonarError(
                 "a worker was lost: it was killed, or the memory did not suffice; go on with fewer workers"
             ) from None
         finally:
+            if not whole:  # nobody waits for what the workers do, and a batch may take long
+                for worker in set(multiprocessing.active_children()).difference(others):
+                    worker.terminate()
             pool.shutdown(cancel_futures=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Self
@@ -137,8 +138,8 @@ def holds_responses(where: str | Path) -> bool:
     """Return whether impulse responses are there: a folder of ``mitsonar impulse``, or its responses.npz or .zarr."""
     path = Path(where)
     if path.name.startswith("responses."):
-        return path.exists()
-    return path.is_dir() and (path / "responses.npz").is_file()
+        return os.path.exists(path)
+    return os.path.isdir(path) and os.path.isfile(path / "responses.npz")
 
 
 def open_responses(where: str | Path) -> ResponseSource:

@@ -90,5 +90,5 @@ def _reckoned(poses: Array, time_s: Array, walk: tuple[float, float], draws: Arr
     off = np.cumsum(np.sqrt(np.diff(time_s))[:, None] * [walk[0], walk[0], np.radians(walk[1])] * draws, axis=0)
     # the walk turns with the vehicle: what it adds is of the motion, in axes of the path
     moved = motions(poses) + np.diff(off, axis=0, prepend=0)
-    wandered = path_of(moved, Pose(*poses[0]), time_s)
+    wandered = path_of(moved, Pose.from_row(poses[0]), time_s)
     return DeadReckoning(wandered, walk[0], float(np.radians(walk[1])))

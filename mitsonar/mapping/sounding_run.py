@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_npz
@@ -185,7 +185,7 @@ def _write_dvl(folder: Path, soundings: Soundings) -> list[str]:
     if lost == len(readings.locked):
         return ["the DVL has no bottom lock in any ping: there is no sensors.csv"]
     save_sensors(folder / "sensors.csv", dvl_sensors(readings))
-    return [f"the DVL lost the bottom in {lost} of {len(readings.locked)} pings"] if lost else []
+    return [f"the DVL lost the bottom in {lost} of {counted(len(readings.locked), 'ping')}"] if lost else []
 
 
 def _write_points(folder: Path, soundings: Soundings) -> list[str]:

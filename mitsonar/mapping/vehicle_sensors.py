@@ -214,6 +214,12 @@ class VehicleSensors:
                 f"the bias of a gyroscope needs a standard deviation of 0 or more: got {self.bias_std:g} rad/s"
             )
 
+    def __repr__(self) -> str:
+        each = [one for one in (self.yaw_rate, self.sideways, self.forward, self.depth, self.heading) if one is not None]
+        times = [one.time_s for one in each] + ([self.dead_reckoning.path.time_s] if self.dead_reckoning else [])
+        span = max(float(time[-1]) for time in times) - min(float(time[0]) for time in times)
+        return f"VehicleSensors({', '.join(self.names)}; {sum(map(len, times)):,} readings over {span:.4g} s)"
+
     @property
     def names(self) -> list[str]:
         """Return what sensors there are, in words."""

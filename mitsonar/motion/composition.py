@@ -9,7 +9,7 @@ from array_api_compat import array_namespace
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.arrays import AnyArray
-from mitsonar.motion.pose import Pose
+from mitsonar.motion.pose import Pose, plain_number
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["Motion", "compose", "inverse", "motions", "steady"]
@@ -22,6 +22,9 @@ class Motion(NamedTuple):
     forward: float
     yaw: float
 
+    def __repr__(self) -> str:
+        return f"Motion({', '.join(f'{name}={plain_number(value)!r}' for name, value in self._asdict().items())})"
+
 
 def compose(pose: Pose, motion: Motion) -> Pose:
     """Compute the pose after a motion along the *new* heading (Almanza-Medina, eq. 3.4)."""
@@ -29,7 +32,7 @@ def compose(pose: Pose, motion: Motion) -> Pose:
     sin, cos = np.sin(heading), np.cos(heading)
     x = pose.x + motion.forward * sin + motion.sideways * cos
     y = pose.y + motion.forward * cos - motion.sideways * sin
-    return Pose(float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading))
+    return Pose.from_row((float(x), float(y), pose.z, pose.pitch, pose.roll, float(heading)))
 
 
 def inverse(motion: AnyArray) -> AnyArray:

@@ -30,6 +30,13 @@ class Deforming:
     path: Trajectory
     vertices: VertexLaw
 
+    def __repr__(self) -> str:
+        law = self.vertices
+        shown = (
+            f"{len(law.vertices)} meshes" if isinstance(law, MeshSequence) else getattr(law, "__name__", type(law).__name__)
+        )
+        return f"Deforming({shown} along {self.path})"
+
 
 @dataclass(frozen=True)
 class MeshSequence:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -21,6 +23,9 @@ __all__ = [
     "vehicle_rotation",
 ]
 
+FULL_TURN = 2 * math.pi
+"""Largest angle of a pose that is typed in [rad]."""
+
 SENSOR_IN_VEHICLE = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 FARTHEST = 1e12
@@ -30,8 +35,13 @@ MOST_TURNED = 1e6
 """Largest angle of a pose [rad]: larger ones no longer say where it points."""
 
 
-class Pose(NamedTuple):
-    """Position and attitude of the sonar: x, y, z [m], pitch, roll, heading [rad]."""
+def plain_number(value: object) -> object:
+    """Return a number of NumPy as one of Python; others as they are."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+class _Six(NamedTuple):
+    """The six numbers of a pose, unchecked."""
 
     x: float
     y: float
@@ -39,6 +49,39 @@ class Pose(NamedTuple):
     pitch: float = 0.0
     roll: float = 0.0
     heading: float = 0.0
+
+
+class Pose(_Six):
+    """Position and attitude of the sonar: x, y, z [m], pitch, roll, heading [rad].
+
+    Raises:
+        MitsonarError: an angle beyond a full turn: degrees, in all likelihood. :meth:`from_degrees` takes degrees,
+            :meth:`from_row` a heading that has turned several times.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, x: float, y: float, z: float, pitch: float = 0.0, roll: float = 0.0, heading: float = 0.0) -> Self:
+        """Make a pose from metres and radians."""
+        for name, angle in (("pitch", pitch), ("roll", roll), ("heading", heading)):
+            if abs(angle) > FULL_TURN:
+                raise MitsonarError(
+                    f"{name} of a pose is in radians, at most a full turn of {FULL_TURN:.4g} rad: got {angle:g}; of degrees "
+                    "make it by Pose.from_degrees or np.radians, of a heading that went on turning by Pose.from_row"
+                )
+        return super().__new__(cls, x, y, z, pitch, roll, heading)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Copy and pickle without the check of angles."""
+        return type(self).from_row, (tuple(self),)
+
+    @classmethod
+    def from_row(cls, row: Iterable[float]) -> Self:
+        """Make a pose from a row of a trajectory: six numbers in metres and radians, with a heading of any size."""
+        return cls._make(row)
+
+    def __repr__(self) -> str:
+        return f"Pose({', '.join(f'{name}={plain_number(value)!r}' for name, value in self._asdict().items())})"
 
     @classmethod
     def from_degrees(cls, numbers: ArrayLike) -> Self:
@@ -52,7 +95,7 @@ class Pose(NamedTuple):
             raise MitsonarError(f"a pose is six numbers x,y,z,pitch,roll,heading (m, deg): got {values.size}")
         if not np.isfinite(values).all():
             raise MitsonarError(f"a pose must be finite: got {','.join(f'{v:g}' for v in values)}; give m and deg")
-        made = cls(*values[:3], *np.radians(values[3:]))
+        made = cls.from_row([*values[:3], *np.radians(values[3:])])
         refuse_beyond_reach([made])
         return made
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.errors import MitsonarError, MitsonarWarning
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted
 from mitsonar.motion.conventions import CONVENTIONS, Convention, convention_named, sideways_or_up
 from mitsonar.motion.pose import Pose, poses_from, refuse_beyond_reach, vehicle_rotation
 from mitsonar.motion.trajectory_files import read_csv, read_tum, write_csv, write_tum
@@ -59,11 +59,17 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.poses)
 
+    def __repr__(self) -> str:
+        low, high = self.poses[:, :3].min(axis=0), self.poses[:, :3].max(axis=0)
+        reach = ", ".join(f"{axis} {a:.4g}..{b:.4g}" for axis, a, b in zip("xyz", low, high, strict=True))
+        return f"Trajectory({len(self)} poses over {np.ptp(self.time_s):.4g} s; {reach} m)"
+
     @classmethod
     def between(cls, start: Pose, end: Pose, frames: int, rate_hz: float) -> Self:
         """Space ``frames`` poses equally from ``start`` to ``end`` (Almanza-Medina, 2.2.1).
 
-        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard.
+        The six numbers run linearly without wrapping: heading 350 to 370 deg turns 20 deg to starboard
+        (:meth:`Pose.from_degrees` takes angles beyond a full turn).
 
         Raises:
             MitsonarError: no frames.
@@ -210,9 +216,9 @@ def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], fr
     pitch, roll, heading = np.degrees(read[frame][0, 3:])
     count = round(share[frame] * len(read[frame]))
     warnings.warn(
-        f"the sonar looks sideways or at the sky in {count} of {len(read[frame])} frames of {path}, read as {frame} (first "
-        f"pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's convention by "
-        f"--frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
+        f"the sonar looks sideways or at the sky in {count} of {counted(len(read[frame]), 'frame')} of {path}, read as "
+        f"{frame} (first pose: pitch {pitch:.3g}, roll {roll:.3g}, heading {heading:.3g} deg); {better}: name the file's "
+        f"convention by --frame (frame= in Python), one of {', '.join(CONVENTIONS)}; nothing is wrong where that is meant",
         MitsonarWarning,
         stacklevel=3,
     )

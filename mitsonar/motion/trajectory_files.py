@@ -83,7 +83,10 @@ def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Ta
     Raises:
         MitsonarError: unreadable file, columns that are missing or double, a broken line, with its number.
     """
-    lines = list(csv.reader(io.StringIO(_text(path))))
+    try:
+        lines = list(csv.reader(io.StringIO(_text(path))))
+    except csv.Error as error:
+        raise MitsonarError(f"cannot read trajectory {path}: it is no table of CSV ({error}); write it again") from None
     if not lines or not any(word.strip() for word in lines[0]):
         raise MitsonarError(f"trajectory {path} holds no pose: its first line must name the columns, {COLUMNS}")
     names = [word.strip().lower() for word in lines[0]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -300,13 +301,13 @@ class Checkpoint:
             MitsonarError: no such file, not a checkpoint, damaged, or of another format.
         """
         path = shipped_path(path) if isinstance(path, str) and path in SHIPPED else Path(path)
-        if path.is_dir():
-            if not (path / FILE).is_file():
+        if os.path.isdir(path):
+            if not os.path.isfile(path / FILE):
                 raise MitsonarError(
                     f"{path} holds no {FILE}: give the folder of a training that has validated once, or a checkpoint"
                 )
             path = path / FILE
-        if not path.exists():
+        if not os.path.exists(path):
             raise MitsonarError(
                 f"no checkpoint {path}: give a {FILE}, the folder of `mitsonar train`, or {' or '.join(SHIPPED)}"
                 f"{meant(path, SHIPPED)}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data_recipe import array_names
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.plotting.response_sheet import response_sheet
 
 if TYPE_CHECKING:
@@ -65,7 +65,10 @@ def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None,
         for place in range(columns):
             _sample(axes[row, place], store, name, view, int(start), place, frames)
     _summary(axes[-1], store, name, view)
-    figure.suptitle(f"{store.recipe.name}, view {view}: {len(store):,} frames in {store.about['sequences']:,} sequences")
+    figure.suptitle(
+        f"{store.recipe.name}, view {view}: {counted(len(store), 'frame')} in "
+        f"{counted(store.about['sequences'], 'sequence')}"
+    )
     return figure
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mitsonar.errors import counted
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def waterfall_figure(responses: ImpulseResponses) -> Figure:
         axes.set(title=receiver.name, xlabel="delay (ms)")
     grid[0].set_ylabel("time (s)")
     figure.colorbar(shown, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
-    figure.suptitle(_title(responses, f"{len(responses)} pings"), fontsize=10)
+    figure.suptitle(_title(responses, counted(len(responses), "ping")), fontsize=10)
     return figure
 
 
@@ -90,7 +91,8 @@ def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
 
 def _title(responses: ImpulseResponses, what: str) -> str:
     sonar = responses.sonar
-    return f"{sonar.name}, {sonar.model}: {sonar.carrier_hz / 1e3:g} kHz, bandwidth {sonar.bandwidth_hz / 1e3:g} kHz; {what}"
+    bands = f"{sonar.carrier_hz / 1e3:g} kHz, bandwidth {sonar.bandwidth_hz / 1e3:g} kHz"
+    return f"{sonar.title}, {sonar.model} model: {bands}; {what}"
 
 
 def _png(figure: Figure) -> bytes:

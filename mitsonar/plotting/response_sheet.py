@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
 
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore
@@ -47,7 +47,8 @@ def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None =
         _sample(row, store, names.index(receiver), start, pings)
     _summary(axes[-1], store, names)
     figure.suptitle(
-        f"{store.recipe.name}, receiver {receiver}: {len(store):,} pings in {store.about['sequences']:,} sequences"
+        f"{store.recipe.name}, receiver {receiver}: {counted(len(store), 'ping')} in "
+        f"{counted(store.about['sequences'], 'sequence')}"
     )
     return figure
 

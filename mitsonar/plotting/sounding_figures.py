@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import counted
 from mitsonar.records.dvl_readings import DvlReadings
 from mitsonar.records.echogram import Echogram
 from mitsonar.records.soundings import Soundings
@@ -43,7 +44,7 @@ def waterfall_figure_of(echogram: Echogram) -> Figure:
     axes.imshow(starboard, extent=(near, far, *along), **shown)
     axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel="along the path (m)")
     figure.colorbar(picture, ax=axes, label="level (dB)")
-    axes.set_title(f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {len(echogram)} pings", fontsize=10)
+    axes.set_title(f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
     return figure
 
 
@@ -59,7 +60,7 @@ def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> F
         axes.plot(time_s, soundings.range_m[:, 0, 0], color="tab:red", lw=1, label="first echo")
         axes.legend(loc="lower right", fontsize=8)
     axes.set(xlabel="time (s)", ylabel="range (m)")
-    axes.set_title(f"{echogram.sounder.name}, {fan.model}, {len(echogram)} pings", fontsize=10)
+    axes.set_title(f"{echogram.sounder.name}, {fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
     figure.colorbar(picture, ax=axes, label="level (dB)")
     return figure
 
@@ -72,7 +73,7 @@ def soundings_figure(soundings: Soundings) -> Figure:
     low, high = np.percentile(points[:, 2], [1, 99]) if len(points) else (0, 1)
     drawn = axes.scatter(*points.T[:2], c=points[:, 2], s=1.5, lw=0, cmap="viridis", vmin=low, vmax=high)
     axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
-    axes.set_title(f"{soundings.sounder.name}: {int(soundings.found.sum()):,} soundings", fontsize=10)
+    axes.set_title(f"{soundings.sounder.name}: {counted(int(soundings.found.sum()), 'sounding')}", fontsize=10)
     figure.colorbar(drawn, ax=axes, label="z (m)")
     return figure
 
@@ -115,7 +116,9 @@ def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -
     below.plot(time_s, readings.altitude_m, ".", ms=3, color="black")
     below.set(xlabel="time (s)", ylabel="altitude (m)")
     lost = int((~readings.locked).sum())
-    above.set_title(f"{readings.soundings.sounder.name}: {len(time_s)} pings, {lost} without bottom lock", fontsize=10)
+    above.set_title(
+        f"{readings.soundings.sounder.name}: {counted(len(time_s), 'ping')}, {lost} without bottom lock", fontsize=10
+    )
     return figure
 
 

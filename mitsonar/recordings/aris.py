@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.beam_table import TABLES, aris_bearings
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
@@ -154,7 +154,7 @@ def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], lis
     whole = tabled if tabled.any() else whole  # where all frames lack a table, the error says which
     notes = []
     if not whole.all():
-        notes.append(f"{(~whole).sum():,} frames have a damaged header and are left out")
+        notes.append(f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header")
     if frames.left_over:
         notes.append(f"the last {frames.left_over:,} bytes are no whole frame and are left out")
     return whole, notes
@@ -298,10 +298,9 @@ def facts_of(headers: Header, beams: int) -> Facts:
     facts: Facts = {"system": f"ARIS {KINDS[int(first['system'])].name}", "beams": beams}
     facts |= {name: int(first[name]) for name in names} | {"gain_db": int(first["gain_db"])}
     facts["sound_speed"] = float(first["sound_speed"])
-    for name in ("heading_deg", "pitch_deg", "roll_deg", "temperature_c"):
-        known = headers[name][np.isfinite(headers[name])]
-        if len(known):
-            facts[name] = [float(known.min()), float(known.max())]
+    known = headers["temperature_c"][np.isfinite(headers["temperature_c"])]  # attitude is in the frames, in our signs
+    if len(known):
+        facts["temperature_c"] = [float(known.min()), float(known.max())]
     return facts
 
 

@@ -11,7 +11,7 @@ from typing import IO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, argument
+from mitsonar.errors import MitsonarError, argument, counted
 from mitsonar.recordings.aris import CODING_DB, FRAME, SIGNATURE
 from mitsonar.recordings.aris_axes import ArisTable, ArisWindow, Values, half_spacing, interpolated, table_of, window_of
 from mitsonar.recordings.header_motion import EARTH_M
@@ -269,7 +269,9 @@ def _form_of(frames: SonarFrames, beams: int | None) -> _Form:
     notes = []
     if turned:
         low, high = np.degrees(table.bearings[[0, -1]])
-        notes.append(f"{len(frames.bearing_rad)} beams were interpolated to {table.beams}, from {low:.4g} to {high:.4g} deg")
+        notes.append(
+            f"{counted(len(frames.bearing_rad), 'beam')} interpolated to {table.beams}, from {low:.4g} to {high:.4g} deg"
+        )
     elif moved > np.radians(1e-3):
         notes.append(
             f"the beams are those of the vendor's table: they differ from the frames' by {np.degrees(moved):.2g} deg"

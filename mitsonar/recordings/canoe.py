@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.csv_table import CsvTable
@@ -79,14 +79,14 @@ def read_canoe(path: Path) -> Recording:
     """
     found = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
     whole = [(time, one) for time, one in found if is_whole(one)]
-    notes = [f"{len(found) - len(whole):,} pictures are cut off and are left out"] if len(whole) < len(found) else []
+    notes = [f"left out: {counted(len(found) - len(whole), 'picture')} cut off"] if len(whole) < len(found) else []
     if not whole:
         raise MitsonarError(f"{path / 'sonar'} holds no whole picture")
     stamps, files = np.array([time for time, _ in whole], dtype=np.int64), [one for _, one in whole]
     poses, told = _poses(path / POSES, stamps)
     if poses is not None and not np.isfinite(poses).all():
         posed = np.flatnonzero(np.isfinite(poses).all(axis=1))
-        notes.append(f"{len(files) - len(posed):,} pictures have no pose and are left out")
+        notes.append(f"left out: {counted(len(files) - len(posed), 'picture')} without a pose")
         stamps, files, poses = stamps[posed], [files[place] for place in posed], poses[posed]
     times = np.asarray(stamps * 1e-6, dtype=float)
     kept, sorting = in_time_order(times)
@@ -184,7 +184,7 @@ def _poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, list[st
     fine = np.isfinite(values).all(axis=1) & (np.abs(values).max(axis=1) < 1e9)
     found = np.array([row if (row := rows.get(int(time), -1)) >= 0 and fine[row] else -1 for time in stamps], dtype=np.intp)
     if (found >= 0).sum() < max(2, len(stamps) // 2):
-        return None, [f"{POSES} has poses of {(found >= 0).sum():,} of {len(stamps):,} pictures: they are left out"]
+        return None, [f"left out: {POSES}, which has poses of {(found >= 0).sum():,} of {counted(len(stamps), 'picture')}"]
     values = values[found[found >= 0]]
     rotation = _to_world(values)
     body = None if rotation is None else _body(rotation, values[:, 12:15])

@@ -33,7 +33,8 @@ class CsvTable:
         try:
             rows = [row for row in csv.reader(io.StringIO(text)) if any(word.strip() for word in row)]
         except csv.Error as error:
-            raise MitsonarError(f"cannot read the table {path}: {error}") from None
+            reason = "it is no text" if "\0" in text or "new-line" in str(error) else error
+            raise MitsonarError(f"cannot read the table {path}: {reason}; give a CSV file") from None
         if len(rows) < 2:
             raise MitsonarError(f"{path} holds no table: a line of names and rows below it are needed")
         self.names = [name.strip() for name in rows[0]]

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import preset
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
@@ -134,7 +134,7 @@ def read_didson(path: str | Path) -> Recording:
     whole = (
         (headers["signature"] == data[:4].tobytes()) & (headers["start_code"] <= MOST_START) & (headers["length_code"] < 4)
     )
-    notes = [f"{(~whole).sum():,} frames have a damaged header and are left out"] if not whole.all() else []
+    notes = [f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header"] if not whole.all() else []
     notes += [f"the last {frames.left_over:,} bytes are no whole frame and are left out"] if frames.left_over else []
     time_s, timing = _times(headers, head)
     kept, sorting = in_time_order(np.where(whole, time_s, np.nan), headers["index"])
@@ -195,7 +195,7 @@ def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[
     gap = np.where((gap > 0) & (gap < LONGEST_TIE * period_s * count), gap, period_s * count)
     group = np.cumsum(new) - 1
     part = (np.arange(len(time_s)) - begin[group]) / count[group]
-    note = f"{(~new).sum():,} frames have the clock of the one before: they were spread evenly up to the next"
+    note = f"{counted(int((~new).sum()), 'frame')} with the clock of the one before: spread evenly up to the next"
     return time_s + part * gap[group], [note]
 
 

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.io.run_directory import refuse_to_replace
 from mitsonar.recordings.mcap_metadata import RECORD, WRITTEN, metadata_of
 from mitsonar.recordings.ros_encoding import TOPICS, Encoded, FrameEncoder
-from mitsonar.records.sonar_frames import PER_FRAME, SonarFrames
+from mitsonar.records.sonar_frames import LABELS, PER_FRAME, SonarFrames, to_uint8
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-__all__ = ["write_mcap"]
+__all__ = ["SPAN_DB", "write_mcap"]
+
+SPAN_DB = 80.0
+"""Levels from full scale down that 8 bits hold of linear images [dB]; a step is 0.31 dB."""
 
 CHUNK_BYTES = 4 * 2**20
 """Size of the pieces that are compressed at a time [bytes]."""
@@ -25,23 +31,30 @@ def write_mcap(
     chunks: Iterable[SonarFrames],
     path: str | Path,
     *,
-    picture: str = "png",
+    picture: str = "jpeg",
+    full: bool = False,
+    labels: bool = False,
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> int:
     """Write frames of one sonar as MCAP (profile ``ros2``, CDR, chunks in Zstandard); the file is whole or absent.
 
-    Topics: ``/sonar/image`` (``marine_acoustic_msgs/ProjectedSonarImage``: samples uint8 or float32, bit for bit),
-    ``/sonar/fan/compressed`` (``sensor_msgs/CompressedImage``). Of frames with elevations ``/sonar/points``
-    (``sensor_msgs/PointCloud2``), with poses ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``, with attitudes
+    Topics: ``/sonar/image`` (``marine_acoustic_msgs/ProjectedSonarImage``), ``/sonar/fan/compressed``
+    (``sensor_msgs/CompressedImage``). With poses ``/sonar/odometry`` (``nav_msgs/Odometry``) and ``/tf``, with attitudes
     ``/sonar/imu`` (``sensor_msgs/Imu``), with heights ``/sonar/altitude`` (``sensor_msgs/Range``). Times in headers are
-    those of the frames. Sonar, exact ranges and bearings, and coding are in a metadata record, which
-    :func:`~mitsonar.recordings.open_recording.open_recording` reads back.
+    those of the frames.
+
+    Samples are 8 bit: values in the codings dB and gamma times 255, linear levels as dB over
+    :data:`~mitsonar.recordings.mcap_writer.SPAN_DB`, which
+    :func:`~mitsonar.recordings.open_recording.open_recording` turns into levels again. A metadata record holds the sonar,
+    exact ranges and bearings, the coding, and how samples become levels, in words.
 
     Args:
         chunks: the frames, some at a time, of one geometry; the first say which arrays all have.
         path: of the file; its name ends with ``.mcap``.
-        picture: format of the fans: ``png``, or the smaller ``jpeg``.
+        picture: format of the fans: ``jpeg``, or the larger ``png``.
+        full: samples as they are, float32 or uint8, bit for bit, and with labels.
+        labels: ``/sonar/points`` (``sensor_msgs/PointCloud2``) of frames with elevations, about as large as all else.
         overwrite: replace a file that is there.
         progress: called with how many more frames are written.
 
@@ -59,7 +72,9 @@ def write_mcap(
     try:
         with part.open("wb") as file:
             writer = _writer(file)
-            count = _write(writer, iter(chunks), picture, progress or (lambda done: None))
+            span_db: list[float] = []
+            smaller = (_reduced(frames, full, labels, span_db) for frames in chunks)
+            count = _write(writer, smaller, picture, span_db, progress or (lambda done: None))
             writer.finish()  # type: ignore[no-untyped-call]
         part.replace(path)
     except FileNotFoundError:
@@ -77,14 +92,33 @@ def _writer(file: object) -> Writer:
     return Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)  # type: ignore[arg-type]
 
 
-def _write(writer: Writer, chunks: Iterator[SonarFrames], picture: str, progress: Callable[[int], None]) -> int:
+def _reduced(frames: SonarFrames, full: bool, labels: bool, span_db: list[float]) -> SonarFrames:
+    """Return frames as they are written; ``span_db`` gets the span where linear levels became dB."""
+    if full:
+        return frames
+    if not labels:
+        nothing: dict[str, Any] = dict.fromkeys(LABELS)
+        frames = replace(frames, **nothing)
+    if frames.image.dtype == np.uint8:
+        return frames
+    if frames.level != "linear":
+        return replace(frames, image=to_uint8(frames.image))
+    span_db[:] = [SPAN_DB]
+    with np.errstate(divide="ignore"):
+        value = 1 + np.log10(np.clip(frames.image, 0, 1)) * np.float32(10 / SPAN_DB)
+    return replace(frames, image=to_uint8(np.where(frames.image > 0, np.maximum(value, np.float32(1e-6)), np.float32(0))))
+
+
+def _write(
+    writer: Writer, chunks: Iterator[SonarFrames], picture: str, span_db: list[float], progress: Callable[[int], None]
+) -> int:
     """Write all frames and return their number."""
     first = next((one for one in chunks if len(one)), None)
     if first is None:
         raise MitsonarError("there are no frames to write")
     encoder = FrameEncoder(first.select(slice(0)), picture)
     writer.start(profile="ros2", library="mitsonar")
-    writer.add_metadata(RECORD, metadata_of(first))
+    writer.add_metadata(RECORD, metadata_of(first, span_db[0] if span_db else None))
     channels = _channels(writer, encoder)
     count, fixed = 0, False
     for frames in _all(first, chunks):

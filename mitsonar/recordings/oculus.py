@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import preset
 from mitsonar.recordings.oculus_images import OculusImages
@@ -153,9 +153,11 @@ def _pings_of(messages: Messages) -> tuple[_Pings, list[str]]:
     place = np.flatnonzero(fan >= 0)
     notes = []
     if len(place) < len(messages):
-        notes.append(f"{len(messages) - len(place):,} pings are damaged and are left out")
+        notes.append(f"left out: {counted(len(messages) - len(place), 'damaged ping')}")
     if messages.skipped:
-        notes.append(f"{messages.skipped:,} messages or items of other kinds hold no image and are left out")
+        notes.append(
+            f"left out: {counted(messages.skipped, 'message or item', 'messages or items')} of other kinds without an image"
+        )
     if messages.left_over:
         notes.append(f"{messages.left_over:,} bytes are no whole message and are left out")
     if not len(place):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -79,13 +80,13 @@ def format_of(path: str | Path) -> Format | None:
     """Return the format of a file or folder; None where it is no recording, or is not there."""
     path = Path(path)
     first = b""
-    if path.is_file():
+    if os.path.isfile(path):
         try:
             with path.open("rb") as file:
                 first = file.read(FIRST_BYTES)
         except OSError:
             return None
-    elif not path.is_dir():
+    elif not os.path.isdir(path):
         return None
     return next((one for one in FORMATS if one.fits(path, first)), None)
 
@@ -99,7 +100,7 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     """Open a recording of a real sonar; pixels are read on demand.
 
     Args:
-        path: of a file or folder in one of :data:`FORMATS`; its content tells which.
+        path: of a file or folder; its content tells the format (docs/guides/recordings.md).
         geometry: a geometry file, for pictures. Other formats tell their geometry themselves.
         topic: of the sonar in a ROS bag; default: the only one.
 
@@ -108,7 +109,7 @@ def open_recording(path: str | Path, geometry: str | Path | None = None, topic: 
     """
     found = format_of(path)
     if found is None:
-        if not Path(path).exists():
+        if not os.path.exists(path):
             raise MitsonarError(f"no such file: {path}")
         raise MitsonarError(f"{path} is no recording that mitsonar reads: it reads {known_formats()}")
     return found.read(Path(path), None if geometry is None else Path(geometry), topic)

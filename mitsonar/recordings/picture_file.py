@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def refuse_size(rows: int, columns: int, source: str) -> None:
 
 def is_whole(path: Path) -> bool:
     """Return whether a path is a file that is not visibly cut off: a PNG file ends as one, any other has bytes."""
-    if not path.is_file():  # a pipe would never end
+    if not os.path.isfile(path):  # a pipe would never end
         return False
     try:
         with path.open("rb") as file:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.recordings.picture_file import SUFFIXES, Grey, is_whole, picture_size, read_picture
 from mitsonar.recordings.picture_recording import Pictures, geometry_for, recording_of
 from mitsonar.recordings.recording import Recording
@@ -157,10 +157,10 @@ def _of_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int
     kept = [file for file, size in sizes.items() if size == shape]
     notes = []
     if len(sizes) < len(files):
-        notes.append(f"{len(files) - len(sizes):,} pictures are cut off or damaged and are left out")
+        notes.append(f"left out: {counted(len(files) - len(sizes), 'picture')} cut off or damaged")
     if len(kept) < len(sizes):
         others = len(sizes) - len(kept)
-        notes.append(f"{others:,} pictures have another size than {shape[1]:,} x {shape[0]:,} pixels and are left out")
+        notes.append(f"left out: {counted(others, 'picture')} of another size than {shape[1]:,} x {shape[0]:,} pixels")
     return kept, shape, notes
 
 

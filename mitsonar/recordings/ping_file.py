@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +33,8 @@ def mapped(path: str | Path, what: str, least: int = 1) -> Bytes:
         MitsonarError: no such file, no file, or too short.
     """
     path = Path(path)
-    if not path.is_file():
-        raise MitsonarError(f"no such file: {path}" if not path.exists() else f"{path} is no file: give {what}")
+    if not os.path.isfile(path):
+        raise MitsonarError(f"no such file: {path}" if not os.path.exists(path) else f"{path} is no file: give {what}")
     size = path.stat().st_size
     if size < least:
         raise MitsonarError(

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["CHUNK_BYTES", "Facts", "Part", "Pixels", "Recording", "in_time_order", "runs_of"]
@@ -130,17 +130,17 @@ def in_time_order(time_s: ArrayLike, number: ArrayLike | None = None) -> tuple[I
     time = np.asarray(time_s, dtype=float)
     known = np.isfinite(time)
     order = np.flatnonzero(known)[np.argsort(time[known], kind="stable")]
-    notes = [] if known.all() else [f"{(~known).sum():,} frames have no valid time and are left out"]
+    notes = [] if known.all() else [f"left out: {counted(int((~known).sum()), 'frame')} without a valid time"]
     if (np.diff(order) < 0).any():
         notes.append("frames are not in the order of time: they were sorted")
     kept = order[np.diff(time[order], prepend=-np.inf) > 0]
     if len(kept) < len(order):
-        notes.append(f"{len(order) - len(kept):,} frames repeat the time of the one before and are left out")
+        notes.append(f"left out: {counted(len(order) - len(kept), 'frame')} at the time of the one before")
     if number is not None and len(kept) > 1:
         steps = np.diff(np.asarray(number, dtype=float)[kept])
         missing = float((steps[steps > 1] - 1).sum())
         if missing:
-            notes.append(f"{missing:,.0f} frames are missing, by the numbers that the sonar gave them")
+            notes.append(f"missing: {counted(round(missing), 'frame')}, by the numbers that the sonar gave them")
     return kept, notes
 
 

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import counted
 from mitsonar.recordings.recording import Part, Recording
 
 __all__ = ["Summary", "summary_lines", "summary_of"]
@@ -92,7 +93,7 @@ def summary_lines(summary: Summary) -> list[str]:
     rows = [("file", summary["name"]), ("format", summary["format"]), ("frames", f"{summary['frames']:,}")]
     for number, part in enumerate(summary["parts"]):
         if len(summary["parts"]) > 1:
-            rows.append((f"part {number}", f"{part['frames']:,} frames"))
+            rows.append((f"part {number}", counted(part["frames"], "frame")))
         rows += _rows_of(part)
     rows += [(f"fact {name}", _shown(value)) for name, value in summary["facts"].items()]
     rows += [("note", note) for note in summary["notes"]]
@@ -107,7 +108,7 @@ def _rows_of(part: Summary) -> list[tuple[str, str]]:
     first, last = part["bearing_deg"]
     rows = [
         ("sonar", part["sonar"]),
-        ("window", f"{low:.4g}..{high:.4g} m, {part['bins']:,} bins{step}"),
+        ("window", f"{low:.4g}..{high:.4g} m, {counted(part['bins'], 'bin')}{step}"),
         ("beams", f"{part['beams']:,} from {first:.4g} to {last:.4g} deg, {part['elevation_fov_deg']:.4g} deg high"),
         ("level", f"{part['level']}, {part['samples']}"),
         ("sound speed", f"{part['sound_speed']:.6g} m/s"),
@@ -120,7 +121,7 @@ def _rows_of(part: Summary) -> list[tuple[str, str]]:
         )
     if "rate_hz" in part:
         longest = f"; the longest step takes {part['longest_step_s']:.4g} s" if part["gaps"] else ""
-        rows.append(("rate", f"{part['rate_hz']:.4g} Hz, {part['gaps']:,} gaps{longest}"))
+        rows.append(("rate", f"{part['rate_hz']:.4g} Hz, {counted(part['gaps'], 'gap')}{longest}"))
     units = {"pitch_deg": "deg", "roll_deg": "deg", "heading_deg": "deg", "height_m": "m", "gain_db": "dB"}
     for name, unit in units.items():
         if part.get(name) is not None:
@@ -141,6 +142,8 @@ def _date(time_s: float) -> str:
 def _shown(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(one, int | float) for one in value):
+        return f"{value[0]:.6g}..{value[1]:.6g}"
     if isinstance(value, list):
         return ", ".join(_shown(one) for one in value)
     return str(value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError, nearest_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.recordings.bag_file import BagFile, Topic
 from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
@@ -77,7 +77,10 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     for number, run in runs_of(numbers.tolist()):
         part = _part(scan, kept[run], scan.layouts[int(str(number))], coding)
         part = with_motion(part, motion, run)
-        parts.append(part if written is None else replace(part, like=written))
+        if written is not None:
+            like, span_db = written
+            part = replace(part, like=like, images=part.images if span_db is None else _Levels(part.images, span_db))
+        parts.append(part)
     if not all(one.elevation_rad for one in scan.layouts):
         notes.append(f"the bag does not tell the opening over elevation: {ELEVATION_DEG:g} deg are assumed")
     facts = _facts(scan, kept) | ({"poses": motion.origin} if motion.origin else {})
@@ -104,7 +107,8 @@ def sonar_topic(bag: BagFile, topic: str | None = None, kinds: Sequence[str] = (
             raise MitsonarError(f"{bag.path} has no topic {topic!r}: {nearest_names(topic, [one.name for one in there])}")
         if named not in readable:
             raise MitsonarError(
-                f"{bag.path}: {topic} holds {named.messages:,} messages {short(named.kind)}; a sonar's are {_words(*kinds)}"
+                f"{bag.path}: {topic} holds {counted(named.messages, 'message')} {short(named.kind)}; a sonar's "
+                f"are {_words(*kinds)}"
             )
         return named
     found = [one for one in readable if one.kind in kinds]
@@ -164,16 +168,35 @@ def _part(scan: TopicScan, places: Index, layout: PingLayout, coding: Coding) ->
     return Part(_like(layout, time_s, scan.topic.name), time_s, _Frames(scan, places, layout, coding))
 
 
-def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> SonarFrames | None:
-    """Return frames without images as mitsonar wrote them; None where the bag is not its file, or other images are read."""
+@dataclass(frozen=True)
+class _Levels:
+    """Linear levels of samples that are dB over a span."""
+
+    samples: Callable[[Index], Pixels]
+    span_db: float
+
+    def __call__(self, index: Index) -> Pixels:
+        """Return levels relative to full scale ``(n, bins, beams)`` float32; 0 for no echo."""
+        level = 10 ** ((np.arange(256) / 255 - 1) * self.span_db / 10)
+        level[0] = 0
+        return np.asarray(level.astype(np.float32)[self.samples(index)], dtype=np.float32)
+
+
+def _as_written(scan: TopicScan, layout: PingLayout, coding: Coding) -> tuple[SonarFrames, float | None] | None:
+    """Return frames without images as mitsonar wrote them, and the span of samples that are dB [dB].
+
+    None where the bag is not its file, or other images are read.
+    """
     path = scan.bag.path
     if path.suffix != ".mcap" or scan.topic.name != WRITTEN or len(scan.layouts) > 1 or coding != Coding(False, 1.0):
         return None
-    like = frames_like(path, np.dtype(np.uint8 if _is_uint8(layout) else np.float32))
-    if like is None or like.image.shape[1:] != (len(layout.range_m), len(layout.bearing_rad)):
+    found = frames_like(path, np.dtype(np.uint8 if _is_uint8(layout) else np.float32))
+    if found is None or found[0].image.shape[1:] != (len(layout.range_m), len(layout.bearing_rad)):
         return None
+    like, span_db = found
     near = np.allclose(like.range_m, layout.range_m, rtol=1e-6)
-    return like if near and np.allclose(like.bearing_rad, layout.bearing_rad, atol=1e-6) else None
+    fits = near and np.allclose(like.bearing_rad, layout.bearing_rad, atol=1e-6)
+    return (like, span_db if _is_uint8(layout) else None) if fits else None
 
 
 @dataclass(frozen=True)

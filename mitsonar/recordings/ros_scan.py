@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.recordings.bag_file import BagFile, Message, Topic
 from mitsonar.recordings.ros_messages import FANS, PROJECTED
 from mitsonar.recordings.ros_pings import PingLayout, layout_of
@@ -127,7 +127,7 @@ class TopicScan:
 
     def notes(self) -> list[str]:
         """Return sentences on what was left out or assumed."""
-        notes = [] if not self.lost else [f"{self.lost:,} messages cannot be read and are left out: {self.reason}"]
+        notes = [] if not self.lost else [f"left out: {counted(self.lost, 'message')} that cannot be read: {self.reason}"]
         if not self._is_stamped():
             notes.append("the headers hold no times: times are those at which the messages were received")
         if self.gaps:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.aris import BEAMS, FRAME, KINDS, facts_of, like_of, notes_of, windows_of
 from mitsonar.recordings.csv_table import CsvTable
@@ -99,12 +99,12 @@ def read_uxo(path: Path) -> Recording:
     there = np.array([int(index) in files and is_whole(files[int(index)]) for index in headers["index"]])
     notes = []
     if not whole.all():
-        notes.append(f"{(~whole).sum():,} rows of {TABLE} cannot be and are left out")
+        notes.append(f"left out: {counted(int((~whole).sum()), 'row')} of {TABLE} with numbers that cannot be")
     if not there.all():
-        notes.append(f"{(~there).sum():,} frames of {TABLE} have no picture and are left out")
+        notes.append(f"left out: {counted(int((~there).sum()), 'frame')} of {TABLE} without a picture")
     extra = len(files) - len(set(files) & {int(index) for index in headers["index"]})
     if extra:
-        notes.append(f"{extra:,} pictures have no row in {TABLE} and are left out")
+        notes.append(f"left out: {counted(extra, 'picture')} without a row in {TABLE}")
     usable = whole & there
     kept, sorting = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
     sorting = [note for note in sorting if "no valid time" not in note]
@@ -193,6 +193,6 @@ def _poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, list[s
     found = np.array([rows.get(int(number), -1) for number in index], dtype=np.intp)
     if (found < 0).any() or not fine[found].all():
         lacking = int(((found < 0) | ~fine[found]).sum())
-        return None, [f"{ROTATOR} has no valid pose for {lacking:,} frames: poses are left out"]
+        return None, [f"left out: the poses, for {ROTATOR} has no valid one for {counted(lacking, 'frame')}"]
     rotation = Rotation.from_quat(turn[found])
     return poses_from(position[found] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 import numpy as np
 
@@ -193,6 +193,8 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[st
     """
     import zarr
 
+    from mitsonar.io.storage import refuse_codecs
+
     names = sorted(one.parent.name for one in path.glob("*/zarr.json"))
     for name in ("", *names):
         metadata = read_json(path / name / "zarr.json")
@@ -202,6 +204,8 @@ def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[st
     arrays = {name: group[name] for name in names}
     if not all(isinstance(array, zarr.Array) for array in arrays.values()):
         raise ValueError("it holds groups where arrays should be")
+    for array in arrays.values():
+        refuse_codecs(cast("zarr.Array[Any]", array))
     return group, arrays
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -51,6 +52,13 @@ class Echoes:
     shape_id: AnyArray
     object_id: AnyArray
 
+    def __repr__(self) -> str:
+        if not isinstance(self.hit, np.ndarray):
+            return "Echoes(not evaluated yet)"
+        hit = self.hit > 0
+        reach = f", {self.range_m[hit].min():.4g}..{self.range_m[hit].max():.4g} m" if hit.any() else ""
+        return f"Echoes({hit.size:,} rays, {int(hit.sum()):,} hit{reach})"
+
     def outside(self, sonar: Sonar) -> tuple[float, float] | None:
         """Return the nearest and farthest echo outside the window [m]; None where all lie inside. NumPy arrays only."""
         near, far = (self.range_m, self.range_m) if sonar.model == "thesis" else (self.near_m, self.far_m)
@@ -93,7 +101,7 @@ def load_exr(path: str | Path, sonar: Sonar) -> Echoes:
     import OpenEXR
 
     shape = (sonar.rays_per_beam, sonar.columns)
-    if not Path(path).is_file():
+    if not os.path.isfile(path):
         raise MitsonarError(f"no such echo file: {path}")
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:

@@ -45,6 +45,12 @@ class Echogram:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    def __repr__(self) -> str:
+        return (
+            f"Echogram({len(self)} pings of {', '.join(self.sounder.channels)}, {self.levels.shape[2]} bins to "
+            f"{self.sounder.fan.range_max:g} m, {self.sounder.name})"
+        )
+
     @property
     def range_m(self) -> NDArray[np.float64]:
         """Return the slant ranges of the bins ``(bins,)`` [m]."""

@@ -55,7 +55,7 @@ class FrameStore:
 
     @classmethod
     def open(cls, path: Path) -> FrameStore:
-        """Open a store that was begun.
+        """Open a store that was begun, and remove what a kill left half written.
 
         Raises:
             MitsonarError: there is none, or it is damaged.
@@ -63,6 +63,8 @@ class FrameStore:
         try:
             store = cls(arrays_in(path, "r+")[0], path)
             store.frames, store.done  # noqa: B018
+            for left in path.rglob("*.partial"):  # Zarr writes a file under such a name, then renames it
+                left.unlink()
         except Exception as error:  # a damaged Zarr raises errors of many kinds
             raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
         return store
@@ -116,17 +118,18 @@ class FrameStore:
         self.group.attrs["frames_done"] = first + len(frames)
 
     def pack(self, path: Path) -> None:
-        """Turn a finished store into ``frames.npz``, frame by frame, and remove it."""
+        """Turn a finished store into ``frames.npz``, frame by frame, and remove it. Equal frames become equal bytes."""
         part = path.with_name(f".{path.name}.part")
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1, allowZip64=True) as file:
-            for name, array in self.group.arrays():
+            for name, array in sorted(self.group.arrays()):  # which lists a folder
                 with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     _write_npy(entry, array)
-            for name, value in self.group.attrs.items():
+            for name, value in sorted(self.group.attrs.items()):
                 if name != "frames_done":
                     buffer = io.BytesIO()
                     np.save(buffer, np.array(value))
-                    file.writestr(f"{name}.npy", buffer.getvalue())
+                    with file.open(f"{name}.npy", "w") as entry:  # writestr would add the time of the clock
+                        entry.write(buffer.getvalue())
         part.replace(path)
         shutil.rmtree(self.path)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -127,12 +128,12 @@ class ImpulseResponses:
             MitsonarError: no such file, damaged, or not responses.
         """
         path = Path(path)
-        if path.is_dir() and path.suffix != ".zarr":
+        if os.path.isdir(path) and path.suffix != ".zarr":
             path = path / "responses.npz"
-        if not path.exists():
+        if not os.path.exists(path):
             raise MitsonarError(f"there are no responses at {path}: give what `mitsonar impulse` wrote")
         try:
-            if path.is_dir():
+            if os.path.isdir(path):
                 table, _ = open_group(path, COLUMNS, "time_s")
                 refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
                 table |= {name: one[...] for name, one in table.items() if not isinstance(one, np.ndarray)}

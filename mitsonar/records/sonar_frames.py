@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,15 @@ class SonarFrames:
 
     def __len__(self) -> int:
         return len(self.image)
+
+    def __repr__(self) -> str:
+        known = [name for name in ("poses", "height_m", *LABELS) if getattr(self, name) is not None]
+        near, far = (self.range_m[0], self.range_m[-1]) if len(self.range_m) else (0.0, 0.0)
+        return (
+            f"SonarFrames({len(self)} frames of {len(self.range_m)} bins x {len(self.bearing_rad)} beams, "
+            f"{near:.4g}..{far:.4g} m, {self.image.dtype}, level {self.level}, sonar {self.sonar.name}; "
+            f"{', '.join(known) or 'no poses'})"
+        )
 
     @property
     def pitch_rad(self) -> NDArray[np.float64] | None:
@@ -246,15 +256,15 @@ class SonarFrames:
             MitsonarError: no such file, or not frames.
         """
         path = Path(path)
-        if path.is_dir() and path.suffix != ".zarr":
-            found = [path / name for name in ("frames.npz", "frames.zarr") if (path / name).exists()]
+        if os.path.isdir(path) and path.suffix != ".zarr":
+            found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
             if not found:
                 raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
             path = found[0]
-        if not path.exists():
+        if not os.path.exists(path):
             raise MitsonarError(f"there are no frames at {path}: give frames.npz or a run's folder")
         try:
-            if path.is_dir():
+            if os.path.isdir(path):
                 table, done = open_group(path, COLUMNS, "time_s", "frames_done")
                 refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
                 arrays = {name: values for name, values in table.items() if not isinstance(values, np.ndarray)}

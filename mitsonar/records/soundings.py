@@ -58,6 +58,13 @@ class Soundings:
     def __len__(self) -> int:
         return len(self.time_s)
 
+    def __repr__(self) -> str:
+        pings, fans, beams = self.range_m.shape
+        return (
+            f"Soundings({pings} pings of {fans} fans x {beams} beams, {int(self.found.sum()):,} of {self.range_m.size:,} "
+            f"found, {self.sounder.name})"
+        )
+
     @property
     def found(self) -> NDArray[np.bool_]:
         """Return which beams have an echo ``(pings, channels, beams)``."""
@@ -99,7 +106,7 @@ class Soundings:
         return cls(arrays["time_s"], arrays["poses"], sounder, *(arrays[name] for name in MEASURED))
 
     def table(self) -> Array:
-        """Return the soundings found as rows of :data:`COLUMNS` ``(found, columns)``."""
+        """Return the soundings found ``(found, columns)``; columns: :data:`mitsonar.records.soundings.COLUMNS`."""
         ping, channel, beam = np.nonzero(self.found)
         bearing = np.degrees(self.sounder.fan.bearing_rad)[beam]
         measured = [getattr(self, name)[self.found] for name in MEASURED]

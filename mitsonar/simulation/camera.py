@@ -14,6 +14,7 @@ from mitsonar.motion.moving_bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices, vehicle_rotation
 from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.simulation.moving_scene import SceneMotion, motion_in
+from mitsonar.simulation.scene_watch import SceneWatch
 
 __all__ = ["CameraSimulator", "camera_of", "told_of"]
 
@@ -56,12 +57,19 @@ class CameraSimulator:
     def __init__(self, scene: mi.Scene, camera: mi.Sensor, *, moving: Moving | MovingBodies | None = None) -> None:
         if not scene.emitters():
             raise MitsonarError('a camera needs light: add an emitter to the scene, such as <emitter type="constant"/>')
-        self.camera, self.motion = camera, motion_in(scene, moving)
+        self.camera, self._given = camera, (scene, moving)
+        self._watch = SceneWatch(scene)
+        self._build()
         own = scene.integrator()
         sees = own is not None and not type(own).__module__.startswith("mitsonar")
         self.integrator = own if sees else load_dict({"type": "path", "max_depth": PATH_DEPTH})
-        self.scene = scene if self.motion is None else _with_instances(scene, self.motion)
         self.samples = int(camera.sampler().sample_count())
+
+    def _build(self) -> None:
+        """Make the scene that is rendered: that given, or one with the bodies that move."""
+        scene, moving = self._given
+        self.motion = motion_in(scene, moving)
+        self.scene = scene if self.motion is None else _with_instances(scene, self.motion)
 
     def pictures(self, poses: ArrayLike, time_s: ArrayLike, *, first: int = 0) -> Iterator[NDArray[np.uint8]]:
         """Render pictures, one a pose: ``(height, width)`` or ``(height, width, 3)``, sRGB.
@@ -71,6 +79,8 @@ class CameraSimulator:
             time_s: of the pictures ``(pictures,)`` [s].
             first: number of the first, of which the noise of rendering is a function.
         """
+        if self._watch.changed() is not None and self.motion is not None:
+            self._build()
         table, time = np.atleast_2d(np.asarray(poses, dtype=float)), np.atleast_1d(np.asarray(time_s, dtype=float))
         grey = "mono" in str(mi.variant())
         place = mi.Transform4f(self.camera.world_transform().matrix)

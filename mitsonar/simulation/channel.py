@@ -116,6 +116,8 @@ class ChannelSimulator:
     With ``mirrors`` sound also arrives by way of flat mirrors, with up to ``sonar.bounces`` reflections in all: from image
     sources, with the carrier's phase of each path. Mirrors that are not flat, such as waves, reflect once.
 
+    Parameters of the scene may be changed at any time (``mi.traverse``): the next ping is of the scene as it is then.
+
     Args:
         scene: any Mitsuba scene.
         sonar: the instrument.
@@ -134,20 +136,40 @@ class ChannelSimulator:
         self, scene: mi.Scene, sonar: ChannelSonar, *, like: ChannelSimulator | None = None, mirrors: Mirroring = None
     ) -> None:
         self.sonar = sonar
+        from mitsonar.simulation.moving_files import refuse_motion
+        from mitsonar.simulation.scene_watch import SceneWatch
+
+        refuse_motion(scene, "impulse responses")
+        self._given = scene, mirrors
+        self._watch = SceneWatch(scene)
+        if like is not None:
+            like._follow_scene()
+        self._build(None if like is None else like.tracer)
+        self.reset()
+
+    def __repr__(self) -> str:
+        shapes, ways = len(self._given[0].shapes()), ", ".join(self.ways[:4])
+        return f"ChannelSimulator({self.sonar} in a scene of {shapes} shapes; ways {ways})"
+
+    def _build(self, like: ChannelTracer | None = None) -> None:
+        """Make all that follows from the scene as it is now: scatterers or tables of its surfaces, and mirrors."""
+        scene, mirrors = self._given
+        sonar = self.sonar
         from mitsonar.simulation.channel_tracing import ChannelTracer
         from mitsonar.simulation.mirror_parts import mirror_of
         from mitsonar.simulation.mirror_paths import MirrorPaths
-        from mitsonar.simulation.moving_files import refuse_motion
-
-        refuse_motion(scene, "impulse responses")
 
         parts = mirror_of(scene, mirrors) if mirrors else None
         check_channel_mirrors(sonar, parts is not None, LACKING)
         self._without_mirrors = mirrors == "materials" and parts is None
-        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, None if like is None else like.tracer, parts)
+        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
         self.ways = tuple([way.name for way in self.tracer.ways] + self.without_scatterer.names)
-        self.reset()
+
+    def _follow_scene(self) -> None:
+        """Make anew what follows from the scene where its parameters have changed since."""
+        if self._watch.changed() is not None:
+            self._build()
 
     @property
     def notes(self) -> list[str]:
@@ -230,6 +252,7 @@ class ChannelSimulator:
         Raises:
             MitsonarError: velocities that do not fit.
         """
+        self._follow_scene()
         table = np.atleast_2d(np.asarray(poses, dtype=float))
         speeds = _checked(velocity, len(table), self.sonar.sound_speed)
         with ThreadPoolExecutor(thread_count()) as threads:
@@ -254,6 +277,7 @@ class ChannelSimulator:
         refuse_beyond_reach(table)
         receiver = self.sonar.receiver_number(receiver)
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
+        self._follow_scene()
         parts = [
             *(self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, way=way) for way in self.tracer.ways),
             *self.without_scatterer.trace(table[0], speeds[0], receiver, FOR_PATHS),

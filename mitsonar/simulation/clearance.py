@@ -1,10 +1,10 @@
-"""Free water around vehicles: how near the nearest surface is, by a few rays from each."""
+"""Free water around vehicles: how near the nearest surface is, by a few rays from each, and who lies below the ground."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.tracing import Tracer, free_way
-from mitsonar.simulation.variant import replayed
+from mitsonar.simulation.variant import frozen, replayed
 
-__all__ = ["Clearance"]
+__all__ = ["Buried", "Clearance", "buried_in"]
 
 AROUND = np.array([way for way in itertools.product((-1, 0, 1), repeat=3) if any(way)], dtype=float)
 """Directions in which surfaces are sought: the faces, edges and corners of a cube."""
@@ -55,7 +55,7 @@ class Clearance:
         ways = np.concatenate([np.broadcast_to(self._ways, (count, *self._ways.shape)), ahead[:, None]], axis=1)
         begin = np.concatenate([np.repeat(after[:, None], len(self._ways), axis=1), before[:, None]], axis=1)
         if count not in self._launches:
-            self._launches[count] = dr.freeze(self._traced)
+            self._launches[count] = frozen(self._traced)
         number = mi.Float(np.repeat(np.arange(count), ways.shape[1]).astype(np.float32).tolist())
         rays = [mi.Float(part.ravel().astype(np.float32).tolist()) for part in (begin, ways)]
         free = replayed(self._launches[count], self.tracer.scene_at(time_s), number, *rays)
@@ -77,3 +77,68 @@ class Clearance:
         time: DeviceArray = number
         ray.time = time
         return free_way(scene, ray)
+
+
+SEA_SURFACE = "surface"
+"""Id of the shape that worlds give the sea above them: what lies below it is in the water."""
+
+
+class Buried(NamedTuple):
+    """A pose below the ground or inside an object.
+
+    Attributes:
+        frame: its number.
+        frames: number of all such poses.
+        text: what is wrong, in a sentence without its subject.
+        inside: whether it is inside an object.
+    """
+
+    frame: int
+    frames: int
+    text: str
+    inside: bool
+
+
+def buried_in(scene: mi.Scene, poses: NDArray[np.float64]) -> Buried | None:
+    """Find poses below the ground or inside an object: straight up a ray meets the back of a surface.
+
+    Below the ground there is nothing straight below; inside an object there is the back of the same shape. Surfaces whose
+    normals point down, and scenes that move, are not judged.
+
+    Args:
+        scene: that stands still.
+        poses: of the sonar or vehicle ``(n, 6)`` [m, rad].
+
+    Returns:
+        The first of them; None where all poses are in the water, or nothing shows that they are not.
+    """
+    places = np.asarray(poses, dtype=float)[:, :3]
+    begin = mi.Point3f(*(mi.Float(column.astype(np.float32).tolist()) for column in places.T))
+    above, below = (scene.ray_intersect(mi.Ray3f(begin, mi.Vector3f(0, 0, way))) for way in (1, -1))
+    roofed = np.array(above.is_valid()) & (np.array(above.n)[2] > 0)
+    open_below = ~np.array(below.is_valid())
+    if not roofed.any():
+        return None
+    shapes = [dr.reinterpret_array(mi.UInt32, found.shape) for found in (above, below)]
+    names = {
+        number: shape.id()
+        for shape in scene.shapes()
+        for number in np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))
+    }
+    up, down = (np.array(number) for number in shapes)
+    wet = np.array([names.get(int(number), "") == SEA_SURFACE for number in up])
+    inside = (up == down) & ~open_below & (np.array(below.n)[2] < 0)
+    wrong = np.flatnonzero(roofed & ~wet & (open_below | inside))
+    if not len(wrong):
+        return None
+    first = int(wrong[0])
+    x, y, z = places[first]
+    where, name = f"at ({x:g}, {y:g}, {z:g}) m", names.get(int(up[first]), "")
+    if inside[first]:
+        return Buried(
+            first, len(wrong), inside=True, text=f"{where} is inside {f'the shape {name}' if name else 'an object'}"
+        )
+    depth = float(np.array(above.t)[first])
+    ground = f"the ground, the shape {name}," if name else "the ground"
+    text = f"{where} is {depth:.3g} m below {ground} at z = {z + depth:.3g} m (z points up)"
+    return Buried(first, len(wrong), text, inside=False)

@@ -96,7 +96,7 @@ def differentiate(
         raise MitsonarError(f"a derivative needs at least 1 ping in each half: got {pings}")
     source = jittered(simulator)
     for number, pose in enumerate(table):
-        yield _at(source, Pose(*pose), gain, pings, step or step_for(source.sonar), first + 2 * pings * number)
+        yield _at(source, Pose.from_row(pose), gain, pings, step or step_for(source.sonar), first + 2 * pings * number)
 
 
 def jittered(simulator: Simulator) -> Simulator:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.errors import counted
 from mitsonar.motion.pose import vehicle_rotation
 
 __all__ = ["NEARLY_EMPTY", "angle_hint", "empty_frames", "percent", "view_of"]
@@ -23,6 +24,7 @@ def empty_frames(
     rays: Sequence[int],
     window: tuple[float, float],
     found: tuple[float, float] | None,
+    buried: str = "",
 ) -> str:
     """Describe empty frames in one sentence.
 
@@ -33,19 +35,20 @@ def empty_frames(
         rays: numbers of that frame's rays that hit something inside the window, nearer, farther, and nothing.
         window: nearest and farthest range of the image [m].
         found: nearest and farthest return outside the window in that frame [m]; None where there is none.
+        buried: that the sonar is below the ground or inside an object in that frame; empty where it is not.
     """
     number, pose = first
-    hint = angle_hint(pose)
+    hint = angle_hint(pose) or (buried and f"the sonar {buried}")
     if not any(rays[:3]):
         check = "check the pose (x, y, z in m; pitch > 0 looks down) and the scene's units"
-        text = f"no ray hit anything in {empty} frames: {check}; in frame {number} {view_of(pose)}"
+        text = f"no ray hit anything in {counted(empty, 'frame')}: {check}; in frame {number} {view_of(pose)}"
         return f"{text}; {hint}" if hint else text
     inside, nearer, farther, missed = (percent(count / sum(rays)) for count in rays)
     beside = f" (returns at {found[0]:.3g}..{found[1]:.3g} m)" if found else ""
     check = "check the pose (m, pitch > 0 looks down), the window and the scene's units"
     return (
-        f"{empty} of {frames} frames are empty, frame {number} first: {inside} % of its rays meet something within the "
-        f"window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{beside}, {missed} % "
+        f"empty: {empty} of {counted(frames, 'frame')}, frame {number} first: {inside} % of its rays meet something within "
+        f"the window {window[0]:g}..{window[1]:g} m, {nearer} % nearer, {farther} % farther{beside}, {missed} % "
         f"nothing; {view_of(pose)}; {hint or check}"
     )
 

@@ -40,6 +40,8 @@ __all__ = ["Simulator"]
 class Simulator:
     """Renders what a sonar receives in a scene.
 
+    Parameters of the scene may be changed at any time (``mi.traverse``): the next ping is of the scene as it is then.
+
     Args:
         scene: a Mitsuba scene; its cameras are ignored.
         sonar: the instrument; default: the scene's ``imaging_sonar``.
@@ -68,18 +70,8 @@ class Simulator:
         rays_per_launch: int = 2**23,
     ) -> None:
         self.variant = ensure_variant()
-        from mitsonar.instruments.views import Whole
-        from mitsonar.simulation.bounce_sums import bounce_sums
-        from mitsonar.simulation.bright_surfaces import bright_notes
-        from mitsonar.simulation.coherent_imaging import coherent_imager
-        from mitsonar.simulation.expected_former import expected_former
-        from mitsonar.simulation.image_launch import ImageLaunch
-        from mitsonar.simulation.mirror_parts import refuse_moving_mirrors
-        from mitsonar.simulation.moving_scene import motion_in
-        from mitsonar.simulation.moving_tracing import tracer_of
         from mitsonar.simulation.scene import sonar_in
-        from mitsonar.simulation.second_mirrors import second_notes
-        from mitsonar.simulation.view_tracers import view_tracers
+        from mitsonar.simulation.scene_watch import SceneWatch
 
         if sonar is None:
             found = sonar_in(scene)
@@ -89,6 +81,34 @@ class Simulator:
                 )
             sonar = found[0]
         self.sonar, self.mirrors = sonar, mirrors
+        self._given = scene, views, moving, rays_per_launch
+        self._build()
+        self._watch = SceneWatch(scene, places=bool(self.motion or mirrors))
+        self._stepped, self._gain_from, self._told = 0, "", set[str]()
+        self.gain: float | None = None
+
+    def __repr__(self) -> str:
+        shapes, moving = len(self.tracer.scene.shapes()), 0 if self.motion is None else len(self.motion.bodies)
+        also = f", {moving} bodies that move" if moving else ""
+        return f"Simulator({self.sonar} in a scene of {shapes} shapes{also}; {self.variant})"
+
+    def _build(self) -> None:
+        """Make all that follows from the scene as it is now: tables of its surfaces, mirrors, moving bodies, launches."""
+        scene, views, moving, rays_per_launch = self._given
+        sonar, mirrors = self.sonar, self.mirrors
+        from mitsonar.instruments.views import Whole
+        from mitsonar.simulation.bounce_sums import bounce_sums
+        from mitsonar.simulation.bright_surfaces import bright_notes
+        from mitsonar.simulation.coherent_imaging import coherent_imager
+        from mitsonar.simulation.expected_former import expected_former
+        from mitsonar.simulation.image_launch import ImageLaunch
+        from mitsonar.simulation.mirror_parts import refuse_moving_mirrors
+        from mitsonar.simulation.moving_scene import motion_in
+        from mitsonar.simulation.moving_tracing import tracer_of
+        from mitsonar.simulation.scene import scale_notes
+        from mitsonar.simulation.second_mirrors import second_notes
+        from mitsonar.simulation.view_tracers import view_tracers
+
         self.motion = motion_in(scene, moving)
         check_timed(sonar, self.motion, views, mirrors)
         if self.motion is not None:
@@ -104,7 +124,11 @@ class Simulator:
         traced = one if self.former is None else self.former.traced
         self.tracer = tracer_of(scene, traced, self.motion)
         self.notes = [*self.tracer.notes, *loss_notes(sonar)] if self.coherent is None else self.coherent.notes
-        self.notes = [*self.notes, *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ())]
+        self.notes = [
+            *self.notes,
+            *scale_notes(scene, one),
+            *(bright_notes(scene, self.tracer.surfaces) if sonar.bounces > 1 else ()),
+        ]
         self.notes += second_notes(scene, mirrors) if sonar.bounces > 2 else []
         self.views: Sequence[View] = [Whole(traced)] if views is None or self.former is not None else views
         self.view_tracers = view_tracers(self.views)
@@ -115,8 +139,27 @@ class Simulator:
         formed = None if self.former is None else one
         self._maker = ImageLaunch(self.tracer, self.views, self.view_tracers, formed, self.bounces)
         self._launches: dict[tuple[int, bool], tuple[Callable[..., Any], Any]] = {}
-        self._stepped, self._gain_from, self._told = 0, "", set[str]()
-        self.gain: float | None = None
+
+    def _follow_scene(self) -> None:
+        """Make anew what follows from the scene where its parameters have changed since.
+
+        Launches stay where only their inputs change: normals and reflectivities in the tables of a scene that stands still.
+        One that evaluates a BSDF is recorded anew after a change of it: Dr.Jit 1.5 replays it with the texture of before.
+        """
+        changed = self._watch.changed()
+        if changed is None:
+            return
+        import mitsuba as mi
+
+        from mitsonar.simulation.moving_tracing import surfaces_of
+
+        scene = self._given[0]
+        tracers = [self.tracer, *(self.coherent.tracers.values() if self.coherent else ())]
+        plain = not (self.motion or self.mirrors or self.sonar.bounces > 1 or self.tracer.surfaces.foreign)
+        plain &= not self.tracer.surfaces.textured or all(isinstance(owner, mi.Mesh) for owner in changed.values())
+        if not (plain and all(one.surfaces.adopt(surfaces_of(scene, one.sonar, None)) for one in tracers)):
+            self._build()
+        self.__dict__.pop("_own_tracer", None)
 
     def pings(
         self, poses: ArrayLike, *, first: FirstPing = 0, labels: bool = False, time_s: ArrayLike | None = None
@@ -139,6 +182,7 @@ class Simulator:
             labels: per-pixel truth as well.
             time_s: of the poses [s]; default: their number / ``frame_rate_hz``. Bodies that move are where they are then.
         """
+        self._follow_scene()
         table, time, numbers = moments_of(self.sonar, poses, time_s, first)
         if self.grouped is not None:
             for pings in self.grouped.pings(table, time, numbers, labels):
@@ -197,6 +241,7 @@ class Simulator:
 
     def film_echoes(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> Echoes:
         """One ping's echoes as NumPy arrays, in the order of the film; all beams ping at ``time_s`` [s]."""
+        self._follow_scene()
         time_s = ping / self.sonar.frame_rate_hz if time_s is None else time_s
         return self._own_tracer.film_echoes(pose, ping, time_s)
 
@@ -211,6 +256,15 @@ class Simulator:
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window of one ping [m]; None where all lie inside."""
         return self.film_echoes(pose, ping).outside(self.sonar)
+
+    def buried(self, pose: ArrayLike) -> str:
+        """Describe where a pose lies below the ground or inside an object; empty where it does not, or bodies move."""
+        from mitsonar.simulation.clearance import buried_in
+
+        found = (
+            None if self.motion is not None else buried_in(self.tracer.scene, np.atleast_2d(np.asarray(pose, dtype=float)))
+        )
+        return "" if found is None else found.text
 
     def render(
         self,

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.io.provenance import digest
 from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.storage import refuse_codecs
 from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.response_figure import response_png, waterfall_png
@@ -142,7 +143,7 @@ def _make(
         )
         empty.save(url)
     try:
-        group = zarr.open_group(url, mode="r+")
+        group = zarr.open_group(url, mode="r+", zarr_format=3)
         _check(group, len(flown), simulator.sonar)
         for part in simulator.pings(flown.poses[done:], velocity[done:], first=done):
             here = slice(part.first, part.first + len(part))
@@ -162,11 +163,12 @@ def _check(group: zarr.Group, pings: int, sonar: ChannelSonar) -> None:
 
     Raises:
         MitsonarError: an array is missing or has another shape or type.
-        ValueError: an array has other chunks.
+        ValueError: an array has other chunks, or codecs that are not read.
     """
     sizes = {"pings": pings, "receivers": len(sonar.receivers), "taps": sonar.taps, "four": 4, "six": 6}
     for name, column in COLUMNS.items():
         array = cast("zarr.Array[Any]", group[name])
+        refuse_codecs(array)
         check_column(array, name, column, sizes, str(group.store_path))
         if array.chunks != ((1, *array.shape[1:]) if array.ndim > 2 else array.shape):
             raise ValueError(f"{name} is cut into pieces of {array.chunks}")
@@ -234,7 +236,7 @@ def warnings_of(made: ImpulseResponses, spread: Spread) -> list[str]:
             up = " (above 90: upwards)" if view.tilt_deg > 90 else ""
             pitch = "" if made.poses is None else f" (pitched by {math.degrees(made.poses[0, 3]):.3g} deg)"
             sentences.append(
-                f"receiver {receiver.name} has no echo in {silent} of {len(made)} pings: check its direction "
+                f"receiver {receiver.name} has no echo in {silent} of {counted(len(made), 'ping')}: check its direction "
                 f"(heading {view.heading_deg:g} deg, tilt {view.tilt_deg:g} deg from straight down{up}), "
                 f"the vehicle's pose{pitch} and range_max"
             )

@@ -31,17 +31,17 @@ def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[
     }
 
 
-def labels_above(pings: RenderedPings, gain: float, floor: float) -> dict[str, Any]:
+def labels_above(pings: RenderedPings, gain: float, floor: float | NDArray[np.float64]) -> dict[str, Any]:
     """Return the label maps of a batch without the pixels whose level is at most ``floor``.
 
     Args:
         pings: with labels, or without.
         gain: that lifts levels to full scale, 1.
-        floor: part of full scale; 0: every echo is labelled, however faint.
+        floor: part of full scale, one or of each bin ``(bins, 1)``; 0: every echo is labelled, however faint.
     """
-    if floor <= 0 or not pings.labels:
+    if np.max(floor) <= 0 or not pings.labels:
         return pings.labels
-    bright = pings.echoes * np.float32(gain) > floor
+    bright = pings.echoes * np.float32(gain) > np.asarray(floor, dtype=np.float32)
     empty = {"elevation_rad": np.float32(np.nan), "shape_id": np.int32(-1), "object_id": np.int32(-1)}
     kept = {name: np.where(bright, pings.labels[name], nothing) for name, nothing in empty.items()}
     return {**kept, "shadow": shadow(pings, bright)}
@@ -57,7 +57,15 @@ def shadow(pings: RenderedPings, echo: NDArray[np.bool_] | None = None) -> NDArr
         echo: which pixels count as echoes; default: all that are not 0.
     """
     echo = pings.echoes > 0 if echo is None else echo
-    nearer = np.logical_or.accumulate(echo, axis=1) | (pings.counts.nearer > 0)[:, None]
+    beams = echo.shape[2]
+    near, far, missed = (_of_beams(one, beams) for one in (pings.counts.nearer, pings.counts.farther, pings.counts.missed))
+    nearer = np.logical_or.accumulate(echo, axis=1) | (near > 0)[:, None]
     still = np.logical_or.accumulate(echo[:, ::-1], axis=1)[:, ::-1]
-    still = still | ((pings.counts.farther > 0) | (pings.counts.missed > 0))[:, None]
+    still = still | ((far > 0) | (missed > 0))[:, None]
     return np.where(nearer & ~echo, np.where(still, 1, 2), 0).astype(np.uint8)
+
+
+def _of_beams(counts: NDArray[Any], beams: int) -> NDArray[Any]:
+    """Return counts of rays in the beams of the image: with a pattern, boxes beside the fan are traced too."""
+    beside = max(0, counts.shape[-1] - beams) // 2
+    return counts[..., beside : counts.shape[-1] - beside]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.config.body_motion import BodyMotion, files_of, read_motions
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, argument
 from mitsonar.io.provenance import digest, file_digest
 from mitsonar.io.whole_files import refuse_beyond_memory
 from mitsonar.motion.deforming import Deforming, MeshSequence
@@ -163,8 +164,12 @@ def load_meshes(files: Sequence[Path], rate_hz: float, *, loop: bool = True) -> 
         loop: after the last comes the first.
 
     Raises:
-        MitsonarError: a damaged mesh, other triangles, or more than the memory holds.
+        MitsonarError: no mesh, a damaged one, other triangles, or more than the memory holds.
     """
+    if isinstance(files, str | Path) or not len(files):
+        raise MitsonarError(
+            f"{argument('files')} are PLY meshes in the order of time: got {str(files)!r}; give a list of them"
+        )
     first, faces = _mesh(files[0])
     refuse_beyond_memory(len(files) * len(first) * BYTES_A_VERTEX, f"{len(files)} meshes like {files[0]}")
     vertices = np.empty((len(files), *first.shape), np.float32)
@@ -209,6 +214,6 @@ def _found(name: str, folders: Sequence[Path]) -> list[Path]:
         except MitsonarError as error:
             errors.append(error)
             continue
-        if all(file.is_file() for file in files):
+        if all(os.path.isfile(file) for file in files):
             return files
     raise errors[0] if errors else MitsonarError(f"there is no {name} in {folders[0] if folders else Path()}")

@@ -81,6 +81,9 @@ class Source(Protocol):
     def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
         """Nearest and farthest return outside the window [m]."""
 
+    def buried(self, pose: ArrayLike) -> str:
+        """Describe where a pose lies below the ground or inside an object; empty where it does not."""
+
     def label_names(self, labels: bool = True) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return the names that labels refer to, of shapes and of objects; none without labels."""
 
@@ -322,6 +325,10 @@ class StoredEchoes:
         """Nearest and farthest return outside the window [m]."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 
+    def buried(self, pose: ArrayLike) -> str:
+        """Return nothing: where the ground is, the run that stored the echoes knows."""
+        return ""
+
     def bodies(self, time_s: ArrayLike) -> BodyStates:
         """Return none: where bodies were is in the run that stored the echoes."""
         return BodyStates()
@@ -377,7 +384,7 @@ def _write_pictures(folder: Path, first: int, frames: SonarFrames, outputs: Outp
     if outputs.cartesian:
         (folder / "cartesian").mkdir(exist_ok=True)
         for index in range(len(frames)):
-            title = f"{frames.sonar.name}, {frames.sonar.model}, frame {first + index}"
+            title = f"{frames.sonar.title}, {frames.sonar.model} model, frame {first + index}"
             save_fan(folder / "cartesian" / f"{first + index:06d}.png", frames, index, title=title)
 
 

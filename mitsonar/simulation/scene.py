@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.instruments.channel_sonar import ChannelSonar
@@ -24,9 +27,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "channel_sonar_in",
+    "covered_squares_in",
     "find_scene",
     "load_scene",
     "object_names_in",
+    "scale_notes",
+    "shape_boxes_in",
     "shape_names_in",
     "shipped_scenes",
     "shipped_trajectory",
@@ -44,6 +50,13 @@ QUOTING = {
 
 LONGEST_REASON = 600
 """Letters of Mitsuba's errors that are shown."""
+
+
+TOO_LARGE = 20
+"""Ends of the window [m] that a body's smallest extent may have before its unit is doubted."""
+
+FARTHEST_WINDOW_M = 500.0
+"""End of a window beyond the reach of imaging sonars [m]: those of 100 kHz see some hundred metres."""
 
 
 def shipped_scenes() -> dict[str, Path]:
@@ -68,12 +81,12 @@ def find_scene(name_or_file: str | Path) -> Path:
         MitsonarError: there is neither.
     """
     path = Path(name_or_file)
-    if path.is_file():
+    if os.path.isfile(path):
         return path
     shipped = shipped_scenes()
     if str(name_or_file) in shipped:
         return shipped[str(name_or_file)]
-    if path.is_dir():
+    if os.path.isdir(path):
         raise MitsonarError(f"scene {path} is a folder: give the XML file in it")
     names = nearest_names(path.stem, shipped)
     raise MitsonarError(f"no scene file {path}: give a Mitsuba XML file or the name of a shipped scene, {names}")
@@ -124,8 +137,44 @@ def _loaded(path: Path, variant: str, parameters: dict[str, str]) -> object:
 
 
 def shape_names_in(scene: mi.Scene) -> tuple[str, ...]:
-    """Return the name of each shape of a scene, by the place in it that ``shape_id`` tells."""
-    return tuple(shape.id() for shape in scene.shapes())
+    """Return the name of each shape of a scene, by its place there, which is its ``shape_id``.
+
+    The name is the shape's id. Without one it is the stem of the mesh file, the id of the shape group that is placed, or
+    the type of the plugin: ``pot01``, ``cannon_parts``, ``sphere``.
+    """
+    return tuple(shape.id() or _name_without_id(shape) for shape in scene.shapes())
+
+
+def _name_without_id(shape: mi.Shape) -> str:
+    kind, text = shape.class_name(), str(shape)
+    named = re.search(r'^ +name = "([^"]+)"', text, flags=re.MULTILINE) if shape.is_mesh() or kind == "Instance" else None
+    return Path(named[1]).stem if named else kind.lower()
+
+
+def shape_boxes_in(scene: mi.Scene) -> NDArray[np.float64]:
+    """Return the box around each shape of a scene: least and largest x, y, z ``(shapes, 2, 3)`` [m]."""
+    boxes = [(shape.bbox().min, shape.bbox().max) for shape in scene.shapes()]
+    corners = [[np.array(corner, dtype=float).ravel() for corner in box] for box in boxes]
+    return np.array(corners, dtype=np.float64).reshape(-1, 2, 3)
+
+
+def covered_squares_in(scene: mi.Scene) -> NDArray[np.float64]:
+    """Return half the edge of the square around the origin that each shape covers, seen from above ``(shapes,)`` [m].
+
+    Of a mesh that of its convex hull counts, of another shape that of its box; 0 where the origin is outside.
+    """
+    halves = []
+    for shape, (low, high) in zip(scene.shapes(), shape_boxes_in(scene), strict=True):
+        half = float(min(*-low[:2], *high[:2]))
+        if shape.is_mesh() and half > 0:
+            points = np.array(shape.vertex_positions_buffer(), dtype=float).reshape(-1, 3)[:, :2]
+            try:
+                normals = ConvexHull(points).equations  # n x + d <= 0 inside
+            except QhullError:  # upright: it covers nothing
+                normals = np.array([[1.0, 0.0, 0.0]])
+            half = float((-normals[:, 2] / np.abs(normals[:, :2]).sum(axis=1)).min())
+        halves.append(max(0.0, half))
+    return np.array(halves, dtype=np.float64)
 
 
 def object_names_in(scene: mi.Scene) -> tuple[str, ...]:
@@ -156,6 +205,32 @@ def channel_sonar_in(scene: mi.Scene, index: int = 0) -> tuple[ChannelSonar, Pos
 
     found = [sensor for sensor in scene.sensors() if is_channel_sonar(sensor)]
     return (found[index].sonar, found[index].pose) if index < len(found) else None
+
+
+def scale_notes(scene: mi.Scene, sonar: Sonar) -> list[str]:
+    """Return a sentence where sizes show that a scene is probably not in metres.
+
+    A body counts as too large where its smallest extent exceeds :data:`TOO_LARGE` windows (floors are flat), and a window
+    where it reaches farther than an imaging sonar does. A scene counts as too small where it fits into a range bin.
+    """
+    do = (
+        'scenes are in metres; where this one is in millimetres, give its shapes <scale value="0.001"/>, or `mitsonar '
+        "world mesh` --scale 0.001"
+    )
+    for shape in scene.shapes():
+        extents = np.ravel(np.array(shape.bbox().extents(), dtype=float))
+        if np.isfinite(extents).all() and extents.min() > TOO_LARGE * sonar.range_max:
+            size = " x ".join(f"{edge:.3g}" for edge in extents)
+            return [f"shape {shape.id()} is {size} m large, and the window of the sonar ends at {sonar.range_max:g} m: {do}"]
+    if sonar.range_max > FARTHEST_WINDOW_M:
+        return [f"the window ends at {sonar.range_max:g} m, farther than imaging sonars reach: {do}"]
+    diagonal = float(np.linalg.norm(np.ravel(np.array(scene.bbox().extents(), dtype=float)))) if scene.shapes() else 0.0
+    if 0 < diagonal < sonar.bin_m:
+        return [
+            f"the whole scene is {1e3 * diagonal:.3g} mm large, less than a range bin of {1e3 * sonar.bin_m:.3g} mm: scenes "
+            "are in metres; give its shapes a <scale/>, or `mitsonar world mesh` a larger --scale"
+        ]
+    return []
 
 
 def _parameters(path: Path, error: BaseException) -> str:

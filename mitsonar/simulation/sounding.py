@@ -65,8 +65,16 @@ class SounderSimulator:
     ) -> None:
         self.sounder = sounder
         self.simulator = Simulator(scene, sounder.fan, moving=moving, rays_per_launch=rays_per_launch)
-        self.variant, self.notes = self.simulator.variant, self.simulator.notes
+        self.variant = self.simulator.variant
         self.noise = self._noise()
+
+    def __repr__(self) -> str:
+        return f"SounderSimulator({self.sounder})"
+
+    @property
+    def notes(self) -> list[str]:
+        """Return what a user should know about the scene and the instrument."""
+        return self.simulator.notes
 
     def pings(self, poses: ArrayLike, *, first: int = 0, time_s: ArrayLike | None = None) -> Iterator[SoundedPings]:
         """Levels of consecutive pings of the vehicle, in batches; every fan of every ping draws its own jitter.

@@ -16,7 +16,11 @@ from mitsonar.io.plain_data import finite_number, whole_number
 from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames, percent
 from mitsonar.simulation.rendered_pings import RenderedPings
 
-__all__ = ["Tally"]
+__all__ = ["NEGLIGIBLE", "Tally"]
+
+
+NEGLIGIBLE = 1e-3
+"""Part of the returns that may lie outside the window without a warning."""
 
 
 @dataclass
@@ -82,8 +86,10 @@ class Tally:
             pose = poses[number - first]
             window = (sonar.range_min, sonar.range_max)
             beside = source.window_range(pose, number)
-            found["empty"] = empty_frames(self.empty, self.frames, (number, pose), its_rays, window, beside)
-        if outside > 0 and "window" not in told:
+            found["empty"] = empty_frames(
+                self.empty, self.frames, (number, pose), its_rays, window, beside, source.buried(pose)
+            )
+        if outside > NEGLIGIBLE * hits and "window" not in told:
             frame = self.worst[1]
             ends = source.window_range(poses[frame - first], frame)
             where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""

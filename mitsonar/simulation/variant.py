@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from mitsonar.errors import MitsonarError, nearest_names
@@ -14,6 +15,7 @@ __all__ = [
     "backend",
     "current_variant",
     "ensure_variant",
+    "frozen",
     "release_memory",
     "replayed",
     "thread_count",
@@ -34,10 +36,11 @@ class Backend(NamedTuple):
 
 
 def ensure_variant(name: str | None = None) -> str:
-    """Set a variant unless a usable one is set, and return its name; ``name`` or ``MITSONAR_VARIANT`` forces one.
+    """Set a variant where none is set, and return the name of the one that is; ``name`` or ``MITSONAR_VARIANT`` forces one.
 
     Raises:
-        MitsonarError: unknown variant; neither CUDA nor LLVM is found (with the command that installs it).
+        MitsonarError: unknown variant; one is set that mitsonar does not work with; neither CUDA nor LLVM is found (with the
+            command that installs it).
     """
     cuda, llvm = _backends()
     import mitsuba as mi
@@ -47,6 +50,11 @@ def ensure_variant(name: str | None = None) -> str:
         if mi.variant() in VARIANTS:
             return str(mi.variant())
         wanted = "cuda_ad_mono" if cuda else "llvm_ad_mono"
+        if mi.variant() is not None:  # chosen by the user, whose objects another variant would not know
+            raise MitsonarError(
+                f"the Mitsuba variant {mi.variant()} is set, and mitsonar works with {', '.join(VARIANTS)}: call "
+                f'mi.set_variant("{wanted}") first, or leave set_variant out'
+            )
     if wanted not in VARIANTS:
         raise MitsonarError(f"unknown variant {wanted!r}: {nearest_names(wanted, VARIANTS)}")
     if not (cuda if wanted.startswith("cuda") else llvm):
@@ -87,6 +95,20 @@ def thread_count() -> int:
     import drjit as dr
 
     return max(1, int(dr.thread_count()))
+
+
+def frozen(launch: Callable[..., Any]) -> Callable[..., Any]:
+    """Record a launch at its first call and replay it at later ones: ``dr.freeze``, for launches that evaluate BSDFs.
+
+    A kernel that evaluates BSDFs holds the code of all that are alive, those of other scenes included, and Dr.Jit records it
+    only if the values that they read are among the inputs. It collects these of every class of which the inputs hold a
+    pointer. A scene holds pointers to shapes only, and through a shape Dr.Jit finds the shape's BSDF, but not a BSDF of
+    another scene that no shape uses. Hence the pointer to a BSDF, which points at none.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.freeze(launch, state_fn=lambda *_: mi.BSDFPtr(None))
 
 
 def replayed(launch: Any, *inputs: object) -> Any:

@@ -57,6 +57,10 @@ class Mounted:
     instrument: Instrument
     mount: Pose = MIDDLE
 
+    def __repr__(self) -> str:
+        shown = str(self.instrument) if isinstance(self.instrument, Sonar | Sounder | ChannelSonar) else "a camera"
+        return f"Mounted({shown} at {self.mount})"
+
     def path(self, vehicle: Trajectory) -> Trajectory:
         """Return the path of the sensor for that of the vehicle."""
         return Trajectory(mounted(vehicle.poses, self.mount), vehicle.time_s)
@@ -74,7 +78,7 @@ class VehicleSimulator:
 
     Args:
         scene: a Mitsuba scene.
-        sensors: by name; default: the scene's own, see :func:`sensors_in`.
+        sensors: by name; default: the scene's own, by their ids.
         moving: trajectories of bodies, as of :class:`mitsonar.Simulator`; ``vehicle`` stands for the path.
 
     Raises:
@@ -87,9 +91,13 @@ class VehicleSimulator:
         self.scene, self._sensors = scene, sensors
         self.moving = motions_of(scene) if moving is None else moving
 
+    def __repr__(self) -> str:
+        names = "those of the scene" if self._sensors is None else ", ".join(self._sensors)
+        return f"VehicleSimulator(sensors {names[:160]}; a scene of {len(self.scene.shapes())} shapes)"
+
     def sensors(self, vehicle: Trajectory) -> Mapping[str, Mounted]:
         """Return the sensors by name; those of the scene stand in it as at the path's first pose."""
-        return sensors_in(self.scene, Pose(*vehicle.poses[0])) if self._sensors is None else self._sensors
+        return sensors_in(self.scene, Pose.from_row(vehicle.poses[0])) if self._sensors is None else self._sensors
 
     def bodies(self, vehicle: Trajectory) -> MovingBodies:
         """Return the bodies that move while the vehicle flies a path.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.io.whole_files import refuse_irregular
 
-__all__ = ["CHECKS", "LARGEST_COORDINATE", "check_counts", "check_mesh"]
+__all__ = ["CHECKS", "LARGEST_COORDINATE", "check_counts", "check_mesh", "refuse_foreign_format"]
 
 LARGEST_COORDINATE = 1e12
 """Largest coordinate of vertices, normals and textures: beyond it single precision overflows."""
@@ -87,8 +87,61 @@ def _check_once(path: str, kind: str, size: int, modified_ns: int) -> None:
     try:
         CHECKS[kind](content)
     except (_FaultError, ValueError, ArithmeticError, UnicodeDecodeError, struct.error, zlib.error, MemoryError) as error:
+        if (other := _format_of(Path(path), content)) and other.lower() != kind:
+            raise MitsonarError(_foreign(path, other, kind)) from None
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MitsonarError(f"mesh {path} is damaged: {reason}; export it again") from None
+
+
+FOREIGN_FORMATS = {
+    **{"glb": "glTF", "gltf": "glTF", "dae": "COLLADA", "stl": "STL", "fbx": "FBX", "blend": "Blender", "3mf": "3MF"},
+    **{"usd": "USD", "usda": "USD", "usdc": "USD", "usdz": "USD", "urdf": "URDF", "sdf": "SDF", "step": "STEP"},
+}
+"""Formats of models that Mitsuba does not read, by the end of a file's name."""
+
+BEGINNINGS = {
+    **{b"glTF": "glTF", b"ply": "PLY", b"solid": "STL", b"Kaydara FBX": "FBX", b"BLENDER": "Blender"},
+    **{b"PXR-USDC": "USD", b"#usda": "USD", b"ISO-10303": "STEP"},
+}
+"""Formats by the first bytes of a file."""
+
+
+def refuse_foreign_format(kind: str, filename: str) -> None:
+    """Refuse a shape whose type is a format of models that Mitsuba lacks, such as ``glb``.
+
+    Raises:
+        MitsonarError: it is; the message says how to make a scene of the file.
+    """
+    if kind in FOREIGN_FORMATS:
+        raise MitsonarError(_foreign(filename, FOREIGN_FORMATS[kind], kind))
+
+
+def _format_of(path: Path, content: bytes) -> str:
+    """Return the format of a model by its first bytes, else by the end of its name; empty where it is unknown."""
+    for begin, name in BEGINNINGS.items():
+        if content.startswith(begin):
+            return name
+    head = content[:1000]
+    if b"<COLLADA" in head:
+        return "COLLADA"
+    if head.lstrip().startswith(b"{") and b'"asset"' in content:
+        return "glTF"
+    if len(content) > 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        return "STL"
+    return FOREIGN_FORMATS.get(path.suffix.lower()[1:], "")
+
+
+def _foreign(path: str, name: str, kind: str) -> str:
+    """Describe what to do with a model in a format that Mitsuba's plugin does not read."""
+    reads = f"Mitsuba's shape {kind} does not read it" if kind in CHECKS else f"Mitsuba has no shape {kind}"
+    make = {
+        "PLY": "name the shape ply",
+        "USD": f"`mitsonar world import {path} -o FOLDER` makes a scene of it",
+        "FBX": "export it as glTF, for `mitsonar world mesh`",
+    }
+    make |= {"URDF": make["USD"], "SDF": make["USD"]} | dict.fromkeys(("Blender", "3MF", "STEP"), make["FBX"])
+    do = make.get(name, f"`mitsonar world mesh {path} -o FOLDER` makes a scene of it")
+    return f"mesh {path} is a file of {name}, and {reads}: the formats are ply, obj and serialized; {do}"
 
 
 def _check_triangles(indices: NDArray[np.generic], vertices: int, what: str = "a triangle names vertex") -> None:

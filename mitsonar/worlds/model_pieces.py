@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -101,7 +102,7 @@ def read_pieces(path: Path, value: str | float) -> list[Piece]:
 
 def _geometries(path: Path) -> list[trimesh.Trimesh]:
     """Read the triangles of a file, transformed by its scene graph."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MitsonarError(f"no model file {path}: give a {', '.join(FORMATS)} file")
     if path.suffix.lower() not in FORMATS:
         raise MitsonarError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,14 +28,16 @@ class ModelSearch:
         roots: folders within which a file must lie, without links.
 
     Raises:
-        MitsonarError: one of the folders is not there.
+        MitsonarError: the file, or one of the folders, is not there.
     """
 
     def __init__(self, file: Path, folders: Sequence[str | Path] = ()) -> None:
-        missing = [folder for folder in folders if not Path(folder).is_dir()]
+        if not os.path.lexists(file):
+            raise MitsonarError(f"no such file: {file}")
+        missing = [folder for folder in folders if not os.path.isdir(folder)]
         if missing:
             raise MitsonarError(f"there is no folder {missing[0]} to search: give a folder that holds models or packages")
-        roots = (file.resolve().parent, *(Path(folder).resolve() for folder in folders))
+        roots = (_without_links(file).parent, *(_without_links(folder) for folder in folders))
         self.roots = list(dict.fromkeys(roots))  # each once
 
     def find(self, name: str, beside: Path) -> Path:
@@ -58,12 +61,12 @@ class ModelSearch:
                 "give the folder by --search"
             )
         for candidate in self._candidates(name, scheme, beside):
-            found = candidate.resolve()
-            if any(found.is_relative_to(root) for root in self.roots) and found.exists():
+            found = _without_links(candidate)
+            if any(found.is_relative_to(root) for root in self.roots) and os.path.exists(found):
                 return found
-        candidates = [path.resolve() for path in self._candidates(name, scheme, beside)]
+        candidates = [_without_links(path) for path in self._candidates(name, scheme, beside)]
         inside = any(path.is_relative_to(root) for path in candidates for root in self.roots)
-        outside = any(path.exists() for path in candidates)
+        outside = any(os.path.exists(path) for path in candidates)
         missing = "there is no such file" if inside and not outside else "which is not"
         raise MitsonarError(
             f"{beside} names {shortened(name)}, {missing} within {', '.join(map(str, self.roots))}: give the folder that "
@@ -80,3 +83,8 @@ class ModelSearch:
             *(root / package / Path(*rest) for root in self.roots),
             *(root / Path(*rest) for root in self.roots if root.name == package),
         ]
+
+
+def _without_links(path: str | Path) -> Path:
+    """Return a path without links. One that leads to itself stays as it is, where :meth:`Path.resolve` raises."""
+    return Path(os.path.realpath(path))

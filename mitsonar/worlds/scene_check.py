@@ -13,7 +13,7 @@ from mitsonar.errors import MitsonarError, shortened
 from mitsonar.io.whole_files import refuse_beyond_memory, refuse_irregular
 from mitsonar.plugins.native_plugins import file_resolver, foreign_names
 from mitsonar.worlds.grid_check import check_grid, check_tensors, pixels_of
-from mitsonar.worlds.mesh_check import CHECKS, LARGEST_COORDINATE, check_counts, check_mesh
+from mitsonar.worlds.mesh_check import CHECKS, LARGEST_COORDINATE, check_counts, check_mesh, refuse_foreign_format
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -48,6 +48,11 @@ def check_parsed(state: mi.parser.ParserState) -> None:
         MitsonarError: a type that is no name; a number that is not finite; objects that refer to each other too often; a
             damaged mesh or picture; a file that is none.
     """
+    import mitsuba as mi
+
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Shape:
+            refuse_foreign_format(node.props.plugin_name(), str(node.props.get("filename", "")))
     foreign_names(node.props.plugin_name() for node in state.nodes)
     _check_references(state)
     pixels = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import ClassVar
 
@@ -69,6 +70,6 @@ class SceneFile(Family):
         Raises:
             MitsonarError: the file does not exist.
         """
-        if not Path(self.file).is_file():
+        if not os.path.isfile(self.file):
             raise MitsonarError(f"no scene file {self.file}: world.file must name a Mitsuba XML file that is there")
         return Path(self.file), self.parameters

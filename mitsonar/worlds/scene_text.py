@@ -157,7 +157,7 @@ class _Text:
                 if not opened or opened.pop() != found[1]:
                     raise _malformed(path, content, place, "an element is closed that is not open")
             elif opened or (found := DOCTYPE.match(content, place)) is None:  # a document type may define entities
-                raise _malformed(path, content, place, "an element or one of its attributes is malformed")
+                raise _malformed(path, content, place, "the XML of an element or of one of its attributes is malformed")
             place = content.find(b"<", found.end())
         if opened:
             raise _malformed(path, content, len(content), f"<{opened[-1].decode('utf-8', 'replace')[:40]}> is not closed")

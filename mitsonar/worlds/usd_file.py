@@ -63,7 +63,7 @@ def read_usd(path: Path, search: ModelSearch, shapes: Shapes, collision: bool = 
 
 def _read_apart(path: Path, search: ModelSearch, collision: bool) -> tuple[PlainValue, dict[str, NDArray[Any]]]:
     """Read a stage in another process; return what it tells of the prims, and their arrays."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MitsonarError(f"no such file: {path}")
     asked = {"path": str(path.resolve()), "roots": [str(root) for root in search.roots], "collision": collision}
     settings = {name: value for name, value in os.environ.items() if not name.startswith(("PXR_", "USD_"))}

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 
-__all__ = ["net_mesh", "particle_mesh"]
+__all__ = ["fishing_net_mesh", "particle_mesh"]
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 """Vertices ``(vertices, 3)`` [m] and triangles ``(faces, 3)``, outward."""
@@ -43,7 +43,7 @@ def particle_mesh(count: int, size_m: tuple[float, float, float], radius_m: floa
     return vertices.reshape(-1, 3), _copied(np.array(outward), len(corners), count)
 
 
-def net_mesh(width_m: float, height_m: float, opening_m: float, twine_m: float) -> Mesh:
+def fishing_net_mesh(width_m: float, height_m: float, opening_m: float, twine_m: float) -> Mesh:
     """Make a net of square openings in the plane y = 0, from the origin to east and up, of bars with three sides.
 
     Args:

@@ -6,14 +6,15 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Self, overload
+from typing import Annotated, ClassVar, NoReturn, Self, overload
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError
 
 from mitsonar.errors import MitsonarError, complaint
+from mitsonar.io.checked_model import CheckedModel
 
 __all__ = [
     *("BuiltFamily", "Counts", "Family", "Floor", "Interval", "Mesh", "Standpoint", "World", "draw", "shifted_grid"),
@@ -45,15 +46,14 @@ SURFACE_MARGIN_M = 25.0
 """What a sea surface reaches beyond the world [m]."""
 
 
-class Family(BaseModel):
+class Family(CheckedModel):
     """A family of worlds: its options are the fields, and :meth:`build` makes a world from a seed.
 
-    :meth:`create` answers a mistake with one sentence, by the name of the family and where its options are described.
+    A mistake is one sentence, with the name of the family and where its options are described.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    called: ClassVar[str]
     described: ClassVar[str] = ""
 
     @classmethod
@@ -63,11 +63,20 @@ class Family(BaseModel):
         Raises:
             MitsonarError: an unknown key, a value outside its limits, or numbers that do not fit each other.
         """
-        try:
-            return cls(**fields)
-        except ValidationError as error:
-            described = cls.described or f"`mitsonar world {cls.called} --help`"
-            raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
+        return cls(**fields)
+
+    @classmethod
+    def refuse(cls, error: ValidationError) -> NoReturn:
+        """Raise the sentence.
+
+        Raises:
+            MitsonarError: the first of pydantic's complaints.
+        """
+        described = cls.described or f"`mitsonar world {cls.called} --help`"
+        raise MitsonarError(complaint(error, cls, cls.called, f" (see {described})")) from None
+
+    def __str__(self) -> str:
+        return repr(self)
 
     @property
     def half_m(self) -> float:
@@ -302,6 +311,13 @@ class World:
     surface: Floor | None = None
     pictures: dict[str, Path] = field(default_factory=dict)
     content: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """Return the ids of the shapes, in the order of the file."""
+        flat = ([one.name] if one else [] for one in (self.floor, self.surface))
+        below, above = flat
+        return (*below, *(mesh.shape_id or mesh.name for mesh in self.meshes), *above)
 
     @property
     def size_m(self) -> float:

@@ -40,7 +40,7 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
     out = tmp_path / "out"
     done = mitsonar("impulse", scene, "--velocity", "2,-1", "--frames", 20, "-o", out)
     assert done.returncode == 0, done.stderr
-    assert "20 pings (scatterers model, custom: front, right) of 800 taps" in done.stdout
+    assert "20 pings (scatterers model, unnamed channel sonar: front, right) of 800 taps" in done.stdout
     assert "spread factor" in done.stdout
     assert "changes the phase by up to" in done.stdout
     assert "overspread" in done.stderr  # at half the speed no receiver's own factor is above 0.3
@@ -131,7 +131,7 @@ def test_a_receiver_that_hears_nothing_is_named(mitsonar: Command, tmp_path: Pat
     )
     done = mitsonar("impulse", path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert "receiver up has no echo in 1 of 1 pings" in done.stderr
+    assert "receiver up has no echo in 1 of 1 ping" in done.stderr
     assert "above 90: upwards" in done.stderr
     assert "receiver up is 20 m from the transmitter: positions are in metres" in done.stderr
     assert "receiver front" not in done.stderr

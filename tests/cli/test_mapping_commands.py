@@ -184,7 +184,7 @@ def test_a_long_run_and_some_of_its_frames(mitsonar: Command, tmp_path: Path) ->
     done = mitsonar("mosaic", tmp_path / "frames.zarr", tmp_path / "out", "-o", tmp_path / "map.tif")
     assert done.returncode == 0, done
     assert "6 frames along the estimated path" in done.stdout
-    assert "warning: 6 of 12 frames have no pose" in done.stderr
+    assert "warning: left out without a pose at their time: 6 of 12 frames" in done.stderr
 
 
 def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
@@ -193,11 +193,11 @@ def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_p
     frames.save(tmp_path / "gap.npz")
     done = mitsonar("odometry", tmp_path / "gap.npz", "-o", tmp_path / "out")
     assert done.returncode == 0, done
-    assert "warning: 4 of 19 motions (21 %) are not believed and were bridged" in done.stderr
+    assert "warning: 4 of 19 motions (21 %) were rejected and bridged" in done.stderr
     assert "4 invalid and bridged" in done.stdout
     frames.image[...] = 0
     frames.save(tmp_path / "dark.npz")
-    refused(mitsonar("odometry", tmp_path / "dark.npz", "-o", tmp_path / "dark"), "none of 19 motions is believed")
+    refused(mitsonar("odometry", tmp_path / "dark.npz", "-o", tmp_path / "dark"), "none of 19 motions is valid")
 
 
 # ---------------------------------------------------------------- kills and workers
@@ -298,6 +298,9 @@ def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path
     refused(mitsonar("mosaic", drawn, tmp_path / "broken.tum", "-o", out), "line 1")
     refused(mitsonar("mosaic", drawn, tmp_path / "empty", "-o", out), "run.json")
     refused(mitsonar("mosaic", drawn, tmp_path / "far.tum", "-o", out), "look for a pose that is wrong")
+    (tmp_path / "estimated").mkdir()
+    (tmp_path / "estimated" / "run.json").write_text('{"kind": "odometry"}')
+    refused(mitsonar("mosaic", tmp_path / "estimated", drawn, "-o", out), "frames first, the odometry second")
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.jpg"), ".png, .tif")
     refused(mitsonar("mosaic", drawn, "true", "-o", tmp_path / "no" / "map.png"), "no folder")
     refused(mitsonar("mosaic", drawn, "true", "-o", out, "--cell-mm", 0), "above 0")

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import os
 import pickle
 import shlex
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from drawn_frames import over_ground, sway
-from helpers import Command, refused
+from helpers import Command, essence, refused, run_python
 
-from mitsonar.cli.console import OPTIONS, command_line
+from mitsonar.cli.console import OPTIONS, answered, command_line, say_json
 from mitsonar.errors import MitsonarError, argument, meant
 from mitsonar.geometry.attitude import attitude_of
 
@@ -206,3 +212,72 @@ def test_a_collada_file_without_its_package_names_the_extra(
     done = mitsonar("world", "mesh", tmp_path / "wreck.dae", "-o", tmp_path / "w")
     refused(done, "COLLADA needs the package pycollada", "pip install 'mitsonar[meshes]'", "glb, obj, stl or ply")
     assert not (tmp_path / "w").exists()
+
+
+# ---------------------------------------------------------------- signals
+
+STAYS = "what is whole on disk stays, and the same command"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_ends_a_command_with_a_sentence(
+    number: signal.Signals, code: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def with_folder(resume: bool = False) -> None:
+        os.kill(os.getpid(), number)
+        time.sleep(10)
+
+    def without() -> None:
+        try:
+            with_folder()
+        except KeyboardInterrupt:
+            raise SystemError("native code was broken off") from None
+
+    for command, words in (
+        (with_folder, ": what is whole on disk stays, and the same command with --resume goes on"),
+        (without, ""),
+    ):
+        with pytest.raises(typer.Exit) as end:
+            answered(command)()
+        assert end.value.exit_code == code
+        assert capfd.readouterr().err == f"stopped{words}\n"
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_signal_ends_a_child_that_a_command_has_forked() -> None:
+    """It inherits the answer to the signal, and is not to go on where its parent was."""
+    script = """
+        import os, signal, time
+        from mitsonar.cli.console import answered
+        def command():
+            child = os.fork()
+            if child == 0:
+                time.sleep(10)
+                os._exit(0)
+            time.sleep(0.1)
+            os.kill(child, signal.SIGTERM)
+            print(os.waitpid(child, 0)[1])
+        answered(command)()
+    """
+    assert run_python(script) == f"{int(signal.SIGTERM)}\n"
+
+
+@pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM]))
+def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar: Command, tmp_path: Path) -> None:
+    words = ["render", "objects", "--sonar", "didson300", "--model", "physical", "--quality", "draft", "-o", "run"]
+    words += ["--trajectory", "shipped", "--set", "range_bins=60"]
+    command = [sys.executable, "-m", "mitsonar", *words]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        end = time.monotonic() + 60
+        while not list((tmp_path / "run").glob("frames.zarr/zarr.json")) and time.monotonic() < end:
+            time.sleep(0.01)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=30)
+    assert process.returncode == 128 + number
+    assert said.splitlines()[-1] == f"stopped: {STAYS} with --resume goes on"
+    assert mitsonar(*words, "--resume", cwd=tmp_path).returncode == 0
+
+
+def test_printed_json_has_no_words_of_python(capfd: pytest.CaptureFixture[str]) -> None:
+    say_json({"a": [1.5, float("nan")], "b": {"c": (float("inf"), "NaN")}}, indent=0)
+    assert json.loads(capfd.readouterr().out, parse_constant=pytest.fail) == {"a": [1.5, None], "b": {"c": [None, "NaN"]}}

@@ -33,7 +33,7 @@ def places(frames: SonarFrames, tmp_path_factory: pytest.TempPathFactory) -> dic
     (folder / "run").mkdir()
     frames.save(folder / "frames.npz")
     as_zarr(frames, folder / "run/frames.zarr")
-    write_mcap([frames], folder / "run.mcap")
+    write_mcap([frames], folder / "run.mcap", full=True)
     return {"npz": folder / "frames.npz", "zarr": folder / "run", "mcap": folder / "run.mcap"}
 
 
@@ -57,7 +57,7 @@ def test_info_tells_gaps_and_notes(mitsonar: Command, frames: SonarFrames, tmp_p
     time = np.array([0.0, 0.1, 0.2, 0.9, 1.0, 1.1]) + 1_790_000_000
     replace(frames, time_s=time).save(tmp_path / "frames.npz")
     table = mitsonar("recording", "info", tmp_path).stdout
-    assert "10 Hz, 1 gaps; the longest step takes 0.7 s" in table
+    assert "10 Hz, 1 gap; the longest step takes 0.7 s" in table
     assert "2026-09-21" in table
 
 
@@ -80,7 +80,7 @@ def test_frames_survive_folder_and_mcap_in_any_order(
 ) -> None:
     first, second = tmp_path / "one.mcap", tmp_path / "two"
     for source, out in ((places[kind], first), (first, second)):
-        done = mitsonar("recording", "convert", source, "-o", out)
+        done = mitsonar("recording", "convert", source, "-o", out, *(["--full"] if out is first else []))
         assert done.returncode == 0, done
         assert "6 frames in" in done.stdout
     back = SonarFrames.load(second)
@@ -99,7 +99,7 @@ def test_frames_survive_folder_and_mcap_in_any_order(
 def test_labels_of_a_run_become_points(mitsonar: Command, places: dict[str, Path], tmp_path: Path, kind: str) -> None:
     from bags import decoded
 
-    assert mitsonar("recording", "convert", places[kind], "-o", tmp_path / "a.mcap").returncode == 0
+    assert mitsonar("recording", "convert", places[kind], "-o", tmp_path / "a.mcap", "--labels").returncode == 0
     clouds = decoded(tmp_path / "a.mcap")["/sonar/points"]
     assert len(clouds) == 6
     assert [one.name for one in clouds[0].fields] == ["x", "y", "z", "intensity", "shape_id"]
@@ -146,6 +146,7 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
         (["convert", "FRAMES", "-o", "a.bag"], "unknown ending"),
         (["convert", "FRAMES", "-o", "a.mcap", "--resume"], "--resume is for folders"),
         (["convert", "FRAMES", "-o", "a.mcap", "--part", "3"], "has no part 3"),
+        (["convert", "FRAMES", "-o", "a", "--full"], "--full and --labels are of MCAP files"),
         (["video", "FRAMES", "-o", "a.mp4", "--rate", "0"], "--rate must lie"),
         (["show", "FRAMES", "-o", "a.png", "--span-db", "-1"], "the span must lie"),
     ],

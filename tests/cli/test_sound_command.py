@@ -14,6 +14,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echogram import Echogram
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.soundings import Soundings
+from mitsonar.simulation.scene import shipped_trajectory
 
 FILES = {
     "sidescan": {"echogram.npz", "sidescan.xtf", "waterfall.png", "soundings.npz", "poses.tum"},
@@ -107,3 +108,28 @@ def test_frames_that_take_time_are_read_and_followed(mitsonar: Command, tmp_path
     assert done.returncode == 0, done.stderr
     done = mitsonar("recording", "convert", run, "-o", tmp_path / "again")
     assert done.returncode == 0, done.stderr
+
+
+def test_poses_are_named_and_an_instrument_that_looks_down_is_warned_of_on_a_pitched_path(
+    mitsonar: Command, tmp_path: Path
+) -> None:
+    """The shipped path is that of a forward-looking sonar: `render` flies it, a DVL rides level below it."""
+    quick = ("--quality", "draft", "--model", "physical", "-o")
+    shipped = Trajectory.load_tum(shipped_trajectory("flat_floor"))
+    seen = mitsonar("render", "flat_floor", "--trajectory", "shipped", "--frames", 2, *quick, tmp_path / "seen")
+    assert "poses: of the sonar, at pitch 35 deg" in seen.stdout
+    dvl = ("sound", "flat_floor", "--instrument", "dvl", "--trajectory")
+    done = mitsonar(*dvl, "shipped", "--frames", 2, *quick, tmp_path / "level")
+    assert "poses: of the vehicle, at pitch 0 deg; mounted on it: beam-1 pitch 67.5, heading 45 deg" in done.stdout
+    assert done.stderr == ""
+    flown = Trajectory.load_tum(tmp_path / "level" / "poses.tum").poses
+    np.testing.assert_allclose(flown[:, 3:5], 0, atol=1e-9)
+    np.testing.assert_allclose(flown[0, [0, 1, 2, 5]], shipped.poses[0, [0, 1, 2, 5]], atol=1e-9)
+    tilted = mitsonar(*dvl, tmp_path / "seen" / "poses.tum", *quick, tmp_path / "tilted")
+    assert tilted.returncode == 0
+    assert (
+        "the vehicle flies at pitch 35, roll 0 deg, and the dvl on it looks down or aside from a level one" in tilted.stderr
+    )
+    assert "the path must be the vehicle's, not that of a sonar on it" in tilted.stderr
+    ahead = ("--instrument", "range-image", "--trajectory", tmp_path / "seen" / "poses.tum", "--frames", 1)
+    assert "vehicle flies at" not in mitsonar("sound", "flat_floor", *ahead, *quick, tmp_path / "ahead").stderr

@@ -12,6 +12,7 @@ from helpers import HEARD, TINY, Command, essence, refused, tiny_recipe
 from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.plan import Scene
 from mitsonar.datasets.scene_rendering import loaded_world
 from mitsonar.datasets.store import DataStore
@@ -91,3 +92,15 @@ def test_the_command_line_says_so(mitsonar: Command, tmp_path: Path) -> None:
     refused(
         mitsonar("dataset", "make", tmp_path / "small.yaml", "-o", tmp_path / "y.zarr"), "world.size_m", "is larger than"
     )
+
+
+@pytest.mark.parametrize(("stated", "share", "warned"), [(True, 0.061, ""), (True, 0.6, "60 %"), (False, 0.061, "6.1 %")])
+def test_a_recipe_that_states_its_window_means_it(stated: bool, share: float, warned: str) -> None:
+    """It is warned of a window that drops more than half of a ping; the window of a preset counts from a thousandth on."""
+    window = {"range_min": 3.2, "range_max": 5.6} if stated else {}
+    recipe = tiny_recipe(sonar={**TINY["sonar"], **window})
+    rays = recipe.instrument.rays
+    table = {"dropped": np.full(4, round(share * rays)), "saturated": np.zeros(4, dtype=int)}
+    found = ImageModality(recipe).warnings(lambda name: table[name])
+    assert bool(found) == bool(warned)
+    assert all(warned in text and "set sonar.range_min" in text for text in found)

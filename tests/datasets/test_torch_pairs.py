@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import re
 from pathlib import Path
@@ -25,7 +26,7 @@ from torch.utils.data import DataLoader  # noqa: E402
 
 from mitsonar.datasets.arrangement import Labels, arrangement_of  # noqa: E402
 from mitsonar.datasets.rendered_pairs import RenderedPairs  # noqa: E402
-from mitsonar.datasets.torch_pairs import SonarPairs  # noqa: E402
+from mitsonar.datasets.torch_pairs import SampleOptions, Samples, SonarPairs  # noqa: E402
 
 HIGH = NOISE_MODELS["high"]
 
@@ -288,7 +289,7 @@ def test_parts_that_are_not_there_are_refused(made: Path) -> None:
     assert len(SonarPairs(made, split={"train": 0.5, "validation": 0.5})) == 60
     for noise in (None, 0.1):
         with pytest.raises(MitsonarError, match="noise must be a name"):
-            SonarPairs(made, noise=noise)
+            SonarPairs(made, noise=noise)  # type: ignore[arg-type]
     with pytest.raises(MitsonarError, match="channels: got 'beside'"):
         SonarPairs(made, layout="beside")
 
@@ -403,3 +404,21 @@ def test_what_cannot_be_rendered_in_training_is_refused() -> None:
     )
     with pytest.raises(MitsonarError, match="multiprocessing_context"):
         next(iter(forked))
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "words"),
+    [
+        (SonarPairs, {"url": "absent.zarr", "layuot": "side"}, "SonarPairs has no argument layuot: did you mean layout"),
+        (SonarPairs, {"url": "absent.zarr", "prat": "all"}, "SonarPairs has no argument prat: did you mean part"),
+        (RenderedPairs, {"recipe": "rocky-field", "seed": 1, "lenght": 8}, "has no argument lenght: did you mean length"),
+    ],
+)
+def test_a_mistyped_argument_is_one_sentence(kind: Any, given: dict[str, object], words: str) -> None:
+    with pytest.raises(MitsonarError, match=words):
+        kind(**given)
+
+
+def test_the_options_that_editors_complete_are_those_of_samples() -> None:
+    options = [name for name, one in inspect.signature(Samples).parameters.items() if one.kind is one.KEYWORD_ONLY]
+    assert sorted(options) == sorted(SampleOptions.__annotations__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import fields
 from typing import Any
 
 import gymnasium
@@ -11,6 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from mitsonar.environments.sonar_env import SonarEnv
+from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -55,16 +57,16 @@ def test_a_vehicle_that_sinks_collides_and_begins_anew(simulator: Simulator) -> 
     env = SonarVectorEnv(simulator, num_envs=2, start=start, step_s=1.0, clearance_m=0.4)
     env.reset(seed=0)
     down, stay = [0, 0, -1, 0], [0, 0, 0, 0]
-    ended = env.step(np.array([down, stay]))[2]
-    assert not ended.any()  # at 0.5 m
-    _, _, ended, cut, told = env.step(np.array([down, stay]))
-    assert ended.tolist() == [True, False]
-    assert not cut.any()
-    assert told["collided"].tolist() == [True, False]
-    _, _, ended, _, told = env.step(np.array([down, stay]))
-    assert not ended.any()
-    np.testing.assert_allclose(told["pose"][0], start)
-    assert told["_collided"].tolist() == [False, True]
+    terminated = env.step(np.array([down, stay]))[2]
+    assert not terminated.any()  # at 0.5 m
+    _, _, terminated, truncated, info = env.step(np.array([down, stay]))
+    assert terminated.tolist() == [True, False]
+    assert not truncated.any()
+    assert info["collided"].tolist() == [True, False]
+    _, _, terminated, _, info = env.step(np.array([down, stay]))
+    assert not terminated.any()
+    np.testing.assert_allclose(info["pose"][0], start)
+    assert info["_collided"].tolist() == [False, True]
 
 
 def test_bounds_steps_and_rewards_count(simulator: Simulator) -> None:
@@ -77,21 +79,21 @@ def test_bounds_steps_and_rewards_count(simulator: Simulator) -> None:
         reward=lambda step: step.poses[:, 0] - step.before[:, 0],
     )
     env.reset(seed=1)
-    _, reward, ended, cut, told = env.step([0, 1, 0, 0])  # ahead is +x
+    _, reward, terminated, truncated, info = env.step([0, 1, 0, 0])  # ahead is +x
     assert reward == pytest.approx(0.4)
-    assert not ended
-    assert not cut
-    _, _, ended, _, told = env.step([0, 1, 0, 0])
-    assert ended
-    assert told["outside"]
+    assert not terminated
+    assert not truncated
+    _, _, terminated, _, info = env.step([0, 1, 0, 0])
+    assert terminated
+    assert info["outside"]
     assert env.step([0, 0, 0, 0])[3]
 
 
 def test_masked_resets_and_wrong_arguments(simulator: Simulator) -> None:
     env = SonarVectorEnv(simulator, num_envs=2, start=START, max_steps=1, autoreset_mode="Disabled")
     env.reset(seed=0)
-    cut = env.step(np.zeros((2, 4)))[3]
-    assert cut.all()
+    truncated = env.step(np.zeros((2, 4)))[3]
+    assert truncated.all()
     with pytest.raises(MitsonarError, match="2 episodes have ended"):
         env.step(np.zeros((2, 4)))
     env.reset(options={"reset_mask": np.array([True, True])})
@@ -176,3 +178,38 @@ def test_a_reward_may_be_one_number_and_a_wrong_one_is_shown(simulator: Simulato
         bad.reset(seed=0)
         with pytest.raises(MitsonarError, match=said):
             bad.step(np.zeros((2, 4)))
+
+
+def test_a_mistyped_argument_of_an_environment_is_one_sentence() -> None:
+    with pytest.raises(MitsonarError, match=r"an environment has no argument boundz: did you mean bounds\?"):
+        SonarEnv("flat_floor", boundz=1)  # type: ignore[call-arg]
+    with pytest.raises(MitsonarError, match=r"an environment has no argument num_env: did you mean num_envs\?"):
+        SonarVectorEnv("flat_floor", num_env=2)  # type: ignore[call-arg]
+    assert list(TaskFields.__annotations__) == [field.name for field in fields(SonarTask)]
+
+
+def test_a_step_returns_what_gymnasium_names_in_its_order(simulator: Simulator) -> None:
+    env = SonarEnv(simulator, start=START, max_steps=1)
+    _, info = env.reset(seed=0)
+    assert list(info) == ["pose"]
+    _, reward, terminated, truncated, info = env.step(np.zeros(4))
+    assert (type(reward), terminated, truncated) == (float, False, True)
+    assert sorted(info) == ["clearance_m", "collided", "outside", "pose"]
+    words = " ".join((SonarEnv.step.__doc__ or "").split())
+    assert "observation, reward, terminated, truncated, info" in words
+
+
+def test_an_environment_follows_its_scene() -> None:
+    """A floor that rises is seen, and collided with: tables and clearance are of the scene as it is."""
+    import mitsuba as mi
+
+    scene = load_scene("flat_floor")
+    env = SonarEnv(scene, SONAR, start=[0, -5, 2, 0.4, 0, 0], clearance_m=0.3)
+    env.reset(seed=0)
+    before, _, terminated, _, _ = env.step(np.zeros(4))
+    values: Any = mi.traverse(scene)
+    values["floor.to_world"] = mi.ScalarTransform4f().translate([0, 0, 1.8]).scale(20)
+    values.update()
+    after, _, collided, _, _ = env.step(np.zeros(4))
+    assert (terminated, collided) == (False, True)
+    assert not np.array_equal(np.asarray(before), np.asarray(after))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from helpers import Command, refused, tiny_recipe
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.datasets.generation import make_dataset
+from mitsonar.errors import MitsonarError
 from mitsonar.motion.motion_errors import cluster_resamples, in_units
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
@@ -33,8 +37,10 @@ from mitsonar.estimation.benchmark import (  # noqa: E402
     rows_of,
     with_prior,
 )
+from mitsonar.estimation.comparison_run import compare  # noqa: E402
 from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
+from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.estimation.zero import Zero  # noqa: E402
 from mitsonar.motion.composition import Motion  # noqa: E402
 from mitsonar.motion.motion_prior import MotionPrior  # noqa: E402
@@ -110,6 +116,50 @@ def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
             assert size == pytest.approx(wanted), variation
             assert (frames.image == told[number].image).all()
     assert {"heave 5 mm", "jitter", "as told"} < set(VARIATIONS)
+
+
+def test_compare_in_python_is_the_table_of_the_command(
+    made: Path, pairs: SonarPairs, mitsonar: Command, tmp_path: Path
+) -> None:
+    """Estimators of one's own, by an object and by name; rows, CSV and columns hold what the table holds."""
+    oracle = Oracle(pairs)
+    found = compare(made, {"oracle": oracle, "zero": "zero", "again": Zero}, part="all", noise="none,low", limit=0)
+    rows = found.rows
+    assert [(row["noise"], row["method"]) for row in rows] == [
+        (noise, name) for noise in ("none", "low") for name in ("oracle", "zero", "again")
+    ]
+    assert rows[0]["rmse_sideways_mm"] < rows[1]["rmse_sideways_mm"] == rows[1]["zero_sideways_mm"]
+    assert rows[0]["rmse_yaw_deg"] == found.report["tables"][0]["rows"][0]["rmse"][2]
+    assert found.columns()["method"] == ["oracle", "zero", "again"] * 2
+    text = found.to_csv(tmp_path / "table.csv")
+    assert (tmp_path / "table.csv").read_text() == text
+    assert [row["method"] for row in csv.DictReader(text.splitlines())] == found.columns()["method"]
+    assert text.count("\n") == 7
+    plain = compare(made, ["zero"], part="all", limit=0, pairs=4)
+    done = mitsonar("compare", made, "--estimators", "zero", "--part", "all", "--limit", "0", "--pairs", "4")
+    assert done.returncode == 0, done.stderr
+    of_command, of_python = (re.sub(r"\S+ +\| nothing", "MS", text).strip() for text in (done.stdout, str(plain)))
+    assert of_command == of_python
+    with pytest.raises(MitsonarError, match="two estimators are named Zero: give a dictionary"):
+        compare(made, [Zero, Zero()], part="all")
+    with pytest.raises(MitsonarError, match=r"^reference must be one of zero: got 'zeor'; did you mean zero\?"):
+        compare(made, "zero", part="all", reference="zeor")
+
+
+def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:
+    """With its samples: their layout and labels."""
+
+    class Sums(torch.nn.Module):  # type: ignore[misc, name-defined]
+        def forward(self, images: Any) -> Any:
+            self.seen = images
+            return torch.tensor([[10.0, -10.0, 0.0]])
+
+    own = SonarPairs(pairs.store.place.url, part="all", labels="normx10", noise="high")
+    estimator: Any = create_estimator(Sums(), samples=own)
+    found = estimator.estimate(pairs.sonar_frames(3))
+    assert found.motion == pytest.approx([own.labels.high[0], own.labels.low[1], 0.0])
+    wanted = torch.cat([*torch.from_numpy(pairs.sonar_frames(3).image)], dim=1)
+    assert torch.equal(estimator._made._network.seen[0, 0], wanted)
 
 
 @pytest.mark.thorough

@@ -19,8 +19,8 @@ from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.comparison_run import Asked, compare
-from mitsonar.estimation.named_estimators import estimator_from
+from mitsonar.estimation.comparison_run import compare
+from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.exports.recorded_data_set import write_recorded
 from mitsonar.exports.recorded_frames import as_pixels, axes_of, frames_with_poses
 from mitsonar.mapping.known_poses import poses_at, stretches
@@ -125,7 +125,7 @@ def test_what_the_user_should_know_is_said(places: dict[str, Path], frames: Sona
     quiet = frames_with_poses(str(tmp_path / "quiet.npz"), path=tmp_path / "short.tum")
     made = write_recorded([frames_with_poses(str(places["npz"])), quiet], tmp_path / "data.zarr")
     left, gains, heights = made.notes
-    assert "quiet.npz: 4 frames are left out" in left
+    assert "quiet.npz: left out: 4 frames" in left
     assert "the gains of the files differ (levels of a pixel of 1 from 0.5 to 1)" in gains
     assert "--height gives one" in heights
     recipe = DataStore.open(tmp_path / "data.zarr").recipe
@@ -189,17 +189,17 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
     places: dict[str, Path], frames: SonarFrames, tmp_path: Path
 ) -> None:
     written(tmp_path / "data.zarr", places["npz"])
-    report = compare(str(tmp_path / "data.zarr"), Asked("zero,direct", part="all"))
+    report = compare(tmp_path / "data.zarr", "zero,direct", part="all").report
     rows = {row["method"]: row for row in report["tables"][0]["rows"]}
     truth = motions(true_poses(frames))
-    direct = estimator_from("direct")
+    direct = create_estimator("direct")
     pairs = [frames.select(slice(number, number + 2)) for number in range(len(truth))]
     found = np.array([direct.estimate(pair).motion for pair in pairs])
     wanted = np.sqrt((in_units(found - truth) ** 2).mean(axis=0))
     assert np.allclose(rows["direct"]["rmse"], wanted, rtol=1e-6)
     assert (np.array(rows["direct"]["rmse"]) < 0.2 * np.array(rows["zero"]["rmse"])).all()
     with pytest.raises(MitsonarError, match="have no world"):
-        compare(str(tmp_path / "data.zarr"), Asked("zero", part="all", perturb=True))
+        compare(tmp_path / "data.zarr", "zero", part="all", perturb=True)
 
 
 @pytest.mark.thorough
@@ -208,7 +208,7 @@ def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[
     done = mitsonar("dataset", "from-frames", places["aris"], "--poses", places["path"], "--cut", 6, "-o", out)
     assert done.returncode == 0, done
     assert "24 frames in 4 sequences" in done.stdout
-    report = compare(str(out), Asked("zero,direct", part="all"))
+    report = compare(out, "zero,direct", part="all").report
     zero, direct = (np.array(row["rmse"]) for row in report["tables"][0]["rows"])
     assert (direct < 0.3 * zero).all(), (direct, zero)
     assert mitsonar("compare", out, "--estimators", "zero,direct").returncode == 0
@@ -354,7 +354,7 @@ def test_rendered_runs_are_compared_and_fine_tuned_on(mitsonar: Command, variant
     store = DataStore.open(out)
     assert check(store) == []
     assert np.array_equal(store.read("image", slice(8, 16)), SonarFrames.load(tmp_path / "two").image)
-    report = compare(str(out), Asked("zero,direct", part="all"))
+    report = compare(out, "zero,direct", part="all").report
     zero, direct = (np.array(row["rmse"]) for row in report["tables"][0]["rows"])
     assert (direct < 0.2 * zero).all(), (direct, zero)
     (tmp_path / "tune.yaml").write_text(FINE_TUNING, encoding="utf-8")

@@ -14,15 +14,22 @@ from mitsonar.instruments.imaging_sonar import Sonar
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)
 SONAR = Sonar(range_min=2.0, range_max=7.0, range_bins=800)
 TOLERANCE_M = 0.02
+STD_BOTH = STD_GIVEN * STD_MEASURED / np.hypot(STD_GIVEN, STD_MEASURED)
+
+
+def weighed(first_m: float) -> float:
+    """The height by first echoes and the given one, each by its own standard deviation."""
+    weights = 1 / np.array([STD_MEASURED * first_m, STD_GIVEN * HEIGHT_M]) ** 2
+    return float(weights @ [first_m, HEIGHT_M] / weights.sum())
 
 
 def test_level_ground_has_the_height_of_the_first_echoes() -> None:
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
     found = attitude_of(frames, "a test", None, None)
     assert found.height_m == pytest.approx(HEIGHT_M, abs=TOLERANCE_M)
-    assert found.height_std_m == pytest.approx(STD_MEASURED * found.height_m)
     assert found.first is not None
-    assert found.height_m == found.first.height_m
+    assert found.height_m == pytest.approx(weighed(found.first.height_m))
+    assert found.height_std_m == pytest.approx(STD_BOTH * HEIGHT_M, rel=0.01)
     assert abs(found.tops_m) < TOLERANCE_M
     assert found.even
     assert not found.reason
@@ -59,29 +66,50 @@ def test_a_window_without_first_echoes_shows_rising_ground_by_its_last_ones() ->
 
 
 def test_rocks_on_level_ground_are_no_slope() -> None:
-    """Rocks of 0.5 m in a third of the beams, shadows in another: 5 % between both ends. On even ground that is a slope."""
+    """Rocks of 0.5 m in a third of the beams, shadows in another: 5 % between both ends, but the other beams end
+    where level ground does."""
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
     rocks, _, _ = lit_plane(SONAR, HEIGHT_M - 0.5, PITCH_RAD)
     image = frames.image.copy()
     image[:, frames.range_m > 4.0, 40:72] = 0
     shadows = attitude_of(replace(frames, image=image), "a test", None, None)
     assert shadows.even
-    assert shadows.height_std_m > STD_MEASURED * shadows.height_m
+    assert shadows.height_std_m == pytest.approx(STD_BOTH * shadows.height_m, rel=0.02)
     image[..., :32] = rocks.image[..., :32]
     found = attitude_of(replace(frames, image=image), "a test", None, None)
     assert not found.even
-    assert found.height_std_m == pytest.approx(STD_MEASURED * found.height_m)
+    assert found.height_std_m == pytest.approx(STD_BOTH * found.height_m, rel=0.02)
 
 
 def test_ground_that_falls_is_taken_for_level() -> None:
     """Its light ends beyond most windows: only the first echoes count."""
     frames, near, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, -5.0)
     found = attitude_of(frames, "a test", None, None)
-    assert found.height_m == pytest.approx(near.mean() - found.tops_m, abs=TOLERANCE_M)
-    assert found.height_std_m == pytest.approx(STD_MEASURED * found.height_m)
+    assert found.height_m == pytest.approx(weighed(near.mean() - found.tops_m), abs=TOLERANCE_M)
+    assert found.height_std_m == pytest.approx(STD_BOTH * found.height_m, rel=0.02)
 
 
-def test_a_told_height_that_first_echoes_contradict_is_rejected() -> None:
+def test_a_given_height_is_not_overruled() -> None:
+    """First echoes that contradict it by more than both know are reported, and do not count."""
     frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
     found = attitude_of(replace(frames, height_m=np.full(2, 3.2)), "a test", None, None)
-    assert "height or pitch is wrong" in found.reason
+    assert found.height_m == 3.2
+    assert found.height_std_m == pytest.approx(np.hypot(STD_GIVEN * 3.2, 3.2 - HEIGHT_M), rel=0.02)
+    assert not found.reason
+    assert found.doubt == "first echoes give a height of 2.19 m, not 3.20 m"
+    near = attitude_of(replace(frames, height_m=np.full(2, 2.4)), "a test", None, None)
+    assert not near.doubt
+    assert HEIGHT_M < near.height_m < 2.25
+
+
+def test_each_frame_has_its_own_height_pitch_and_roll() -> None:
+    frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
+    assert attitude_of(frames, "a test", None, None).apart == ()
+    poses = np.array([[0, 0, 2.0, 0.60, 0.02, 0], [0, 0, 2.02, 0.62, -0.02, 0]])
+    found = attitude_of(replace(frames, poses=poses), "a test", None, None)
+    mean = np.array([found.height_m, found.pitch_rad, found.roll_rad])
+    np.testing.assert_allclose(
+        np.array([found.of_frame(k) for k in range(2)]) - mean, poses[:, 2:5] - poses[:, 2:5].mean(axis=0)
+    )
+    assert found.ground(frames, 1).pitch_rad == pytest.approx(0.62)
+    assert found.ground(frames).pitch_rad == pytest.approx(0.61)

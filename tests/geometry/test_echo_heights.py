@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
 from helpers import lit_plane
 
 from mitsonar.geometry.echo_heights import TOPS, echo_heights
+from mitsonar.instruments.aperture import half_power
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.records.sonar_frames import SonarFrames
 
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)
 SONAR = Sonar(range_min=2.0, range_max=7.0, range_bins=800)
@@ -52,6 +55,40 @@ def test_a_window_that_cuts_an_end_does_not_show_it() -> None:
     assert early.first is not None
     assert early.last_m is None
     assert early.ends_m is None
+
+
+@pytest.mark.parametrize(
+    ("pattern", "fov_deg", "pitch_deg", "height_m", "window_m"),
+    [
+        ("two_way", 14, 35, 2.5, (2, 7)),
+        ("receive", 14, 35, 2.5, (3, 7)),
+        ("two_way", 12, 20, 2.0, (1, 9)),
+        ("two_way", 20, 20, 4.0, (3, 20)),
+        ("two_way", 14, 35, 2.5, (3.2, 5.6)),
+    ],
+)
+def test_a_skirt_of_the_light_does_not_lower_the_height(
+    pattern: Literal["two_way", "receive"], fov_deg: float, pitch_deg: float, height_m: float, window_m: tuple[float, float]
+) -> None:
+    """The light of rays a thousandth of a degree apart, summed into bins, under the pattern of a uniform aperture."""
+    sonar = Sonar(model="physical", pattern=pattern, elevation_fov_deg=fov_deg, range_bins=800)
+    sonar = sonar.replace(range_min=window_m[0], range_max=window_m[1])
+    half = np.radians(fov_deg / 2)
+    elevation = np.radians(np.arange(-50, fov_deg, 1e-3))
+    down = np.sin(np.radians(pitch_deg) - elevation)
+    power = {"two_way": 4, "receive": 2}[pattern]
+    gain = np.abs(np.sinc(half_power((), power) * np.sin(elevation) / np.sin(half))) ** power
+    meets = down > height_m / 20
+    ranges = height_m / down[meets]
+    level = np.histogram(
+        ranges, np.linspace(*window_m, 801), weights=(gain * down)[meets] * ranges ** (sonar.gain_exponent - 2)
+    )[0]
+    image = np.tile(level[:, None] / level.max(), (2, 1, sonar.beams)).astype(np.float32)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
+    found = echo_heights(frames, np.radians(pitch_deg), 0.0)
+    assert found.first is not None
+    at_the_middle = found.first.height_m / np.cos(sonar.bearing_rad).mean()  # the cone's beams aside go down less
+    assert at_the_middle == pytest.approx(height_m, rel=0.01)
 
 
 def test_shallow_rays_and_local_contrast_show_no_end() -> None:

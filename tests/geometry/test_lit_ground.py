@@ -12,9 +12,9 @@ from mitsonar.geometry.lit_ground import margin_of_light
 FOV_DEG = 14.0
 
 
-def grazing(told_m: float | None = None, height_m: float = 0.32) -> tuple[GroundGeometry, Attitude]:
+def grazing(given_m: float | None = None, height_m: float = 0.32) -> tuple[GroundGeometry, Attitude]:
     """A look at a plate from 0.32 m, pitch 4 deg: lit from 1.7 m on."""
-    attitude = Attitude(height_m, 0.01, np.radians(4), told_m=told_m)
+    attitude = Attitude(height_m, 0.01, np.radians(4), given_m=given_m)
     range_m = np.linspace(1.5, 5.0, 351)
     return GroundGeometry(range_m, np.zeros(1), "azimuth", height_m, attitude.pitch_rad), attitude
 
@@ -37,10 +37,10 @@ def test_light_begins_where_the_steepest_rays_meet_the_ground() -> None:
 
 def test_the_outline_lies_on_the_floor_and_not_on_the_tubes() -> None:
     """Tubes of 40 mm answer first: over them the light seems to begin 0.2 m nearer, and its outline would be matched."""
-    hidden, told = first_lit_m(*grazing(height_m=0.28)), first_lit_m(*grazing(told_m=0.32, height_m=0.28))
+    hidden, told = first_lit_m(*grazing(height_m=0.28)), first_lit_m(*grazing(given_m=0.32, height_m=0.28))
     assert told == pytest.approx(0.32 / np.sin(np.radians(10.3)), abs=0.01)
     assert told - hidden == pytest.approx(0.04 / np.sin(np.radians(10.3)), abs=0.01)
-    rock_below = first_lit_m(*grazing(told_m=0.25, height_m=0.28))
+    rock_below = first_lit_m(*grazing(given_m=0.25, height_m=0.28))
     assert rock_below == hidden, "a rock straight below tells too small a height"
 
 

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+import mitsonar
+from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
 from mitsonar.instruments.imaging_sonar import Sonar
 
 DEFAULTS = {
@@ -202,3 +205,28 @@ def test_the_widest_beam_that_is_told_would_do(model: str, shading: str) -> None
     told = float(str(caught.value).split("below ")[1].split()[0].rstrip("."))
     assert Sonar.create(**fields, azimuth_fov_deg=100.0, beam_width_deg=told).aperture.length == pytest.approx(0.5, rel=0.01)
     assert Sonar.create(**{**fields, "model": "thesis"}, azimuth_fov_deg=160.0).beam_pattern == "box"
+
+
+def test_the_title_names_an_instrument_or_says_that_it_has_no_name() -> None:
+    assert Sonar().title == "unnamed sonar"
+    assert Sonar(name="rov").title == "rov"
+    assert ChannelSonar().title == "unnamed channel sonar"
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "words"),
+    [
+        (mitsonar.Sonar, {"beamz": 3}, "unknown sonar key beamz: did you mean beams"),
+        (mitsonar.Sonar, {"beams": "many"}, "sonar beams: input should be a valid integer.* got 'many'"),
+        (mitsonar.ChannelSonar, {"carier_hz": 8e4}, "unknown channel sonar key carier_hz: did you mean carrier_hz"),
+        (mitsonar.Sounder, {"kind": "dvl"}, "instrument lacks fan"),
+        (mitsonar.SeaSurface, {"wind": 3}, "unknown sea-surface key wind: did you mean wind_m_s"),
+        (NoiseModel, {"mean": 2}, "noise mean: input should be less than or equal to 1, got 2"),
+        (FieldOfView, {"tilt": 2}, "unknown field of view key tilt: did you mean tilt_deg"),
+    ],
+)
+def test_a_class_answers_a_mistake_as_create_does(kind: Any, given: dict[str, object], words: str) -> None:
+    """One sentence of a MitsonarError, which is a ValueError as pydantic's own is."""
+    with pytest.raises(MitsonarError, match=words) as caught:
+        kind(**given)
+    assert isinstance(caught.value, ValueError)

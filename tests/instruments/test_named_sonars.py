@@ -126,3 +126,14 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "sonar.txt").write_text("beams: 12")
     with pytest.raises(MitsonarError, match=r"ends in \.yaml: got .*sonar\.txt"):
         load_sonar(tmp_path / "sonar.txt")
+
+
+def test_the_default_model_is_explained_where_it_is_chosen() -> None:
+    """Presets of real sonars have a carrier, and are coherent; a bare sonar has none, and is physical."""
+    assert Sonar().model == "physical"
+    real = [preset(name) for name in named_sonars() if preset(name).frequency_hz is not None]
+    assert real
+    assert {sonar.model for sonar in real} == {"coherent"}
+    described = Sonar.model_fields["model"].description or ""
+    assert "as presets of real sonars" in described
+    assert "needs a frequency_hz" in described

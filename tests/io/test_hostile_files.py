@@ -31,19 +31,29 @@ from hostile_readers import (
     make_run,
     make_store,
     read_exr,
+    read_frames_zarr,
     read_meshes,
     read_odometry,
     read_run,
+    read_store,
     responses,
     serialized,
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 from mutations import changed_arrays, changed_bytes, limits, npz, outcome, with_part
+from numcodecs import Pickle
+from zarr.abc.codec import BytesBytesCodec
+from zarr.registry import register_codec
 
+import mitsonar
+from mitsonar.acoustics.backscatter import material
 from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
+from mitsonar.io.storage import refuse_codecs
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.worlds.imported_world import imported_world
+from mitsonar.worlds.user_mesh import mesh_world
 
 SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
 """Readers that take 20 ms and more a mutant."""
@@ -64,6 +74,51 @@ def refusal(read: Callable[[], Any]) -> str:
     with limits(), pytest.raises(MitsonarError) as error:
         read()
     return str(error.value)
+
+
+# ---------------------------------------------------------------- paths
+
+BY_PATH: dict[str, Callable[[str], object]] = {
+    "checkpoint": lambda path: mitsonar.load_checkpoint(path),
+    "frames": lambda path: mitsonar.load_frames(path),
+    "SonarFrames": SonarFrames.load,
+    "ImpulseResponses": ImpulseResponses.load,
+    "trajectory": lambda path: mitsonar.Trajectory.load(path),
+    "motions": lambda path: mitsonar.load_motions(path),
+    "noise": lambda path: mitsonar.load_noise(path),
+    "recipe": lambda path: mitsonar.load_recipe(path),
+    "recording": lambda path: mitsonar.open_recording(path),
+    "scene": lambda path: mitsonar.load_scene(path),
+    "sensors": lambda path: mitsonar.load_sensors(path),
+    "sonar": lambda path: mitsonar.load_sonar(path),
+    "sounder": lambda path: mitsonar.load_sounder(path),
+    "material": lambda path: material(path),
+    "mesh": lambda path: mesh_world(f"{path}.obj"),
+    "sdf": lambda path: imported_world(f"{path}.sdf"),
+    "urdf": lambda path: imported_world(f"{path}.urdf"),
+    "usd": lambda path: imported_world(f"{path}.usda"),
+}
+"""Readers that are given a path."""
+
+
+@pytest.mark.parametrize("path", ["a" * 300, f"{'a' * 300}/b.yaml", "/".join(["a" * 200] * 30)], ids=len)
+def test_a_path_that_is_too_long_is_refused(path: str, variant: str) -> None:
+    """``Path.exists`` and its kind raise on such a path, where those of ``os.path`` answer."""
+    for name, read in BY_PATH.items():
+        assert path[:20] in refusal_without_limit(lambda read=read: read(path)), name  # type: ignore[misc]
+
+
+def test_a_link_to_itself_is_refused(tmp_path: Path, variant: str) -> None:
+    for name, read in BY_PATH.items():
+        path = tmp_path / name
+        for ending in ("", ".obj", ".sdf", ".urdf", ".usda"):
+            path.with_name(name + ending).symlink_to(path.with_name(name + ending))
+        assert name in refusal_without_limit(lambda read=read, path=path: read(str(path)))  # type: ignore[misc]
+
+
+def test_a_lone_carriage_return_in_a_path_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "path.csv").write_bytes(b"time_s,x,y,z,qx,qy,qz,qw\n0,1\r2,0,0,0,0,0,1\n")
+    assert "path.csv: it is no table of CSV" in refusal(lambda: mitsonar.Trajectory.load(tmp_path / "path.csv"))
 
 
 # ---------------------------------------------------------------- mutants
@@ -383,7 +438,67 @@ def test_a_model_that_promises_millions_of_points(tmp_path: Path) -> None:
     assert "169,000,000" in refusal(lambda: mesh_world(tmp_path / "many.glb"))
 
 
+# ---------------------------------------------------------------- Zarr
+
+
+class Hostile(BytesBytesCodec):
+    """A codec of a package that happens to be installed."""
+
+    decoded = 0
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Hostile:
+        return cls()
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"name": "hostile"}
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: Any) -> int:
+        return input_byte_length
+
+    async def _decode_single(self, chunk_data: Any, chunk_spec: Any) -> Any:
+        Hostile.decoded += 1
+        return chunk_data
+
+
+@pytest.mark.parametrize("name", ["frames.zarr", "data set"])
+def test_a_codec_that_is_not_of_zarr_itself_is_refused_before_it_decodes(name: str, tmp_path: Path) -> None:
+    register_codec("hostile", Hostile)
+    make, read, array = {
+        "frames.zarr": (make_frames_zarr, read_frames_zarr, "frames.zarr/image"),
+        "data set": (make_store, read_store, "data.zarr/pose"),
+    }[name]
+    make(tmp_path)
+    path = tmp_path / array / "zarr.json"
+    about = json.loads(path.read_text())
+    path.write_text(json.dumps(about | {"codecs": [*about["codecs"], {"name": "hostile"}]}))
+    with pytest.raises(MitsonarError):
+        read(tmp_path)
+    assert Hostile.decoded == 0
+
+
+def test_responses_in_the_format_that_may_hold_pickles_are_not_resumed(tmp_path: Path) -> None:
+    import zarr
+
+    group = zarr.open_group(tmp_path / "responses.zarr", mode="w", zarr_format=2)
+    array = group.create_array("height_m", shape=(3,), dtype="f8", chunks=(3,), filters=[Pickle()], compressors=None)
+    with pytest.raises(ValueError, match="version 2"):
+        refuse_codecs(array)
+
+
 # ---------------------------------------------------------------- npz
+
+
+@pytest.mark.parametrize("name", ["sonar", "about"])
+def test_text_that_is_not_unicode_is_refused(name: str, tmp_path: Path) -> None:
+    """NumPy makes a text of any numbers, and pydantic ends on it with what is no ``Exception``."""
+    responses().save(tmp_path / "responses.npz")
+    table = dict(np.load(tmp_path / "responses.npz"))
+    letters = np.atleast_1d(table[name]).view(np.uint32).copy()
+    letters[1] = 0x110000
+    table[name] = letters.view(table[name].dtype)[0]
+    np.savez(tmp_path / "responses.npz", **table)
+    assert f"{name}.npy holds text that is not Unicode" in refusal(lambda: ImpulseResponses.load(tmp_path / "responses.npz"))
 
 
 BAD_FRAMES: dict[str, tuple[dict[str, Any], str]] = {
@@ -595,10 +710,10 @@ def test_a_run_without_frames_has_none_to_read(tmp_path: Path) -> None:
     assert f"{path} has no frame 3: it holds 3, numbered from 0" in refusal(lambda: open_frames(path).read([0, 3]))
     assert "has no frame -1" in refusal(lambda: open_frames(path).read([-1]))
     set_attributes(path, frames_done=0)
-    with pytest.warns(MitsonarWarning, match="0 of 3 frames are there"):
+    with pytest.warns(MitsonarWarning, match="0 of 3 frames written"):
         source = open_frames(path)
     assert f"{path} has no frame 0: it holds 0" in refusal(lambda: source.read([0]))
-    with pytest.warns(MitsonarWarning, match="0 of 3 frames are there"):
+    with pytest.warns(MitsonarWarning, match="0 of 3 frames written"):
         assert load_frames(path).image.shape == (0, 6, 4)
 
 

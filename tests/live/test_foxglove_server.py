@@ -7,6 +7,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -28,7 +29,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.live.foxglove_server import FoxgloveServer
 from mitsonar.live.live_client import LiveClient, image_of
-from mitsonar.live.live_loop import live_pings
+from mitsonar.live.live_loop import LivePing, live_pings
 from mitsonar.live.pose_mailbox import PoseMailbox
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
@@ -150,6 +151,8 @@ def test_bad_poses_are_refused_with_one_sentence_each_and_the_next_is_rendered(l
         b"no json": "not JSON",
         b'{"x": "far"}': "x of pose must be a finite number",
         b'{"x": NaN}': "x of pose must be a finite number",
+        b'{"x": 1, "id": 1e999}': "id of a pose is a finite number or a text",  # JSON has no word for it
+        b'{"x": 1, "id": NaN}': "id of a pose is a finite number or a text",
         b'{"yaw": 3}': "has no key 'yaw'",
         b'{"x": 1e9}': "within 1e+06 m of the origin",
         b'{"pose": {"position": {"x": 1}, "orientation": {}}}': "quaternion of length 1",
@@ -190,6 +193,22 @@ def test_poses_of_ros_are_understood(live: Live) -> None:
     got = [told[key] for key in ("x", "y", "z", "pitch", "roll", "heading")]
     np.testing.assert_allclose(got, [-4, 1, 2.2, 25, 0, 90], atol=1e-9)
     client.close()
+
+
+def test_a_client_that_no_longer_reads_does_not_keep_the_server() -> None:
+    server = FoxgloveServer(PoseMailbox(), port=0)
+    client = client_of(server.port, ["/sonar/image"])
+    sonar = small_sonar().replace(range_bins=1000, beams=500)
+    image = np.zeros((1, sonar.range_bins, sonar.beams), np.float32)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar, np.array([START]))
+    for number in range(60):  # half a megabyte each, more than all buffers hold
+        server.publish(LivePing(frames, number, number, "path", None, 0, 0.0))
+        time.sleep(0.005)
+    closing = threading.Thread(target=server.close, daemon=True)
+    closing.start()
+    closing.join(timeout=3)
+    assert not closing.is_alive()
+    client._socket.socket.shutdown(socket.SHUT_RDWR)
 
 
 # ---------------------------------------------------------------- the command

@@ -262,9 +262,9 @@ def test_many_that_are_not_believed_are_warned_of_and_all_is_an_error() -> None:
     path = sway(31)
     assert odometry(*told(path, lost=(3, 4, 5))).warnings() == []
     (warning,) = odometry(*told(path, lost=(3, 4, 5, 6))).warnings()
-    assert "4 of 30 motions (13 %) are not believed" in warning
+    assert "4 of 30 motions (13 %) were rejected and bridged" in warning
     assert "4 times such as 'correlates by 0.03 only'" in warning
-    with pytest.raises(MitsonarError, match=r"none of 30 motions is believed.*30 times such as 'correlates by 0.00 only'"):
+    with pytest.raises(MitsonarError, match=r"none of 30 motions is valid.*30 times such as 'correlates by 0.00 only'"):
         odometry(*told(path, lost=tuple(range(30))))
 
 
@@ -325,7 +325,7 @@ def test_the_table_tells_what_a_hand_finds() -> None:
         slope = ((driven + off[:40])[:, k] * driven[:, k]).sum() / (driven[:, k] ** 2).sum()
         assert rows[f"slope over the true {name}"][0] == pytest.approx(slope)
     nees = ((off[:40] / STD) ** 2).sum(axis=1).mean() / 3
-    assert rows["squared motion error over its covariance, a third"][0] == pytest.approx(nees)
+    assert rows["NEES (1 is honest)"][0] == pytest.approx(nees)
     end = np.linalg.norm(found.path.poses[-1, :2] - path.poses[-1, :2])
     assert rows["end-point error"][0] == pytest.approx(1e3 * end)
     assert rows["end-point error"][1] == "mm"
@@ -442,7 +442,7 @@ def test_the_attitude_of_a_long_recording_is_its_own(tmp_path: Path) -> None:
 
 def test_a_run_that_goes_on_gives_what_is_there(tmp_path: Path) -> None:
     as_zarr(numbered(sway(12)), tmp_path / "frames.zarr", done=7)
-    with pytest.warns(MitsonarWarning, match="7 of 12 frames are there"):
+    with pytest.warns(MitsonarWarning, match="7 of 12 frames written"):
         source = open_frames(tmp_path)
     assert len(source) == 7
     np.testing.assert_array_equal(source.read([6]).image[0, 0], 6)
@@ -592,7 +592,7 @@ def test_a_folder_holds_the_path_and_all_about_it(tmp_path: Path) -> None:
     assert state["asked"]["options"]["lost"] == [4]
     assert (state["smooth"], state["not_believed"]) == ("none", 1)
     table = json.loads((out / "table.json").read_text())["rows"]
-    assert {"name": "motions not believed, bridged", "value": 1.0, "unit": ""} in table
+    assert {"name": "motions rejected, bridged", "value": 1.0, "unit": ""} in table
     assert (out / "table.md").read_text().count("\n") == len(table) + 2
 
 

@@ -174,7 +174,7 @@ def test_motions_that_all_fail_are_a_row(frames: SonarFrames, tmp_path: Path) ->
     empty = replace(frames, image=np.zeros_like(frames.image))
     row = row_of(empty, "ecc", tmp_path / "row")
     assert row["failures"] == row["pairs"] == 11
-    assert "none of 11 motions is believed" in row["note"]
+    assert "none of 11 motions is valid" in row["note"]
 
 
 def test_without_truth_loops_are_closed(frames: SonarFrames, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +56,29 @@ def test_each_pair_gets_its_own_prior(workers: int) -> None:
             assert one.motion == Motion(1e-3 * k, 0.0, float(k))
             assert one.covariance is not None
             assert one.covariance[0, 0] == 1 + k
+
+
+class Slow(Believer):
+    """Takes a minute from the second batch on."""
+
+    def estimate(self, frames: SonarFrames, /, prior: MotionPrior | None = None) -> Estimate:
+        if frames.image[0, 0, 0] >= PAIRS_A_BATCH:
+            time.sleep(60)
+        return rejected("nothing told")
+
+
+@pytest.mark.thorough
+def test_a_stop_does_not_wait_for_what_workers_have_begun() -> None:
+    stopped = list[float]()
+
+    def stop(number: int, estimate: Estimate) -> None:
+        time.sleep(1)  # the next batch has begun
+        stopped.append(time.monotonic())
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_motions(numbered(), Slow(), np.arange(FRAMES), workers=2, keep=stop)
+    assert time.monotonic() - stopped[0] < 20
 
 
 def test_without_priors_none_is_told() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +124,7 @@ def test_pose_in_degrees() -> None:
 
 
 def test_between_runs_linearly_as_the_numbers_are_given() -> None:
-    start, end = Pose(0, 0, 2, 0.1, 0, np.radians(350)), Pose(1, 2, 2, 0.3, 0, np.radians(370))
+    start, end = Pose(0, 0, 2, 0.1, 0, np.radians(350)), Pose.from_row((1, 2, 2, 0.3, 0, np.radians(370)))
     flown = Trajectory.between(start, end, 5, rate_hz=20)
     np.testing.assert_allclose(flown.poses[2], [0.5, 1, 2, 0.2, 0, np.radians(360)], atol=1e-12)
     np.testing.assert_array_equal(flown.poses[[0, -1]], [start, end])
@@ -272,6 +274,29 @@ def test_a_pitched_mount_keeps_the_rest_to_the_bit() -> None:
     np.testing.assert_array_equal(got[:, 3], 0.61)
 
 
+@pytest.mark.parametrize("angles", [{"pitch": 35.0}, {"roll": -10.0}, {"heading": 90.0}])
+def test_degrees_where_radians_are_meant_are_refused(angles: dict[str, float]) -> None:
+    (name,) = angles
+    with pytest.raises(
+        MitsonarError, match=rf"{name} of a pose is in radians.*got .*of degrees make it by Pose\.from_degrees"
+    ):
+        Pose(0, 0, 2.5, **angles)
+
+
+def test_headings_may_go_on_turning() -> None:
+    """In degrees, along a path, from a row, and through a pickle: the same numbers, not wrapped."""
+    turned = Pose.from_degrees([0, 0, 2.5, 35, 0, 730])
+    assert np.degrees(turned.heading) == pytest.approx(730)
+    further = compose(turned, Motion(0.1, 0.2, 0.3))
+    assert further.heading == turned.heading + 0.3
+    path = Trajectory.between(turned, further, 3, 1.0)
+    row = Pose.from_row(path.poses[-1])
+    for same in (row, pickle.loads(pickle.dumps(row)), copy.deepcopy(row), row._replace(x=row.x)):
+        assert isinstance(same, Pose)
+        assert same == further
+    assert Pose(0, 0, 0, heading=-2 * np.pi).heading == -2 * np.pi
+
+
 @pytest.mark.parametrize(
     ("pose", "words"),
     [
@@ -282,7 +307,7 @@ def test_a_pitched_mount_keeps_the_rest_to_the_bit() -> None:
 def test_poses_beyond_reach_are_refused(pose: tuple[float, ...], words: str) -> None:
     """Nothing could be rendered there; earlier, a picture without an echo came out."""
     with pytest.raises(MitsonarError, match=words):
-        moments_of(Sonar(), [pose], None, 0)
+        moments_of(Sonar(), [Pose.from_row(pose)], None, 0)
     with pytest.raises(MitsonarError, match=words):
         Trajectory(np.array([pose]), np.zeros(1))
     with pytest.raises(MitsonarError, match="at most"):

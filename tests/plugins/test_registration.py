@@ -5,11 +5,13 @@ from __future__ import annotations
 import ast
 import re
 import textwrap
+from pathlib import Path
 
 import pytest
 from helpers import essence, run_python
 
 from mitsonar.plugins import PLUGINS
+from mitsonar.plugins.scalar_variants import KINDS
 
 SHIPPED = {
     "imaging_sonar": "imaging_sonar_sensor",
@@ -186,3 +188,51 @@ def test_asking_whether_mitsuba_is_there_does_not_lose_the_plugins() -> None:
         assert importlib.util.find_spec("mitsuba") is not None
         mitsonar.load_scene("flat_floor")
     """)
+
+
+def test_every_plugin_is_known_by_its_kind() -> None:
+    """Scalar variants refuse the plugins by these names."""
+    import importlib.util
+
+    spec = importlib.util.find_spec("mitsonar.plugins")
+    assert spec is not None
+    assert spec.submodule_search_locations is not None
+    texts = [path.read_text() for path in Path(spec.submodule_search_locations[0]).glob("*.py")]
+    found = {pair for text in texts for pair in re.findall(r'^mi\.register_(\w+)\("(\w+)"', text, flags=re.MULTILINE)}
+    assert found == {(kind, name) for kind, names in KINDS.items() for name in names}
+
+
+def test_scalar_variants_name_the_variant_that_is_needed() -> None:
+    """In Mitsuba's own loader, for each plugin; in load_scene, which leaves the user's variant as it is."""
+    said = run_python("""
+        import mitsonar
+        import mitsuba as mi
+        from mitsonar.plugins.scalar_variants import KINDS
+        mi.set_variant("scalar_rgb")
+        for name in (name for names in KINDS.values() for name in names):
+            try:
+                mi.load_dict({"type": name})
+            except RuntimeError as error:
+                assert f"{name} is a plugin of mitsonar" in str(error), error
+                assert 'variant scalar_rgb: call mi.set_variant("llvm_ad_mono")' in str(error), error
+            else:
+                raise AssertionError(name)
+        try:
+            mitsonar.load_scene("flat_floor")
+        except mitsonar.MitsonarError as error:
+            print(error)
+        assert mi.variant() == "scalar_rgb"
+        mi.set_variant("llvm_ad_mono")
+        mitsonar.load_scene("flat_floor")
+    """)
+    assert "the Mitsuba variant scalar_rgb is set" in said
+    assert "mi.set_variant(" in said
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("name", ["max_depth", "rr_depth", "hide_emitters"])
+def test_echo_has_no_properties_not_those_of_its_base_either(name: str) -> None:
+    import mitsuba as mi
+
+    with pytest.raises(RuntimeError, match=rf"the integrator echo has no properties: got {name}"):
+        mi.load_dict({"type": "echo", name: False if name == "hide_emitters" else 2})

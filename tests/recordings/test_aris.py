@@ -82,8 +82,8 @@ def test_frames_are_sorted_repeated_ones_dropped_and_missing_ones_counted(tmp_pa
     recording = open_recording(written(tmp_path / "a.aris", time_us=times, index=numbers))
     assert recording.part().time_s == pytest.approx([0.1, 0.2, 0.3, 0.7])
     assert "sorted" in " ".join(recording.notes)
-    assert "1 frames repeat" in " ".join(recording.notes)
-    assert "3 frames are missing" in " ".join(recording.notes)
+    assert "left out: 1 frame at the time of the one before" in " ".join(recording.notes)
+    assert "missing: 3 frames" in " ".join(recording.notes)
 
 
 def test_a_window_that_changes_makes_parts_and_small_drifts_of_the_speed_none(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_damaged_headers_are_left_out_and_a_cut_file_keeps_its_whole_frames(tmp_
     path.write_bytes(path.read_bytes()[:-10])
     recording = open_recording(path)
     assert len(recording) == 2
-    assert any("2 frames have a damaged header" in note for note in recording.notes)
+    assert any("left out: 2 frames with a damaged header" in note for note in recording.notes)
     assert any("no whole frame" in note for note in recording.notes)
 
 
@@ -118,7 +118,7 @@ def test_one_frame_that_cannot_be_is_left_out(tmp_path: Path, field: str, values
     """No lens, no other ARIS has 64 beams, and no window ends 27 km away."""
     recording = open_recording(written(tmp_path / "a.aris", **{field: values}))
     assert [len(part) for part in recording.parts] == [4]
-    assert any("1 frames have a damaged header" in note for note in recording.notes)
+    assert any("left out: 1 frame with a damaged header" in note for note in recording.notes)
 
 
 def test_a_file_without_a_table_of_its_beams_says_which(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_other_files_are_refused_in_one_sentence(tmp_path: Path, content: bytes,
 def test_times_that_are_nan_are_left_out() -> None:
     kept, notes = in_time_order([2.0, np.nan, 1.0])
     assert kept.tolist() == [2, 0]
-    assert notes[0].startswith("1 frames have no valid time")
+    assert notes[0].startswith("left out: 1 frame without a valid time")
 
 
 def test_runs_keep_their_order() -> None:

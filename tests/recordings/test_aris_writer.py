@@ -157,7 +157,7 @@ def test_beams_that_fit_no_table_are_refused_or_interpolated(tmp_path: Path) -> 
     slope = np.degrees(frames.bearing_rad) * 5 + 100
     frames.image = np.broadcast_to(np.rint(slope).astype(np.uint8), (3, 50, 96)).copy()
     written = write_aris(tmp_path / "a.aris", frames, beams=128)
-    assert "96 beams were interpolated to 128" in written.notes[0]
+    assert "96 beams interpolated to 128" in written.notes[0]
     made = open_recording(tmp_path / "a.aris").part().read([0])
     inside = np.abs(made.bearing_rad) < frames.bearing_rad[-1]
     expected = np.degrees(made.bearing_rad) * 5 + 100

@@ -108,7 +108,7 @@ def test_pictures_without_a_pose_are_left_out(tmp_path: Path) -> None:
     written(tmp_path)
     flown = with_poses(tmp_path, np.eye(3), skip=2)
     recording = open_recording(tmp_path)
-    assert "1 pictures have no pose and are left out" in recording.notes
+    assert "left out: 1 picture without a pose" in recording.notes
     assert recording.part().poses[:, 0] == pytest.approx(np.delete(flown[:, 0], 2), abs=1e-6)  # type: ignore[index]
 
 
@@ -140,7 +140,7 @@ def test_sizes_that_change_make_parts_and_cut_pictures_are_left_out(tmp_path: Pa
     recording = open_recording(tmp_path)
     assert [len(part) for part in recording.parts] == [6, 2]
     assert recording.part(1).read([0]).image.shape == (1, 50, 72)
-    assert any("1 pictures are cut off" in note for note in recording.notes)
+    assert any("left out: 1 picture cut off" in note for note in recording.notes)
 
 
 def test_pictures_without_bearings_are_refused(tmp_path: Path) -> None:

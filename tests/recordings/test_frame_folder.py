@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,8 @@ def test_a_stopped_copy_goes_on_and_gives_the_same(
     with pytest.raises(KeyboardInterrupt):
         write_frames(of(frames, stops_at=5), None, folder)
     assert len(load_frames_of_unfinished(folder)) == 4
+    (folder / "frames.zarr/image/c/4/0").mkdir(parents=True, exist_ok=True)
+    (folder / "frames.zarr/image/c/4/0/0.7f.partial").write_bytes(b"half")  # as a kill leaves it
     with pytest.raises(MitsonarError, match="--resume goes on with it"):
         write_frames(of(frames), None, folder)
     read: list[int] = []
@@ -73,7 +76,15 @@ def test_a_stopped_copy_goes_on_and_gives_the_same(
     assert read == [4, 2, 1]
     assert made.name == ("frames.zarr" if longest_npz < COUNT else "frames.npz")
     same(made, frames)
+    monkeypatch.setattr(time, "time", lambda: 1e9)
+    whole = write_frames(of(frames), None, tmp_path / "whole")
+    assert files_of(made) == files_of(whole)
     assert write_frames(of(frames, stops_at=0), None, folder, resume=True) == made  # nothing is read again
+
+
+def files_of(made: Path) -> dict[str, bytes]:
+    files = [one for one in made.rglob("*") if one.is_file()] if made.is_dir() else [made]
+    return {str(one.relative_to(made)): one.read_bytes() for one in files}
 
 
 def load_frames_of_unfinished(folder: Path) -> SonarFrames:

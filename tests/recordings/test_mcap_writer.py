@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from mitsonar import MitsonarError, Simulator, SonarFrames, open_recording
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.recordings.mcap_writer import write_mcap
+from mitsonar.recordings.mcap_writer import SPAN_DB, write_mcap
 from mitsonar.recordings.ros_pings import is_beam_major
 from mitsonar.records.sonar_frames import to_uint8
 
@@ -37,6 +38,7 @@ def rendered(variant: str) -> SonarFrames:
 
 def written(frames: SonarFrames, folder: Path, **options: Any) -> Path:
     path = folder / "run.mcap"
+    options = {"full": True, **options}
     assert write_mcap([frames.select(slice(0, 2)), frames.select(slice(2, None))], path, **options) == len(frames)
     return path
 
@@ -91,6 +93,46 @@ def test_frames_come_back_bit_for_bit(rendered: SonarFrames, tmp_path: Path, kin
     assert (back.sonar, back.level, back.level_scale) == (frames.sonar, frames.level, frames.level_scale)
     assert back.poses == pytest.approx(frames.poses, abs=1e-12)
     assert back.height_m == pytest.approx(frames.height_m, rel=1e-6)
+
+
+@pytest.mark.parametrize("level", ["linear", "dB", "gamma"])
+def test_samples_are_8_bit_by_default_and_levels_come_back(rendered: SonarFrames, tmp_path: Path, level: str) -> None:
+    image = np.where(rendered.image > 0.9, 0, rendered.image)  # some cells without an echo
+    frames = replace(rendered, image=image, level=level)
+    path = written(frames, tmp_path, full=False)
+    found = decoded(path)
+    assert "/sonar/points" not in found
+    assert {one.image.dtype for one in found["/sonar/image"]} == {0}
+    assert set(by_rosbags(path)) == set(found)
+    back = open_recording(path).part().read(np.arange(len(frames)))
+    assert (back.sonar, back.level, back.level_scale) == (frames.sonar, level, frames.level_scale)
+    assert ((back.image > 0) == (frames.image > 0)).all()
+    if level == "linear":
+        kept = frames.image > 10 ** (-SPAN_DB / 10)
+        error_db = 10 * np.log10(back.image[kept] / frames.image[kept])
+        assert np.abs(error_db).max() <= SPAN_DB / 255 / 2 + 1e-4
+        write_mcap([back], tmp_path / "again.mcap")
+        again = open_recording(tmp_path / "again.mcap").part().read(np.arange(len(frames)))
+        assert (again.image == back.image).all()
+    else:
+        assert (back.image == to_uint8(frames.image)).all()
+
+
+def test_the_record_tells_in_words_how_samples_become_decibels(rendered: SonarFrames, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = written(replace(rendered, level_scale=100.0), tmp_path, full=False)
+    with path.open("rb") as file:
+        record = next(one.metadata for one in make_reader(file).iter_metadata())
+    assert json.loads(record["samples"]) == (
+        "0 is no echo; level in dB = 80 * (sample / 255 - 1), relative to full scale, which is 20 dB"
+    )
+
+
+def test_points_are_written_on_request(rendered: SonarFrames, tmp_path: Path) -> None:
+    small, labelled = (written(rendered, tmp_path, full=False, labels=one, overwrite=True).stat().st_size for one in (0, 1))
+    assert small < labelled / 2
+    assert len(decoded(tmp_path / "run.mcap")["/sonar/points"]) == len(rendered)
 
 
 def test_without_its_record_the_messages_alone_tell_ranges_and_bearings(rendered: SonarFrames, tmp_path: Path) -> None:

@@ -94,7 +94,7 @@ def test_times_of_a_dump_follow_the_numbers_at_the_ping_rate(tmp_path: Path) -> 
     (tmp_path / "a.raw").write_bytes(b"".join(pings))
     recording = open_recording(tmp_path / "a.raw")
     assert recording.part().time_s == pytest.approx(np.array([0, 1, 4]) / 15)
-    assert any("2 frames are missing" in note for note in recording.notes)
+    assert any("missing: 2 frames" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize("version", [0, 1, 2])
@@ -248,9 +248,9 @@ def test_a_log_of_viewpoint_2_is_refused(tmp_path: Path) -> None:
         (b"", "no recording"),
         (b"SOS", "no recording"),
         (other_message(), "holds no ping"),
-        (oculus_ping(np.ones((4, 3)), resolution=np.nan), "1 pings are damaged"),
-        (oculus_ping(np.ones((4, 3)), ranges=60_000), "1 pings are damaged"),
-        (oculus_ping(np.ones((4, 3)), bearings=np.array([0, 0, 1])), "1 pings are damaged"),
+        (oculus_ping(np.ones((4, 3)), resolution=np.nan), "left out: 1 damaged ping"),
+        (oculus_ping(np.ones((4, 3)), ranges=60_000), "left out: 1 damaged ping"),
+        (oculus_ping(np.ones((4, 3)), bearings=np.array([0, 0, 1])), "left out: 1 damaged ping"),
         (b"\x44\x33\x22\x11", "cut off"),
     ],
 )

@@ -41,7 +41,7 @@ def test_pictures_are_read_in_natural_order(tmp_path: Path) -> None:
     images = polar(3)
     path = folder_of(tmp_path / "p", images, ["f10.png", "f2.png", "f1.pgm"], POLAR + "frame_rate_hz: 5\n")
     recording = open_recording(path)
-    assert recording.notes == ("7 frames are missing, by the numbers that the sonar gave them",)
+    assert recording.notes == ("missing: 7 frames, by the numbers that the sonar gave them",)
     frames = recording.part().read([0, 1, 2])
     assert (frames.image == images[[2, 1, 0]]).all()
     assert frames.image.dtype == np.uint8
@@ -113,7 +113,7 @@ def test_times_may_stand_in_a_file(tmp_path: Path) -> None:
     (path / "times.csv").write_text("# name, time\nb.png, 3.5\na.png, 3.0\n")
     recording = open_recording(path)
     assert recording.part().time_s == pytest.approx([3, 3.5])
-    assert "1 frames have no valid time and are left out" in recording.notes
+    assert "left out: 1 frame without a valid time" in recording.notes
     (path / "times.csv").write_text("1\n2\n4\n")
     assert open_recording(path).part().time_s == pytest.approx([1, 2, 4])
     for text, reason in [
@@ -161,8 +161,8 @@ def test_odd_pictures_are_left_out_and_told(tmp_path: Path) -> None:
     Image.fromarray(polar(1, 31)[0]).save(path / "6.png")
     recording = open_recording(path)
     assert len(recording) == 3
-    assert any("5 pictures are cut off or damaged" in note for note in recording.notes)
-    assert any("1 pictures have another size than 20 x 30" in note for note in recording.notes)
+    assert any("left out: 5 pictures cut off or damaged" in note for note in recording.notes)
+    assert any("left out: 1 picture of another size than 20 x 30" in note for note in recording.notes)
 
 
 def test_damage_within_a_picture_is_one_sentence(tmp_path: Path) -> None:

@@ -182,7 +182,7 @@ def test_bags_without_a_sonar_say_what_they_hold(tmp_path: Path) -> None:
         match=r"holds no messages marine_acoustic_msgs/ProjectedSonarImage or .*: its topics are /odom \(nav_msgs/O",
     ):
         open_recording(path)
-    with pytest.raises(MitsonarError, match=r"/odom holds 1 messages nav_msgs/Odometry; a sonar's are"):
+    with pytest.raises(MitsonarError, match=r"/odom holds 1 message nav_msgs/Odometry; a sonar's are"):
         open_recording(path, topic="/odom")
 
 

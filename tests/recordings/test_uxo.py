@@ -84,7 +84,7 @@ def test_what_is_missing_or_damaged_is_left_out_and_told(tmp_path: Path) -> None
     recording = open_recording(tmp_path)
     assert len(recording) == 3
     notes = " ".join(recording.notes)
-    for part in ("1 rows of", "1 frames of", "1 pictures have no row", "no valid pose for 2 frames", "1 frames are missing"):
+    for part in ("1 row of", "1 frame of", "1 picture without a row", "no valid one for 2 frames", "missing: 1 frame"):
         assert part in notes
     assert recording.part().poses is None
     Image.fromarray(np.zeros((39, 64), np.uint8)).save(tmp_path / "aris_raw/0102.pgm")

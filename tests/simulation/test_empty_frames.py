@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from helpers import Command, diffuse, floor, scene, sphere
+from helpers import Command, diffuse, floor, plate, refused, scene, separate, sphere
 from numpy.typing import ArrayLike
 
 from mitsonar.errors import MitsonarWarning
@@ -35,8 +35,8 @@ def warned(loaded: mi.Scene, poses: ArrayLike, sonar: Sonar = SONAR) -> list[str
 def test_frames_that_look_over_the_ground_say_so() -> None:
     """Radians given where degrees are meant: pitch 0.61 deg; the floor is met beyond the window."""
     ground = scene(floor=floor(diffuse(0.5), 50))
-    (said,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "frames are empty" in text]
-    assert said.startswith("1 of 2 frames are empty, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
+    (said,) = [text for text in warned(ground, [GOOD, Pose(0, 0, 2.5, np.radians(0.61))]) if "empty: " in text]
+    assert said.startswith("empty: 1 of 2 frames, frame 1 first: 0 % of its rays meet something within the window 1..5 m")
     assert "farther (returns at" in said
     assert "the sonar is at (0, 0, 2.5) m and looks 0.61 deg below the horizon, along (0.00, 1.00, -0.01)" in said
     assert said.endswith("its pitch, roll, heading are only 0.61, 0, 0 deg: were radians given where degrees are meant?")
@@ -51,8 +51,8 @@ def test_all_rays_are_100_percent() -> None:
 def test_frames_of_degrees_given_as_radians_say_so() -> None:
     """35 rad is 205 deg, into the sky."""
     ground = scene(floor=floor(diffuse(0.5), 50))
-    (said,) = warned(ground, [Pose(0, 0, 2.5, 35.0)])
-    assert said.startswith("no ray hit anything in 1 frames: check the pose (x, y, z in m; pitch > 0 looks down)")
+    (said,) = warned(ground, [Pose.from_row((0, 0, 2.5, 35.0, 0, 0))])
+    assert said.startswith("no ray hit anything in 1 frame: check the pose (x, y, z in m; pitch > 0 looks down)")
     assert "35, 0, 0 rad, more than a full turn: were degrees given where radians are meant?" in said
 
 
@@ -61,7 +61,7 @@ def test_frames_with_hardly_an_echo_count_and_frames_with_a_small_target_do_not(
     sonar = SONAR.replace(range_bins=2048, beams=64)
     tiny = scene(ball=sphere((0, 3, 2.5), 0.003, diffuse(0.9)))
     hardly = warned(tiny, [Pose(0, 0, 2.5)], sonar.replace(rays_per_beam=400, rays_across=4))
-    assert any(text.startswith("1 of 1 frames are empty") for text in hardly)
+    assert any(text.startswith("empty: 1 of 1 frame,") for text in hardly)
     assert not warned(scene(ball=sphere((0, 3, 2.5), 0.3, diffuse(0.9))), [Pose(0, 0, 2.5)], sonar)
 
 
@@ -84,3 +84,38 @@ def test_the_command_line_warns_of_a_black_picture(mitsonar: Command, tmp_path: 
     done = mitsonar("render", "flat_floor", "-o", tmp_path / "out", "--from", "0,0,2.5,0.61,0,0.07")
     assert done.returncode == 0, done.stderr
     assert "were radians given where degrees are meant?" in done.stderr
+
+
+@pytest.mark.usefixtures("variant")
+def test_poses_below_the_ground_and_inside_objects_are_found() -> None:
+    """A hull seen from below, and the water below a sea surface, are no ground above."""
+    from mitsonar.simulation.clearance import buried_in
+
+    bed = separate(floor=floor(), ball=sphere((0, 3, 1), 0.5), surface=plate((0, 0, 9), (0, 0, 1)))
+    poses = np.array([Pose(0, 0, 2.5), Pose(1, 2, -2.5), Pose(0, 3, 1.1)])
+    below, inside = buried_in(bed, poses), buried_in(bed, poses[2:])
+    assert below is not None
+    assert (below.frame, below.frames, below.inside) == (1, 2, False)
+    assert below.text == "at (1, 2, -2.5) m is 2.5 m below the ground, the shape floor, at z = 0 m (z points up)"
+    assert inside is not None
+    assert (inside.text, inside.inside) == ("at (0, 3, 1.1) m is inside the shape ball", True)
+    assert buried_in(bed, poses[:1]) is None
+    assert buried_in(scene(hull=sphere((0, 0, 5), 2)), poses[:1]) is None
+    assert buried_in(separate(surface=plate((0, 0, 9), (0, 0, 1))), poses[:1]) is None
+    (said,) = warned(separate(floor=floor()), [Pose(0, 0, -2.5, np.radians(35))])
+    assert said.startswith("no ray hit anything in 1 frame: ")
+    assert said.endswith("the sonar at (0, 0, -2.5) m is 2.5 m below the ground, the shape floor, at z = 0 m (z points up)")
+
+
+def test_a_path_below_the_ground_is_refused_and_leaves_no_folder(mitsonar: Command, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ("--sonar", "didson300", "--model", "physical", "--quality", "draft", "-o", out, "--from")
+    refused(
+        mitsonar("render", "flat_floor", *words, "0,0,-2.5,35,0,0"),
+        "pose 0 at (0, 0, -2.5) m is 2.5 m below the ground, the shape floor, at z = 0 m",
+        "correct --from",
+    )
+    assert not out.exists()
+    done = mitsonar("render", "flat_floor", *words, "0,0,-2.5,-35,0,0")
+    assert done.returncode == 0
+    assert "its frames show the ground from below" in done.stderr

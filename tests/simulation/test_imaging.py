@@ -19,6 +19,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
+from mitsonar.simulation.tally import Tally
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -245,6 +246,21 @@ def test_warned_of_returns_outside_the_window(flat: mi.Scene) -> None:
         simulator.render(poses, gain=1e-3)
 
 
+class _Seen:
+    """A source whose worst frame lost returns at 6..7 m."""
+
+    def window_range(self, pose: object, number: int) -> tuple[float, float]:
+        return 6.0, 7.0
+
+
+@pytest.mark.parametrize(("outside", "warned"), [(1, False), (21_000, False), (22_000, True)])
+def test_a_negligible_share_outside_the_window_is_not_warned_of(outside: int, warned: bool) -> None:
+    """Up to a thousandth of the returns."""
+    rays = {"inside": 21_299_182 - outside, "nearer": 0, "farther": outside, "missed": 0}
+    tally = Tally(SMALL, frames=1, rays=rays, pixels=100, filled=100, worst=(outside, 0))
+    assert ("window" in tally.findings(_Seen(), np.zeros((1, 6)))) == warned
+
+
 def test_warned_of_saturation(flat: mi.Scene) -> None:
     raw = levels(flat, SMALL)
     for share, warned in ((0.013, True), (0.008, False)):
@@ -309,6 +325,14 @@ def test_a_launch_that_cannot_be_replayed_is_recorded_anew(flat: mi.Scene) -> No
     simulator._launches[key] = Refusing(), rays
     (after,) = simulator.pings([POSE])
     np.testing.assert_array_equal(before.levels, after.levels)
+
+
+def test_a_scene_with_a_bsdf_that_no_shape_uses_is_rendered_beside_another() -> None:
+    """Dr.Jit refuses to record a launch of the second scene while it does not find the values of that BSDF."""
+    shapes = {"unused": diffuse(0.3), "ground": floor(), "ball": sphere([0, 3, 0], 0.5)}
+    first, second = scene(**shapes), scene(**shapes)
+    before, after = (Simulator(one, SMALL).render([POSE], gain=1.0).image for one in (first, second))
+    np.testing.assert_array_equal(before, after)
 
 
 def test_a_replayed_launch_gives_what_a_new_one_gives(flat: mi.Scene) -> None:

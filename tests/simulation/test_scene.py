@@ -9,9 +9,10 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar, named_sonars
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.moving_files import said_by
-from mitsonar.simulation.scene import find_scene, load_scene, shipped_scenes, shipped_trajectory, sonar_in
+from mitsonar.simulation.scene import find_scene, load_scene, scale_notes, shipped_scenes, shipped_trajectory, sonar_in
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -109,3 +110,63 @@ def test_a_trajectory_that_no_shape_reads_is_refused(shape: str, said: str, tmp_
             load_scene(file)
     else:
         assert [found.name for found in said_by(load_scene(file))] == ["fish"]
+
+
+GLB = b"glTF\x02\x00\x00\x00" + bytes(100)
+BINARY_STL = bytes(80) + (2).to_bytes(4, "little") + bytes(100)
+COLLADA = b'<?xml version="1.0"?><COLLADA version="1.4.1"/>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "content", "message"),
+    [
+        (
+            "ply",
+            "ship.glb",
+            GLB,
+            r"is a file of glTF, and Mitsuba's shape ply does not read it.*mitsonar world mesh .*ship.glb",
+        ),
+        ("obj", "ship.gltf", b'{"asset": {"version": "2.0"}}', r"is a file of glTF.*mitsonar world mesh"),
+        ("ply", "ship.dae", COLLADA, r"is a file of COLLADA.*mitsonar world mesh"),
+        ("obj", "ship.stl", BINARY_STL, r"is a file of STL.*ply, obj and serialized.*mitsonar world mesh"),
+        ("glb", "ship.glb", GLB, r"is a file of glTF, and Mitsuba has no shape glb.*mitsonar world mesh"),
+        ("obj", "ship.ply", b"ply\nformat ascii 1.0\n", r"is a file of PLY.*name the shape ply"),
+        ("ply", "ship.ply", b"ply\nformat ascii 1.0\n", r"is damaged: it has no header of PLY; export it again"),
+    ],
+)
+def test_a_model_in_a_format_that_mitsuba_lacks_is_named(
+    tmp_path: Path, kind: str, name: str, content: bytes, message: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    shape = f'<shape type="{kind}"><string name="filename" value="{name}"/></shape>'
+    (tmp_path / "mine.xml").write_text(f'<scene version="3.0.0">{shape}</scene>')
+    with pytest.raises(MitsonarError, match=message):
+        load_scene(tmp_path / "mine.xml")
+
+
+def ball(radius: float) -> str:
+    return f'<scene version="3.0.0"><shape type="sphere" id="ball"><float name="radius" value="{radius}"/></shape></scene>'
+
+
+@pytest.mark.parametrize(
+    ("radius", "window", "words"),
+    [
+        (200.0, 10.0, ["shape ball is 400 x 400 x 400 m large", "window of the sonar ends at 10 m", "--scale 0.001"]),
+        (200.0, 2300.0, ["the window ends at 2300 m", "--scale 0.001"]),
+        (0.0002, 10.0, ["the whole scene is 0.693 mm large", "larger --scale"]),
+        (0.019, 10.0, []),  # a sphere for calibration
+        (50.0, 10.0, []),
+    ],
+)
+def test_a_scene_in_millimetres_is_noticed(tmp_path: Path, radius: float, window: float, words: list[str]) -> None:
+    (tmp_path / "ball.xml").write_text(ball(radius))
+    notes = scale_notes(load_scene(tmp_path / "ball.xml"), Sonar(range_min=1.0, range_max=window))
+    assert len(notes) == bool(words)
+    assert all(word in notes[0] for word in words)
+
+
+def test_shipped_scenes_and_presets_are_of_their_size() -> None:
+    for name in shipped_scenes():
+        scene = load_scene(name)
+        for sonar in named_sonars():
+            assert scale_notes(scene, load_sonar(sonar)) == [], (name, sonar)

@@ -149,7 +149,7 @@ def test_a_loop_warns_once_of_each_thing(ground: mi.Scene) -> None:
         stepped(simulator, [up] * 3)
         said = [str(one.message) for one in caught if issubclass(one.category, MitsonarWarning)]
         assert len(said) == 1
-        assert said[0].startswith("no ray hit anything in 1 frames")
+        assert said[0].startswith("no ray hit anything in 1 frame")
         simulator.reset()
         simulator.step(up)
         assert len([one for one in caught if issubclass(one.category, MitsonarWarning)]) == 2

@@ -32,7 +32,7 @@ pytestmark = [
 
 from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
-from mitsonar.estimation.named_estimators import create_estimator, estimator_from  # noqa: E402
+from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
 from mitsonar.networks.onnx_export import onnx_of  # noqa: E402
@@ -252,14 +252,13 @@ def test_networks_that_know_the_geometry_are_given_it(
     with pytest.raises(MitsonarError, match="corrnet needs height and pitch"):
         estimator.estimate(bare)
     geometric.save(tmp_path / "network.ckpt")
-    told = estimator_from(f"{tmp_path}:height_m=2.5:pitch_deg=35").estimate(bare)
+    told = create_estimator(f"{tmp_path}:height_m=2.5:pitch_deg=35").estimate(bare)
     assert np.allclose(told.motion, estimator.estimate(frames).motion, rtol=1e-3, atol=1e-7)
     other = frames.sonar.replace(beams=40)
     fewer = changed(frames, image=frames.image[:, :, 4:44], bearing_rad=frames.bearing_rad[4:44], sonar=other)
     assert np.isfinite(estimator.estimate(fewer).motion).all()
     wrong = estimator.estimate(changed(frames, height_m=np.full(2, 6.0)))
     assert not wrong.valid
-    assert "first echoes tell a height" in wrong.reason
 
 
 def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: SonarPairs) -> None:
@@ -268,7 +267,7 @@ def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: Son
     assert (checkpoint.network, checkpoint.recipe["data"]) == ("corrnet", "rocky-field")
     assert checkpoint.trained["pairs"] > 10_000
     estimator = create_estimator("corrnet")
-    assert estimator_from("corrnet:force=0").digest == checkpoint.digest
+    assert create_estimator("corrnet:force=0").digest == checkpoint.digest
     frames = pairs.sonar_frames(2)
     there = pickle.loads(pickle.dumps(estimator)).estimate(frames)
     assert there.motion == estimator.estimate(frames).motion
@@ -299,7 +298,7 @@ def test_estimators_are_named_by_checkpoint_or_folder(
     frames = pairs.sonar_frames(2)
     monkeypatch.chdir(run.parent)
     for text in (f"{run}/network.ckpt", str(run), run.name, f"{run}:force=1"):
-        assert np.allclose(estimator_from(text).estimate(frames).motion, SAYS, atol=1e-7)
+        assert np.allclose(create_estimator(text).estimate(frames).motion, SAYS, atol=1e-7)
     for text, words in {
         f"{run}:force=2": "force must be 0 or 1",
         f"{run}:levels=2": "takes force, height_m, pitch_deg, relief_m",
@@ -309,19 +308,18 @@ def test_estimators_are_named_by_checkpoint_or_folder(
         "dierct": "did you mean direct.*or give a checkpoint",
     }.items():
         with pytest.raises(MitsonarError, match=words):
-            estimator_from(text)
-    with pytest.raises(MitsonarError, match="unknown estimator"):
-        create_estimator(str(run))
+            create_estimator(text)
+    assert np.allclose(create_estimator(run, force=True).estimate(frames).motion, SAYS, atol=1e-7)
 
 
 def test_without_torch_the_extra_is_named(run: Path) -> None:
     said = run_python(
         f"""
         from mitsonar.errors import MitsonarError
-        from mitsonar.estimation.named_estimators import estimator_from
-        estimator_from("direct")
+        from mitsonar.estimation.named_estimators import create_estimator
+        create_estimator("direct")
         try:
-            estimator_from({str(run)!r})
+            create_estimator({str(run)!r})
         except MitsonarError as error:
             print(error)
         """,

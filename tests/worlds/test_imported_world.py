@@ -292,6 +292,7 @@ def test_the_command_makes_a_scene_and_names_its_shapes(mitsonar: Command, tmp_p
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--material", "base=stel", "-o", out), "did you mean steel")
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--material", "bas=steel", "-o", out), "no link", "base")
     refused(mitsonar("world", "import", tmp_path / "crane.urdf", "--reflectivity", "2", "-o", out), "--reflectivity must be")
+    (tmp_path / "crane.dae").write_text("<COLLADA/>")
     refused(mitsonar("world", "import", tmp_path / "crane.dae", "-o", out), "cannot read scenes of type .dae")
     refused(mitsonar("world", "import", tmp_path / "none.urdf", "-o", out), "no such file")
     assert not out.exists()

@@ -150,7 +150,7 @@ def real_models() -> list[Path]:
     return sorted(folder.glob("*.dae"))
 
 
-@pytest.mark.filterwarnings("ignore:.*outside the window")
+@pytest.mark.filterwarnings("ignore:.*outside the window", "ignore:.*farther than imaging sonars reach")
 @pytest.mark.skipif(not real_models(), reason="the shared data is not here")
 @pytest.mark.parametrize("path", real_models(), ids=lambda path: path.stem)
 def test_real_models_render(path: Path, tmp_path: Path) -> None:
@@ -186,10 +186,21 @@ def test_a_model_in_the_wrong_unit_is_warned_of(mitsonar: Command, tmp_path: Pat
     for scale, warned in ((1, True), (0.001, False)):
         done = mitsonar("world", "mesh", tmp_path / "box.stl", "--scale", scale, "-o", tmp_path / str(scale))
         assert done.returncode == 0, done.stderr
-        assert ("0.001 for millimetres" in done.stderr) == warned
+        assert ("0.001 where the unit is a millimetre" in done.stderr) == warned
 
 
 def test_a_model_without_colours_is_half_reflecting(tmp_path: Path) -> None:
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.stl")
     (mesh,) = mesh_world(tmp_path / "box.stl").meshes
     np.testing.assert_array_equal(mesh.reflectivity, 0.5)
+
+
+@pytest.mark.parametrize(("edge", "scale", "warned"), [(400, 1, "400 m large"), (400, 0.001, ""), (400, 0.0001, "0.04 m")])
+def test_a_model_of_another_unit_is_warned_of(
+    mitsonar: Command, tmp_path: Path, edge: float, scale: float, warned: str
+) -> None:
+    trimesh.creation.box((edge, edge, edge)).export(tmp_path / "box.stl")
+    done = mitsonar("world", "mesh", tmp_path / "box.stl", "-o", tmp_path / "out", "--scale", scale)
+    assert done.returncode == 0
+    assert ("--scale 0.001 where the unit is a millimetre" in done.stderr) == bool(warned)
+    assert warned in done.stderr

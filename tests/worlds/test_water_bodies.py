@@ -11,7 +11,7 @@ from helpers import scene, sphere
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
-from mitsonar.worlds.water_bodies import net_mesh, particle_mesh
+from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
 
 
 def normals(vertices: Any, faces: Any) -> Any:
@@ -30,7 +30,7 @@ def test_particles_have_their_surface_and_face_outward() -> None:
 
 
 def test_a_net_has_its_bars() -> None:
-    vertices, faces = net_mesh(1.0, 0.5, 0.1, 0.004)
+    vertices, faces = fishing_net_mesh(1.0, 0.5, 0.1, 0.004)
     bars = 11 * 5 + 10 * 6
     assert len(faces) == 6 * bars
     area = normals(vertices, faces)
@@ -72,4 +72,4 @@ def test_mistakes_are_told() -> None:
     with pytest.raises(MitsonarError, match="of positive size"):
         particle_mesh(0, (1, 1, 1), 0.1)
     with pytest.raises(MitsonarError, match="twine < opening"):
-        net_mesh(1, 1, 0.1, 0.2)
+        fishing_net_mesh(1, 1, 0.1, 0.2)

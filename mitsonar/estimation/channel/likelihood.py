@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import maximum_filter
+from threadpoolctl import threadpool_limits
 
 from mitsonar.estimation.channel.motion_score import MotionScore, judged
 from mitsonar.estimation.channel.motion_search import ReceiverBand, Search, receiver_bands_of
@@ -124,9 +125,16 @@ class Likelihood:
     def estimate(self, responses: ImpulseResponses, prior: MotionPrior | None = None) -> Estimate:
         """Estimate the motion and its covariance; a prior is ignored: the search covers all motions up to ``speed``.
 
+        Linear algebra uses one thread: its matrices have some 90 rows, for which threads wait for each other much longer
+        than they compute.
+
         Raises:
             MitsonarError: records of :func:`mitsonar.estimation.channel.pings.pings_of`, or no height.
         """
+        with threadpool_limits(1, "blas"):
+            return self._estimate(responses)
+
+    def _estimate(self, responses: ImpulseResponses) -> Estimate:
         pings = pings_of(responses)
         height = assumed_height(responses, "likelihood", self.height_m)
         received = [k for k, one in enumerate(responses.sonar.receivers) if one.name not in pings.silent]

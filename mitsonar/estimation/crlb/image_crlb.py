@@ -206,19 +206,26 @@ def cramer_rao_bound(
     frames: int = 2,
     pings: int | None = None,
 ) -> NDArray[np.float64]:
-    """Least standard deviations at each pose ``(n, 3)`` [m, m, rad]; 0 where :func:`bound` is None, inf where an axis cannot
-    be observed.
+    """Compute the least standard deviations of a motion at each pose (Cramer and Rao).
 
     Args:
-        simulator: as for :func:`bounds_at`, with its poses and gain.
-        poses: of the sonar ``(n, 6)``.
+        simulator: of the scene that the poses are in.
+        poses: of the sonar ``(n, 6)`` [m, rad].
         noise: of the pixels; without noise ask for the law ``rays``. The model ``coherent`` has its own: none.
         gain: that of the frames.
         view: which one; default: the only one, or all together where no two hear the same rays.
-        kind: of :data:`KINDS`; the model ``coherent`` has images only.
-        law: of :func:`laws_of` the sonar; default: ``pixel``, of the model ``coherent`` ``ground``.
+        kind: ``image``, all pixels, or ``vector``, sums over the beams; the model ``coherent`` has images only.
+        law: ``pixel``: the exact law of the noisy pixel, clipped and rounded to grey values; ``gaussian``: a Gaussian of the
+            same mean and variance; ``rays``: the same, with the noise of the rays of a single ping as further variance. Of
+            the model ``coherent`` ``ground``: the expected level is known, and the grain is new in each frame; ``grain``:
+            the scatterers are known as well. Default: ``pixel``, of the model ``coherent`` ``ground``.
         frames: noisy ones, 1 or 2.
-        pings: as for :func:`bounds_at`.
+        pings: of each half of the derivatives; default: 8, and four times as many, twice, where images leave it open whether
+            an axis can be observed.
+
+    Returns:
+        Sideways, forward [m] and yaw [rad] ``(n, 3)``; 0 where nothing but rounding stands between a pixel and its level,
+        inf where an axis cannot be observed.
 
     Raises:
         MitsonarError: unknown words; several portions that overlap, and none named; noise of pixels with speckle.

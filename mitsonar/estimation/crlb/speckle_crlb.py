@@ -220,6 +220,6 @@ def _power_slopes(imager: CoherentImager, pose: Floats, step: Floats, pings: int
             for side in (1, -1):
                 moved = motion.copy()
                 moved[axis] = side * step[axis]
-                echo = imager.echoes(np.array(compose(Pose(*pose), Motion(*moved))))[0]
+                echo = imager.echoes(np.array(compose(Pose.from_row(pose), Motion(*moved))))[0]
                 slopes[..., axis] += side * (echo.real.astype(float) ** 2 + echo.imag.astype(float) ** 2)
     return slopes / (2 * step * pings)

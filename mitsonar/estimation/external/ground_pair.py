@@ -76,7 +76,7 @@ def ground_pair(frames: SonarFrames, name: str) -> GroundPair:
     spacing = float(np.ptp(frames.bearing_rad)) / (len(frames.bearing_rad) - 1)
     view = GroundView(frames, attitude, PIXEL * spacing * float(frames.range_m[0] + frames.range_m[-1]) / 2)
     rows, columns = _filled_rectangle(view.inside)
-    first, second = (np.ascontiguousarray(view.draw(image)[rows, columns]) for image in images)
+    first, second = (np.ascontiguousarray(view.draw(image, k)[rows, columns]) for k, image in enumerate(images))
     small = "" if min(first.shape) >= SMALLEST else "the fan meets too little ground"
     blank = "" if small or (np.ptp(first) > 0 and np.ptp(second) > 0) else "nothing in the frames to match"
     return GroundPair(first, second, view, (columns.start, rows.start), attitude.reason or small or blank)

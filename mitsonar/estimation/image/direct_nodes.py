@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -45,15 +46,29 @@ class GroundNodes:
     def __init__(self, frames: SonarFrames, attitude: Attitude, *, heave: bool) -> None:
         self.frames, self.attitude, self.heave = frames, attitude, heave
         self.axes = node_axes(frames.range_m, frames.bearing_rad)
-        self.ground = self._ground(attitude.height_m)
+        self.ground = self._ground(None)
         self.known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
         self.from_node = nearest_known(self.known)
         self.derivative = self._derivative(self.ground)
 
-    def _ground(self, height: float) -> GroundGeometry:
-        """Return the geometry of the nodes from a height."""
+    def _ground(self, number: int | None, lift_m: float = 0.0) -> GroundGeometry:
+        """Return the geometry of the nodes, of the frames' mean or of one frame, over ground raised by ``lift_m``."""
         attitude = self.attitude
-        return GroundGeometry(*self.axes, self.frames.sonar.bearing, height, attitude.pitch_rad, attitude.roll_rad)
+        mean = attitude.height_m - lift_m, attitude.pitch_rad, attitude.roll_rad
+        pose = mean if number is None else attitude.of_frame(number, lift_m)
+        return GroundGeometry(*self.axes, self.frames.sonar.bearing, *pose)
+
+    @cached_property
+    def _of_frames(self) -> tuple[GroundGeometry, GroundGeometry]:
+        """Return the geometry of the nodes in each frame."""
+        return (self._ground(0), self._ground(1)) if self.attitude.apart else (self.ground, self.ground)
+
+    @cached_property
+    def _from_nodes_of_frames(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """Return the nodes of each frame whose values its nodes take."""
+        if not self.attitude.apart:
+            return [self.from_node, self.from_node]
+        return [nearest_known(np.asarray(np.isfinite(one.points).all(axis=-1))) for one in self._of_frames]
 
     def _derivative(self, ground: GroundGeometry) -> Doubles:
         """Return the derivative by motion (and heave), that of the nearest node where a node meets no ground."""
@@ -78,19 +93,22 @@ class GroundNodes:
 
     def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
         """Return the displacement of the nodes in range [m] and bearing [rad]; see :meth:`Cells.shift`."""
-        ground = other = self._ground(self.attitude.height_m - lift_m) if lift_m else self.ground
+        ground, other = self._of_frames[:: -1 if back else 1]
+        if lift_m:
+            ground, other = (replace(one, height_m=one.height_m - lift_m) for one in (ground, other))
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
-            ground, other = (self._ground(self.attitude.height_m + change) for change in (half, -half))
+            ground, other = replace(ground, height_m=ground.height_m + half), replace(other, height_m=other.height_m - half)
         motion = inverse(v[:3]) if back else v[:3]
         radius, bearing = other.to_polar(moved(ground.points, motion))
         nodes = np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
         # a cell that meets level ground may not meet ground that lies lower
-        row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else self.from_node
+        known = self._from_nodes_of_frames[int(back)]
+        row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else known
         return np.asarray(nodes[:, row, column], dtype=np.float64)
 
     def lifted_shift(self, v: Doubles) -> Doubles:
         """Return the derivative of :meth:`shift` by the height [m/m, rad/m], to first order in the motion."""
         change = HEIGHT_STEP * self.attitude.height_m
-        higher = self._derivative(self._ground(self.attitude.height_m + change))
+        higher = self._derivative(self._ground(None, -change))
         return np.asarray(np.tensordot(v / change, higher - self.derivative, axes=1))

@@ -66,12 +66,13 @@ SMALL = (2e-3, 2e-3, 5e-4, 0.04)
 
 
 class _Equations(NamedTuple):
-    """Normal equations of motion and heights: those of the motion, those of both, and those of each block's height."""
+    """Normal equations of motion and heights: of the motion ``(3, 3)``, of both ``(3, blocks)``, of each block's height
+    ``(blocks,)``; what pulls the motion, by block ``(3, blocks)``, and each height ``(blocks,)``."""
 
     normal: NDArray[np.float64]
     both: NDArray[np.float64]
     height: NDArray[np.float64]
-    pull: NDArray[np.float64]
+    pulls: NDArray[np.float64]
     height_pull: NDArray[np.float64]
     noise: float
     correlation: float
@@ -85,8 +86,12 @@ class _Equations(NamedTuple):
             off: heights less their prior mean ``(blocks,)`` [m].
         """
         held = self.height + self.noise * prior
-        pulled = (self.height_pull + self.noise * prior * off) / held
-        return self.normal - (self.both / held) @ self.both.T, self.pull - self.both @ pulled
+        return self.normal - (self.both / held) @ self.both.T, self.pulls_alone(prior, off).sum(axis=1)
+
+    def pulls_alone(self, prior: float, off: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what each block pulls the motion by, its height eliminated ``(3, blocks)``; see :meth:`without_heights`."""
+        pulled = (self.height_pull + self.noise * prior * off) / (self.height + self.noise * prior)
+        return self.pulls - self.both * pulled
 
 
 class _ReliefLevel:
@@ -152,10 +157,10 @@ class _ReliefLevel:
             jacobian = (by_bin * derivatives[:, 0] + by_beam * derivatives[:, 1]) * sign
             shown = self._places(level_shift) if back else None  # heights are those of the first frame's blocks
             sums.append(self._summed(jacobian, jacobian * weight, residual, shown))
-        by_motion, both, height = (np.sum([one[k] for one in map(_split, sums)], axis=0) for k in range(3))
-        return _Equations(
-            by_motion[:, :3], both, height[0], by_motion[:, 3], height[1], ALIKE * scale**2, correlation, count
-        )
+        total = np.sum(sums, axis=0)  # motion by motion and by residual, height by motion, by itself and by residual
+        by_motion, both, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
+        normal, pulls = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
+        return _Equations(normal, both, height[0], pulls, height[1], ALIKE * scale**2, correlation, count)
 
     def _summed(
         self, jacobian: Floats, weighted: Floats, residual: Floats, shown: tuple[Floats, Floats] | None
@@ -231,25 +236,24 @@ def registered_over_relief(
             if converged:
                 break
     assert found is not None
-    return v, _assessed(found, prior, level, converged=converged)
+    assert heights is not None
+    return v, _assessed(found, prior, heights - at.mean, level, converged=converged)
 
 
-def _assessed(found: _Equations, prior: float, level: DirectLevel, *, converged: bool) -> Fit:
-    """Return the covariance, and how the motion depends on the mean height."""
-    normal, _ = found.without_heights(prior, np.zeros(len(found.height)))
+def _assessed(found: _Equations, prior: float, off: NDArray[np.float64], level: DirectLevel, *, converged: bool) -> Fit:
+    """Return the covariance, and how the motion depends on the mean height.
+
+    The covariance is that of the blocks' pulls, which hold whatever errs together within a block: noise, speckle, relief.
+    """
+    normal, _ = found.without_heights(prior, off)
     undone = np.linalg.inv(normal)
     held = found.noise * prior
+    each = undone @ found.pulls_alone(prior, off)
     return Fit(
         converged=converged,
-        # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
-        covariance=np.asarray(found.noise * (undone + undone.T) / 2, dtype=np.float64),
+        covariance=np.asarray(each @ each.T, dtype=np.float64),
         by_height=undone @ (found.both @ (held / (found.height + held))),
         correlation=found.correlation,
         independent=found.cells / alike_cells(level),
         blocks=spread_of(found.height),
     )
-
-
-def _split(sums: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Separate what :meth:`_ReliefLevel._summed` returns: by motion, motion by height, height by itself and by residual."""
-    return sums[:12].sum(axis=1).reshape(3, 4), sums[12:15], sums[15:]

@@ -35,9 +35,16 @@ HIGHER = 0.02
 
 @dataclass(frozen=True)
 class WindowGrid:
-    """The cells of a level's frames over the ground, and the windows over them."""
+    """The cells of a level's frames over the ground, and the windows over them.
+
+    Attributes:
+        ground: of the first frame.
+        other: of the second frame.
+        level: of the windows.
+    """
 
     ground: GroundGeometry
+    other: GroundGeometry
     level: FlowLevel
 
     @cached_property
@@ -79,22 +86,27 @@ class WindowGrid:
         return np.nan_to_num(self.ground.derivative[self.centres])
 
     @cached_property
-    def higher(self) -> GroundGeometry:
-        """The same sonar :data:`HIGHER` times its height further up."""
-        return replace(self.ground, height_m=self.ground.height_m * (1 + HIGHER))
+    def _higher(self) -> tuple[GroundGeometry, GroundGeometry]:
+        """The sonar of both frames :data:`HIGHER` times the height of the first further up."""
+        ground, other = (replace(one, height_m=one.height_m + HIGHER * self.ground.height_m) for one in self._both)
+        return ground, other
+
+    @property
+    def _both(self) -> tuple[GroundGeometry, GroundGeometry]:
+        return self.ground, self.other
 
     @cached_property
-    def higher_points(self) -> Doubles:
+    def _higher_points(self) -> Doubles:
         """Ground points of the centres, seen from there ``(n, m, 2)``."""
-        return self.higher.points[self.centres]
+        return self._higher[0].points[self.centres]
 
     def map(self, v: Doubles) -> Doubles:
         """Return the modelled displacement map of a motion [m, rad] ``(n, m, 2)``; zero where no ground is shown."""
-        return np.nan_to_num(np.stack(self.ground.to_polar(moved(self.points, v)), axis=-1) - self.home)
+        return np.nan_to_num(np.stack(self.other.to_polar(moved(self.points, v)), axis=-1) - self.home)
 
     def by_height(self, v: Doubles) -> Doubles:
         """How that map changes with the height, in parts of it ``(n, m, 2, 1)``."""
-        map_there = np.stack(self.higher.to_polar(moved(self.higher_points, v)), axis=-1) - self.home
+        map_there = np.stack(self._higher[1].to_polar(moved(self._higher_points, v)), axis=-1) - self.home
         return (np.nan_to_num(map_there - self.map(v)) / HIGHER)[..., None]
 
 
@@ -103,11 +115,11 @@ def window_grid(
     range_m: tuple[float, ...],
     bearing_rad: tuple[float, ...],
     bearing: Bearing,
-    height: float,
-    pitch: float,
-    roll: float,
+    first: tuple[float, float, float],
+    second: tuple[float, float, float],
     level: FlowLevel,
 ) -> WindowGrid:
-    """Return the windows of a level over level ground; heights in m, pitch and roll in rad."""
+    """Return the windows of a level over level ground; of each frame height [m], pitch and roll [rad]."""
     ranges = np.array(range_m)[level.step // 2 :: level.step]
-    return WindowGrid(GroundGeometry(ranges, np.array(bearing_rad), bearing, height, pitch, roll), level)
+    ground, other = (GroundGeometry(ranges, np.array(bearing_rad), bearing, *pose) for pose in (first, second))
+    return WindowGrid(ground, other, level)

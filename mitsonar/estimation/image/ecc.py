@@ -73,7 +73,7 @@ class Ecc:
         pixel_m = self._pixel_m(frames)
         for pixels, size in LEVELS:
             view = GroundView(frames, attitude, pixels * pixel_m)
-            first, second = (view.draw(image) for image in images)
+            first, second = (view.draw(image, number) for number, image in enumerate(images))
             warp = view.warp(motion)
             mask = (view.inside * np.uint8(255)).astype(np.uint8)
             if min(first.shape) < 4 * size:
@@ -85,7 +85,7 @@ class Ecc:
                 return rejected("the correlation has no maximum nearby")
             motion = view.motion(warp)
         reason = self._rejection(first, second, warp, view.inside, size)
-        return Estimate(motion, None, not reason, reason)
+        return Estimate(motion, None, not reason, reason, attitude.about)
 
     @staticmethod
     def _rejection(

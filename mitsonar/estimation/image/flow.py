@@ -123,8 +123,7 @@ class Flow:
         v = np.zeros(3)
         fit = None
         for level in self.levels:
-            trained_at = (attitude.height_m, attitude.pitch_rad, attitude.roll_rad)
-            grid = window_grid(*axes, frames.sonar.bearing, *trained_at, level)
+            grid = window_grid(*axes, frames.sonar.bearing, attitude.of_frame(0), attitude.of_frame(1), level)
             fit = self._register(_smoothed(first, level), _smoothed(second, level), grid, v, height_std)
             if fit is None:
                 return Estimate(Motion(0.0, 0.0, 0.0), None, False, "nothing in the frames to match")
@@ -133,7 +132,7 @@ class Flow:
         unseen = _unseen(grid, fit.structure, frames.sonar.elevation_fov_deg)
         blocks = _blocks(fit.structure)
         reason = attitude.reason or _rejection(fit, blocks, unseen)
-        about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen}
+        about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen, **attitude.about}
         return Estimate(Motion(*(float(x) for x in v)), fit.covariance, not reason, reason, about)
 
     def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
@@ -164,7 +163,7 @@ def _smoothed(image: Floats, level: FlowLevel) -> Floats:
 
 def _warped(second: Floats, grid: WindowGrid, v: Doubles) -> tuple[Floats, Floats]:
     """Draw the second frame at the cells of the first, for a motion; and 1 where it is known, else 0 ``(bins, beams)``."""
-    radius, bearing = grid.ground.to_polar(moved(grid.cells, v))
+    radius, bearing = grid.other.to_polar(moved(grid.cells, v))
     row, column = _place(radius, grid.ground.range_m), _place(bearing, grid.ground.bearing_rad)
     bins, beams = second.shape
     inside = (row >= 0) & (row <= bins - 1) & (column >= 0) & (column <= beams - 1)  # False for nan

@@ -72,21 +72,22 @@ class GroundView:
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     @cached_property
-    def _pixel_positions(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Row and column in the frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
-        return fan_places(self._geometry, self.frames.sonar, self.points)
+    def _pixel_positions(self) -> list[tuple[Floats, Floats, NDArray[np.bool_]]]:
+        """Row and column in each frame of each pixel, and whether it is inside and lit ``(rows, columns)``."""
+        numbers = range(len(self.attitude.apart)) if self.attitude.apart else (None,)
+        return [fan_places(self.attitude.ground(self.frames, k), self.frames.sonar, self.points) for k in numbers]
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Pixels within the fan that the sonar can light, were the ground level ``(rows, columns)``.
+        """Pixels within the fans that the sonar can light, were the ground level ``(rows, columns)``.
 
         What lies around them is dark in every frame: an outline that moves with the sonar.
         """
-        return self._pixel_positions[2]
+        return np.asarray(np.all([lit for _, _, lit in self._pixel_positions], axis=0))
 
-    def draw(self, image: Floats) -> Floats:
-        """Draw an image ``(bins, beams)`` as seen from above ``(rows, columns)``; 0 outside the fan."""
-        row, column, _ = self._pixel_positions
+    def draw(self, image: Floats, number: int = 0) -> Floats:
+        """Draw the image ``(bins, beams)`` of a frame as seen from above ``(rows, columns)``; 0 outside the fan."""
+        row, column, _ = self._pixel_positions[number if self.attitude.apart else 0]
         if not row.size:
             return np.zeros((0, 0), dtype=np.float32)
         finer = self.edge / float(np.median(np.diff(self.frames.range_m)))

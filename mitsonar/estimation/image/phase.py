@@ -73,7 +73,7 @@ class Phase:
         images = two_frames(frames)
         attitude = attitude_of(frames, "phase", self.height_m, self.pitch_rad, self.relief_m)
         view = GroundView(frames, attitude, CELL_M, MOST_CELLS)
-        first, second = (view.draw(image) for image in images)
+        first, second = (view.draw(image, number) for number, image in enumerate(images))
         if attitude.reason or blank(first) or blank(second):
             return rejected(attitude.reason or "nothing in the frames to match")
         if min(first.shape) < 32 or not view.inside.any():
@@ -89,7 +89,7 @@ class Phase:
         matched = _back(second, view, motion)
         smooth = [cv2.GaussianBlur(image, (5, 5), 0) for image in (first, matched)]
         reason = matching_rejection(smooth[0], smooth[1], window > 0.3, alike=4 * np.pi * 1.1**2)
-        return Estimate(motion, None, not reason, reason)
+        return Estimate(motion, None, not reason, reason, attitude.about)
 
 
 def _window(inside: NDArray[np.bool_]) -> Floats:

@@ -187,7 +187,13 @@ class ImageNetwork(Trained):
                 by_height = _by_height(ground, found.motion)
                 covariance = covariance + unsure * np.outer(by_height, by_height)
         reason = found.reason or prior_rejection(found.motion, covariance, prior)
-        return replace(found, covariance=covariance, valid=not reason, reason=reason, about={**found.about, "start": named})
+        return replace(
+            found,
+            covariance=covariance,
+            valid=not reason,
+            reason=reason,
+            about={**found.about, **attitude.about, "start": named},
+        )
 
     def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
         """Estimate the motion from a start of the network's iterations; None: no motion."""

@@ -7,6 +7,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from mitsonar.errors import MitsonarError
+from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.external.cfar_gicp import CfarGicp
 from mitsonar.estimation.external.ground_pair import ground_pair
-from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator, estimator_from
+from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.mapping.odometry import odometry
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.pose import Pose
@@ -126,6 +129,22 @@ class Fixed:
     def estimate(self, frames):
         return Estimate(Motion(0.01 * len(frames), 0.0, 0.0))
 
+class Biased:
+    """Answers by its options, and where it is told to begin."""
+    def __init__(self, key=1, name="", wide_rad=0.0):
+        self.key, self.name = key, name
+    def estimate(self, frames, prior=None):
+        start = 0.0 if prior is None else prior.motion.forward
+        return Estimate(Motion(self.key, start, 0.0), reason=self.name)
+
+class Demanding:
+    def estimate(self, frames, other):
+        pass
+
+class Failing:
+    def estimate(self, frames):
+        return frames.weights
+
 class Bare:
     def estimate(self, frames):
         return 0.01, 0.0, 0.0
@@ -162,11 +181,11 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("mine")
 def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -> None:
-    estimator = estimator_from("my_module:Fixed")
+    estimator = create_estimator("my_module:Fixed")
     frames = pair(ground, Motion(0.0, 0.0, 0.0))
     assert estimator.estimate(frames).motion == Motion(0.02, 0.0, 0.0)
     with pytest.raises(MitsonarError, match="my_module:Bare: estimate must return an Estimate: got tuple"):
-        estimator_from("my_module:Bare").estimate(frames)
+        create_estimator("my_module:Bare").estimate(frames)
 
 
 @pytest.mark.usefixtures("mine")
@@ -179,19 +198,83 @@ def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -
         ("my_module:KeyMissing", r"KeyMissing\(\) raises KeyError \('weights'\)"),
         ("my_module:AttributeMissing", r"AttributeMissing\(\) raises AttributeError \(.* no attribute 'weights'"),
         ("my_module:Needy", r"Needy\(\) raises TypeError \(.*\): it must need no arguments"),
+        ("my_module:Biased:kye=5", r"unknown option 'kye': my_module:Biased takes key, name, wide_rad; did you mean key\?"),
+        ("my_module:Biased:key", r"is my_module:MyEstimator or my_module:MyEstimator:key=value"),
+        ("my_module:Demanding", r"Demanding: estimate\(frames, other\) must take the frames alone, or the frames and"),
         ("broken_module:Fixed", r"broken_module raises NameError \(.*nothing_of_this_name.*\) when it is imported"),
     ],
 )
 def test_what_is_no_estimator_is_one_sentence(text: str, reason: str) -> None:
     with pytest.raises(MitsonarError, match=reason):
-        estimator_from(text)
+        create_estimator(text)
+
+
+PRIOR = MotionPrior(Motion(0.0, 0.7, 0.0), np.eye(3))
+
+
+@pytest.mark.usefixtures("mine")
+def test_one_door_for_estimators_of_ones_own(ground: NDArray[np.float64]) -> None:
+    """An instance, a class with options, and a text with options; each gets the prior if it takes one, and not if not."""
+    frames = pair(ground, Motion(0.0, 0.0, 0.0))
+    made = create_estimator("my_module:Biased:key=5:name=mine")
+    kind: Any = type(getattr(made, "_made"))  # noqa: B009
+    for one in (made, create_estimator(kind(5, "mine")), create_estimator(kind, key=5, name="mine"), kind(5, "mine")):
+        found = create_estimator(one).estimate(frames, PRIOR)
+        assert found.motion == Motion(5.0, 0.7, 0.0)
+        assert found.reason == "mine"
+    for text in ("my_module:Fixed", "my_module:Biased:key=0.02"):
+        assert odometry(frames, text).estimates[0].motion == Motion(0.02, 0.0, 0.0)
+    assert create_estimator("my_module:Fixed").estimate(frames, PRIOR).motion == Motion(0.02, 0.0, 0.0)
+    with pytest.raises(MitsonarError, match=r"my_module:Failing: estimate raises AttributeError \(.*weights.*line 2\d"):
+        odometry(frames, "my_module:Failing")
+    with pytest.raises(MitsonarError, match=r"unknown option 'kye': Biased takes key, name, wide_rad; did you mean key\?"):
+        create_estimator(kind, kye=5)
+    with pytest.raises(MitsonarError, match="Biased is made already and takes no options: got key; give its class"):
+        create_estimator(kind(), key=5)
+    with pytest.raises(MitsonarError, match=r"int has no method estimate\(frames\)"):
+        create_estimator(5)  # type: ignore[arg-type]  # anything may be given
+
+
+def test_what_cannot_be_sent_to_workers_is_one_sentence(ground: NDArray[np.float64]) -> None:
+    class Local:
+        def estimate(self, frames: SonarFrames) -> Estimate:
+            return Estimate(Motion(0.01, 0.0, 0.0))
+
+    frames = pair(ground, Motion(0.0, 0.0, 0.0))
+    assert odometry(frames, Local()).estimates[0].motion.sideways == 0.01
+    with pytest.raises(MitsonarError, match=r"Local cannot be sent to another process .*: use one worker, or name it as"):
+        odometry(frames, Local, workers=2)
+
+
+@pytest.mark.learn
+def test_a_network_of_torch_is_an_estimator(ground: NDArray[np.float64]) -> None:
+    torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
+
+    class Means(torch.nn.Module):  # type: ignore[misc, name-defined]  # torch is imported here
+        """Labels: the means of both images, and no turn."""
+
+        def forward(self, images: Any) -> Any:
+            assert images.shape[:2] == (1, 2)
+            assert not self.training
+            return torch.stack([images[:, 0].mean(), images[:, 1].mean(), images.new_zeros(())])[None]
+
+    frames = pair(ground, Motion(0.0, 0.05, 0.0))
+    network = Means()
+    found = odometry(frames, network).estimates[0]
+    assert found.motion == pytest.approx([*frames.image.mean(axis=(1, 2)), 0.0], rel=1e-5)
+    assert found.covariance is None
+    assert network.training, "the user's network stays as it is"
+    with pytest.raises(MitsonarError, match="unknown option 'layout': Means takes samples"):
+        create_estimator(network, layout="side")
+    with pytest.raises(MitsonarError, match=r"must return labels \(batch, 3\): got a tensor of \(1, 2, 128, 96"):
+        create_estimator(torch.nn.Identity()).estimate(frames)
 
 
 @pytest.mark.usefixtures("mine")
 def test_a_worker_imports_the_class_again(ground: NDArray[np.float64], tmp_path: Path) -> None:
     """Its search path lacks the folder of the module, as that of the installed command does."""
     assert not {"", str(tmp_path)} & set(sys.path)
-    estimator = estimator_from("my_module:Unpicklable")
+    estimator = create_estimator("my_module:Unpicklable")
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         found = pool.submit(estimator.estimate, pair(ground, Motion(0.0, 0.0, 0.0))).result()
     assert found.motion == Motion(0.02, 0.0, 0.0)
@@ -201,5 +284,5 @@ def test_a_worker_imports_the_class_again(ground: NDArray[np.float64], tmp_path:
 def test_a_module_that_changes_the_folder_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "moving_module", raising=False)
     before = list(sys.path)
-    estimator_from("moving_module:Fixed")
+    create_estimator("moving_module:Fixed")
     assert sys.path == before

@@ -296,13 +296,13 @@ class TestNetworks:
     def test_the_network_trained_nearest_to_the_height_answers(
         self, heights: Path, tmp_path: Path, mitsonar: Command
     ) -> None:
-        from mitsonar.estimation.named_estimators import estimator_from
+        from mitsonar.estimation.named_estimators import create_estimator
 
         runs = []
         for name, seed in (("low", 0), ("high", 1)):
             self.trained(heights, tmp_path / name, input={"kind": "vector", "views": ["c1", "c2", "c3", "c4"]}, seed=seed)
             runs.append(tmp_path / name)
-        both: Any = estimator_from(f"{runs[0]},{runs[1]}")
+        both: Any = create_estimator(f"{runs[0]},{runs[1]}")
         both.networks[0]._checkpoint.trained_at["height_m"] = [2.0, 2.6]
         both.networks[1]._checkpoint.trained_at["height_m"] = [2.7, 4.0]
         assert [both.networks.index(both.chosen(height)) for height in (1.0, 2.3, 2.62, 2.69, 3, 9)] == [0, 0, 0, 1, 1, 1]
@@ -314,10 +314,10 @@ class TestNetworks:
         with pytest.raises(MitsonarError, match="measure it with --height-by direct"):
             both.estimate(replace(pair, height_m=None))
         with pytest.raises(MitsonarError, match="zero was not trained at a height"):
-            estimator_from(f"zero,{runs[0]}")
+            create_estimator(f"zero,{runs[0]}")
         words = ("--estimator", f"{runs[0]},{runs[1]}", "--height-by", "direct", "--sequence", "1", "-o", tmp_path / "path")
         done = mitsonar("odometry", heights, *words)
         assert done.returncode == 0, done.stderr
         self.trained(heights, tmp_path / "other", input={"kind": "vector", "views": ["c1"]})
         with pytest.raises(MitsonarError, match="must read the same views: got vectors of c1; vectors of c1, c2, c3, c4"):
-            estimator_from(f"{runs[0]},{tmp_path / 'other'}")
+            create_estimator(f"{runs[0]},{tmp_path / 'other'}")

@@ -198,17 +198,16 @@ def test_far_covariances_know_the_relief_of_the_first_echoes(far: SonarFrames, m
     assert covariances[2][1, 1] > 2 * covariances[0][1, 1]
 
 
-def test_small_cells_count_by_their_area(far: SonarFrames) -> None:
-    """The cells of a DIDSON count one by one; half as large ones count half, larger ones and those of spread beams whole."""
-    height_m = 2.13
-    coarse = direct._far_model(far, height_m)
-    assert coarse == pytest.approx(direct.FAR_MODEL, rel=0.02)
+def test_smaller_cells_tell_no_more(far: SonarFrames) -> None:
+    """The covariance over relief is that of whole blocks: bins cut in half hold nothing new."""
     middles = (far.range_m[1:] + far.range_m[:-1]) / 2
-    finer = changed(far, range_m=np.sort(np.append(far.range_m, middles)), image=np.repeat(far.image, 2, axis=1)[:, 1:])
-    assert direct._far_model(finer, height_m) == pytest.approx(2 * coarse, rel=0.02)
-    assert direct._far_model(changed(far, image=far.image[:, ::2], range_m=far.range_m[::2]), height_m) == direct.FAR_MODEL
-    spread = changed(finer, sonar=far.sonar.replace(model="physical", pattern="two_way"))
-    assert direct._far_model(spread, height_m) == direct.FAR_MODEL
+    between = (far.image[:, 1:] + far.image[:, :-1]) / 2
+    image = np.stack([far.image[:, 1:], between], axis=2).reshape(2, -1, far.image.shape[2])
+    finer = changed(far, range_m=np.sort(np.append(far.range_m[1:], middles)), image=image)
+    whole, cut = (Direct().estimate(frames, expected(FAR, mm=10, deg=0.3)) for frames in (far, finer))
+    assert whole.covariance is not None
+    assert cut.covariance is not None
+    assert np.diag(cut.covariance) == pytest.approx(np.diag(whole.covariance), rel=0.5)
 
 
 def changed(frames: SonarFrames, **fields: object) -> SonarFrames:

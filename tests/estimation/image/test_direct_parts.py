@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mitsonar.estimation.estimator import two_frames
-from mitsonar.estimation.image.direct import LEVELS
+from mitsonar.estimation.image.direct import LEVELS, _resolved
 from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.direct_nodes import GroundNodes
@@ -17,6 +19,7 @@ from mitsonar.estimation.image.image_slopes import blurred
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 ATTITUDE = Attitude(2.5, 0.05, np.radians(35))
@@ -97,3 +100,17 @@ def test_phase_takes_the_relief() -> None:
     """As direct does, for starts over rocks."""
     estimator = create_estimator("phase", relief_m=0.2)
     assert getattr(estimator, "relief_m") == 0.2  # noqa: B009
+
+
+def test_beams_closer_than_their_width_are_averaged_first() -> None:
+    """An Oculus has four beams within the width of one: half a million cells become as many as four DIDSONs have."""
+    sonar = load_sonar("oculus-m1200d-2100khz")
+    image = np.random.default_rng(1).random((2, sonar.range_bins, sonar.beams), dtype=np.float32)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
+    fewer, images = _resolved(frames, (image[0], image[1]))
+    assert images[0].shape == (1024, 170)
+    np.testing.assert_allclose(images[1], image[1, :, :510].reshape(1024, 170, 3).mean(axis=2), atol=1e-6)
+    np.testing.assert_allclose(fewer.bearing_rad, sonar.bearing_rad[:510].reshape(170, 3).mean(axis=1))
+    np.testing.assert_array_equal(fewer.range_m, sonar.range_m)
+    few = replace(frames, image=image[..., :96], bearing_rad=sonar.bearing_rad[:96])
+    assert _resolved(few, (image[0, :, :96], image[1, :, :96]))[0] is few
