@@ -63,7 +63,7 @@ def outcome_of(path: Path) -> str:
         found = sonar_in(scene)
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            frames = Simulator(scene).render([found[1] if found else np.zeros(6)])
+            frames = Simulator(scene).render(np.array([found[1] if found else np.zeros(6)], dtype=float))
         assert np.isfinite(frames.image).all(), "the picture is not finite"
     except MitsonarError as error:
         return "refused" if 0 < len(str(error)) < 2000 else f"a refusal of {len(str(error))} letters"
