@@ -70,7 +70,7 @@ def relinked(markdown: str, source: str, place: str) -> str:
     """
 
     def link(found: re.Match[str]) -> str:
-        if "://" in found[1]:
+        if "://" in found[1] or found[1].startswith("data:"):
             return found[0]
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), found[1]))
         target = PAGES.get(target, target.removeprefix("docs/"))

@@ -23,7 +23,7 @@ from mitsonar.simulation.mirrored_link import MirroredLink
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.scatterers import Scatterers
 from mitsonar.simulation.tracing import height_below
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["DIRECT", "ChannelTracer", "EchoValues", "ScattererWay"]
 
@@ -139,7 +139,7 @@ class ChannelTracer:
     def _compile(self, receiver: int, wanted: tuple[str, ...], out: int, back: int) -> _Launch:
         """Record a receiver's launch by a number of mirrors; later calls replay it (``dr.freeze``)."""
 
-        @frozen
+        @Frozen
         def launch(index: mi.UInt32, scene: mi.Scene, table: mi.Float64, tables: DeviceArray) -> list[DeviceArray]:
             link: LinkGeometry
             if out + back == 0:

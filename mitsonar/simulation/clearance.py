@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.tracing import Tracer, free_way
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["Buried", "Clearance", "buried_in"]
 
@@ -55,7 +55,7 @@ class Clearance:
         ways = np.concatenate([np.broadcast_to(self._ways, (count, *self._ways.shape)), ahead[:, None]], axis=1)
         begin = np.concatenate([np.repeat(after[:, None], len(self._ways), axis=1), before[:, None]], axis=1)
         if count not in self._launches:
-            self._launches[count] = frozen(self._traced)
+            self._launches[count] = Frozen(self._traced)
         number = mi.Float(np.repeat(np.arange(count), ways.shape[1]).astype(np.float32).tolist())
         rays = [mi.Float(part.ravel().astype(np.float32).tolist()) for part in (begin, ways)]
         free = replayed(self._launches[count], self.tracer.scene_at(time_s), number, *rays)

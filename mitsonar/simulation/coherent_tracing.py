@@ -28,7 +28,7 @@ from mitsonar.simulation.hashed_points import LEAST_COSINE, HashedPoints, Point,
 from mitsonar.simulation.mirror_parts import Mirrors, without_mirror_part
 from mitsonar.simulation.moving_scene import SceneMotion, scene_at
 from mitsonar.simulation.moving_tracing import MovingSurfaces, surfaces_of
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["STRIP", "CoherentTracer", "FanRays", "FieldCounts", "add_waves", "elevation_gain"]
 
@@ -131,7 +131,7 @@ class CoherentTracer:
         return field, FieldCounts(*map(int, np.array(counts)))
 
     def _compile(self) -> Callable[..., Any]:
-        @frozen
+        @Frozen
         def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.fan, self.sonar, index, lines, self.side)

@@ -39,7 +39,7 @@ from mitsonar.simulation.mirror_tracing import (
 )
 from mitsonar.simulation.reflections import overlap, reflected
 from mitsonar.simulation.tracing import hidden
-from mitsonar.simulation.variant import frozen
+from mitsonar.simulation.variant import Frozen
 
 __all__ = ["CornerTracer"]
 
@@ -107,7 +107,7 @@ class CornerTracer(MirrorTracer):
     # ---------------------------------------------------------------- first launch
 
     def _compile_survey(self) -> Callable[..., Any]:
-        @frozen
+        @Frozen
         def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
             rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
             wanted: DeviceArray = mi.Float(0)

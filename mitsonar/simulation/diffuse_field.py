@@ -31,7 +31,7 @@ from mitsonar.simulation.elevation_pattern import elevation_gain_of_ends
 from mitsonar.simulation.mirror_parts import parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.moving_scene import scene_at
 from mitsonar.simulation.reflections import overlap
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["DiffuseField"]
 
@@ -92,7 +92,7 @@ class DiffuseField:
         return np.asarray(np.sqrt(-np.log(first[0])) * np.exp(2j * math.pi * second[0]), dtype=np.complex64)
 
     def _compile(self) -> Callable[..., Any]:
-        @frozen
+        @Frozen
         def launch(index: Any, scene: Any, rows: Any, tables: Any, mirrors: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.direct.fan, self.sonar, index, lines)

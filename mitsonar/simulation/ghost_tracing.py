@@ -36,7 +36,7 @@ from mitsonar.simulation.moving_tracing import MovingSurfaces
 from mitsonar.simulation.reflections import going_on, mirrored_lines, overlap
 from mitsonar.simulation.second_mirrors import SecondMirrors
 from mitsonar.simulation.tracing import hidden
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["GhostTracer", "MirroredRays", "mirrored_on"]
 
@@ -91,7 +91,7 @@ class GhostTracer:
         field.imag += np.array(imag, copy=False).reshape(field.shape)
 
     def _compile(self) -> Callable[..., Any]:
-        @frozen
+        @Frozen
         def launch(index: Any, scene: Any, rows: Any, tables: Any, patches: Any, mirrors: Any, bodies: Any) -> Any:
             lines = [[dr.gather(mi.Float64, rows, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
             rays = FanRays(self.direct.fan, self.sonar, index, lines)

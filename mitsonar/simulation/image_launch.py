@@ -18,7 +18,7 @@ from mitsonar.simulation.bounce_sums import BounceSums
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.elevation_pattern import elevation_gain
 from mitsonar.simulation.tracing import Rays, Tracer
-from mitsonar.simulation.variant import frozen
+from mitsonar.simulation.variant import Frozen
 from mitsonar.simulation.view_echoes import ViewEchoes, ViewTracer
 
 __all__ = ["ImageLaunch"]
@@ -51,7 +51,7 @@ class ImageLaunch:
         """
         tracer, bounces = self.tracer, self.bounces
 
-        @frozen
+        @Frozen
         def launch(index: Any, scene: Any, rows: Any, keys: Any, surfaces: Any, tables: Any, mirrors: Any) -> Any:
             rays = Rays(tracer.sonar, index)
             ray, fan = tracer.rays_of(rays, rows, keys)

@@ -22,7 +22,7 @@ from mitsonar.simulation.mirrored_link import PlaneRow, unfolded
 from mitsonar.simulation.nonuniform_fft import phasors
 from mitsonar.simulation.propagation_delay import delay_exact
 from mitsonar.simulation.tracing import hidden
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["APART_M", "MirrorPaths"]
 
@@ -151,7 +151,7 @@ class MirrorPaths:
 def _compile_open(length: int, wavenumber: float) -> Callable[..., list[DeviceArray]]:
     """Record the launch that follows ways by ``length`` planes from a receiver to the transmitter."""
 
-    @frozen
+    @Frozen
     def launch(number: mi.UInt32, table: mi.Float64, scene: mi.Scene) -> list[DeviceArray]:
         columns = _columns(mi.Float64, table, number, 6 + (ROW + 1) * length)
         at = columns[:3]
@@ -175,7 +175,7 @@ def _columns(kind: Any, table: DeviceArray, number: mi.UInt32, count: int) -> li
 def _compile_shadows() -> Callable[..., DeviceArray]:
     """Record the launch that tests which facets two places see."""
 
-    @frozen
+    @Frozen
     def launch(number: mi.UInt32, table: mi.Float, scene: mi.Scene) -> DeviceArray:
         columns = _columns(mi.Float, table, number, 12)
         at, normal = mi.Point3f(*columns[:3]), mi.Normal3f(*columns[3:6])

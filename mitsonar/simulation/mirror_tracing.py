@@ -44,7 +44,7 @@ from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.mirror_parts import Mirrors, parts_at, smooth_share
 from mitsonar.simulation.moving_scene import SceneMotion, scene_at
 from mitsonar.simulation.moving_tracing import surfaces_of
-from mitsonar.simulation.variant import frozen, replayed
+from mitsonar.simulation.variant import Frozen, replayed
 
 __all__ = ["LEVEL_PART", "NEIGHBOURS", "FinerRays", "MirrorTracer", "facing_share", "rows_of", "sinc"]
 
@@ -166,7 +166,7 @@ class MirrorTracer:
     # ---------------------------------------------------------------- first launch
 
     def _compile_survey(self) -> Callable[..., Any]:
-        @frozen
+        @Frozen
         def survey(index: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
             rays = FanRays(self.fan, self.sonar, index, rows_of(rows))
             hit = replace(self.surfaces, **tables).hit(scene, mi.Ray3f(rays.origin, rays.d))
@@ -230,7 +230,7 @@ class MirrorTracer:
     # ---------------------------------------------------------------- second launch
 
     def _compile_sum(self) -> Callable[..., Any]:
-        @frozen
+        @Frozen
         def launch(inputs: Any, scene: Any, rows: Any, tables: Any, table: Any) -> Any:
             rays = FinerRays(self.fan, self.sonar, inputs, rows_of(rows))
             sums = tuple(dr.zeros(mi.UInt64, self.former.sines * self.former.ranges) for _ in range(2))

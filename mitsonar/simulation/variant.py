@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import weakref
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,10 +13,10 @@ from mitsonar.errors import MitsonarError, nearest_names
 __all__ = [
     "VARIANTS",
     "Backend",
+    "Frozen",
     "backend",
     "current_variant",
     "ensure_variant",
-    "frozen",
     "release_memory",
     "replayed",
     "thread_count",
@@ -97,18 +98,40 @@ def thread_count() -> int:
     return max(1, int(dr.thread_count()))
 
 
-def frozen(launch: Callable[..., Any]) -> Callable[..., Any]:
+class Frozen:
     """Record a launch at its first call and replay it at later ones: ``dr.freeze``, for launches that evaluate BSDFs.
 
     A kernel that evaluates BSDFs holds the code of all that are alive, those of other scenes included, and Dr.Jit records it
     only if the values that they read are among the inputs. It collects these of every class of which the inputs hold a
     pointer. A scene holds pointers to shapes only, and through a shape Dr.Jit finds the shape's BSDF, but not a BSDF of
     another scene that no shape uses. Hence the pointer to a BSDF, which points at none.
-    """
-    import drjit as dr
-    import mitsuba as mi
 
-    return dr.freeze(launch, state_fn=lambda *_: mi.BSDFPtr(None))
+    For the same reason scenes must go as soon as nobody refers to them. ``dr.freeze`` makes a class for each function, and a
+    class refers to itself: what a launch holds would stay until Python collects its garbage. So Dr.Jit gets a function that
+    holds nothing.
+    """
+
+    def __init__(self, launch: Callable[..., Any]) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self._launch = launch
+        own = weakref.ref(self)
+
+        def run(*inputs: object) -> Any:
+            found = own()
+            assert found is not None, "called by its owner"
+            return found._launch(*inputs)
+
+        self._recorded: Any = dr.freeze(run, state_fn=lambda *_: mi.BSDFPtr(None))
+
+    def __call__(self, *inputs: object) -> Any:
+        """Run the launch, or replay it."""
+        return self._recorded(*inputs)
+
+    def clear(self) -> None:
+        """Forget what was recorded."""
+        self._recorded.clear()
 
 
 def replayed(launch: Any, *inputs: object) -> Any:

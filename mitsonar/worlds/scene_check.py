@@ -46,7 +46,7 @@ def check_parsed(state: mi.parser.ParserState) -> None:
 
     Raises:
         MitsonarError: a type that is no name; a number that is not finite; objects that refer to each other too often; a
-            damaged mesh or picture; a file that is none.
+            damaged mesh or picture; a file that is none; a bitmap without a file or a group of no shape.
     """
     import mitsuba as mi
 
@@ -55,6 +55,7 @@ def check_parsed(state: mi.parser.ParserState) -> None:
             refuse_foreign_format(node.props.plugin_name(), str(node.props.get("filename", "")))
     foreign_names(node.props.plugin_name() for node in state.nodes)
     _check_references(state)
+    _refuse_incomplete(state)
     pixels = 0
     for node in state.nodes:
         for name in list(node.props):
@@ -132,6 +133,20 @@ def _files(value: str, name: str) -> Iterator[Path]:
         except OSError:  # such as a name too long
             if name == "filename":
                 raise MitsonarError(f"there cannot be a file of the name {shortened(value)}") from None
+
+
+def _refuse_incomplete(state: mi.parser.ParserState) -> None:
+    """Refuse objects without what they consist of, on which Mitsuba ends the process or fails late."""
+    import mitsuba as mi
+
+    kinds = mi.Properties.Type
+    for node in state.nodes:
+        plugin, held = node.props.plugin_name(), {name: node.props.type(name) for name in node.props}
+        where = f"{plugin} {node.props.id()}".strip()[:100]
+        if plugin == "bitmap" and held.get("filename") != kinds.String:
+            raise MitsonarError(f'{where} names no file: give <string name="filename" value="..."/>')
+        if plugin == "shapegroup" and kinds.ResolvedReference not in held.values():
+            raise MitsonarError(f"{where} has no shape: put one in it, or leave it out")
 
 
 def _check_references(state: mi.parser.ParserState) -> None:

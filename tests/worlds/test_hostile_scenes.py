@@ -150,6 +150,8 @@ FILES = {
     **{f"picture {name}": SCENE.format(TEXTURED.format(name)) for name in ("ZERO", "pipe", "secret", "large.png")},
     **{f"spectrum {name}": SCENE.format(SPECTRUM.format(name)) for name in ("ZERO", "pipe", "secret", "&#112;ipe")},
     **{f"include {name}": SCENE.format(f'<include filename="{name}"/>') for name in ("ZERO", "pipe", "secret")},
+    "picture of no file": SCENE.format('<texture type="bitmap"/>'),
+    "group of no shape": SCENE.format('<shape type="shapegroup"/>'),
     "references": SCENE.format(DIFFUSE + "".join(BLEND.format(k + 1, k, k) for k in range(60))),
     "circle": SCENE.format(TWOSIDED.format("a", "b") + TWOSIDED.format("b", "a")),
     "chain": SCENE.format(DIFFUSE + "".join(TWOSIDED.format(f"b{k + 1}", f"b{k}") for k in range(3_000))),
@@ -237,3 +239,18 @@ def test_grids_and_tables_hold_what_they_promise(tmp_path: Path) -> None:
         path.write_bytes(wrong)
         with pytest.raises(MitsonarError, match=r"table .* is damaged"):
             check_tensors(path)
+
+
+@pytest.mark.thorough
+def test_mutants_of_a_scene_render_or_are_refused(tmp_path: Path) -> None:
+    """Elements, attributes and values of every kind of object changed, then a ping rendered: no other error, no hang."""
+    mutants, most = 120, 30
+    command = [sys.executable, str(Path(__file__).parent / "scene_mutants.py"), str(tmp_path), "-1", str(mutants)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False, env=environment)
+    lines = [json.loads(line) for line in done.stdout.splitlines() if "began" not in line]
+    assert done.returncode == 0, done.stdout[-300:] + done.stderr[-2000:]
+    assert len(lines) == mutants
+    assert lines[0][1] == "read"
+    assert not [line for line in lines if line[1] not in ("read", "refused") or line[2] > most]
+    assert min(sum(line[1] == kind for line in lines) for kind in ("read", "refused")) > mutants / 4
