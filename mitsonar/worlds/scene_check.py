@@ -34,6 +34,9 @@ BYTES_A_PIXEL = 28
 
 PICTURES = ("bitmap", "envmap")
 
+CONTAINERS = {"blendbsdf": "bsdf", "merge": "shape", "shapegroup": "shape", "volume": "volume"}
+"""Objects that consist of others, and of what."""
+
 REFRACTING = ("material", "int_ior", "ext_ior")
 """Properties that name a file of ``data/ior``, without its ending."""
 
@@ -46,7 +49,7 @@ def check_parsed(state: mi.parser.ParserState) -> None:
 
     Raises:
         MitsonarError: a type that is no name; a number that is not finite; objects that refer to each other too often; a
-            damaged mesh or picture; a file that is none; a bitmap without a file or a group of no shape.
+            damaged mesh or picture; a file that is none; a bitmap without a file, an empty group.
     """
     import mitsuba as mi
 
@@ -145,8 +148,8 @@ def _refuse_incomplete(state: mi.parser.ParserState) -> None:
         where = f"{plugin} {node.props.id()}".strip()[:100]
         if plugin == "bitmap" and held.get("filename") != kinds.String:
             raise MitsonarError(f'{where} names no file: give <string name="filename" value="..."/>')
-        if plugin == "shapegroup" and kinds.ResolvedReference not in held.values():
-            raise MitsonarError(f"{where} has no shape: put one in it, or leave it out")
+        if plugin in CONTAINERS and kinds.ResolvedReference not in held.values():
+            raise MitsonarError(f"{where} is empty: put a {CONTAINERS[plugin]} in it, or leave it out")
 
 
 def _check_references(state: mi.parser.ParserState) -> None:
