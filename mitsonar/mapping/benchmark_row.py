@@ -14,6 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark import Answers
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
 from mitsonar.io.run_directory import RunDirectory
+from mitsonar.mapping.benchmark_sets import PRESET
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import Odometry
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder, run_odometry
@@ -64,7 +65,8 @@ class Case:
         geometry = [] if self.geometry is None else [f"--geometry {self.geometry}"]
         if self.texture == "recorded":
             return " ".join([f"--set {self.name}", *geometry, f"--method {self.method}"])
-        return f"--set {self.name} --texture {self.texture} --noise {self.noise} --method {self.method}"
+        noise = [] if self.noise == PRESET else [f"--noise {self.noise}"]
+        return " ".join([f"--set {self.name} --texture {self.texture}", *noise, f"--method {self.method}"])
 
 
 def measured_row(

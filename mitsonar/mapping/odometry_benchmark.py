@@ -21,22 +21,21 @@ from mitsonar.io.provenance import digest, versions
 from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.whole_files import read_json, whole_lines, write_json, write_whole
 from mitsonar.mapping.benchmark_row import LENGTHS_M, Case, measured_row
-from mitsonar.mapping.benchmark_sets import NOISES, SEED, SETS, TEXTURES, Begin, RenderedSet
+from mitsonar.mapping.benchmark_sets import DIVE, NOISES, PRESET, SEED, SETS, TEXTURES, Begin, RenderedSet
 from mitsonar.mapping.benchmark_table import benchmark_lines
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_source import LOOP, Reading, open_source, record_at
 from mitsonar.records.sonar_frames import SonarFrames
 
-__all__ = ["FRAMES", "METHODS", "Wanted", "benchmark_odometry"]
-
-FRAMES = 260
-"""Frames of a simulated set: 5.2 m, so that segments of 5 m fit."""
+__all__ = ["METHODS", "Wanted", "benchmark_odometry"]
 
 METHODS = ("zero", "ecc", "phase", "flow", "direct", "corrnet", "corrnet-coherent", *EXTERNAL)
 """Rows that are made unasked, but for :data:`OTHER_GRAIN`."""
 
 OTHER_GRAIN = {"still": "corrnet-coherent", "speckle": "corrnet", "recorded": "corrnet"}
 """The network that was not trained for frames of a texture."""
+
+SET_WORDS = (DIVE, *(name for name, one in SETS.items() if one.flight is None))
 
 LARGEST_JOURNAL = 2**28
 
@@ -54,17 +53,18 @@ class Wanted:
     """Rows that are asked for: every method on every set, texture and level of noise.
 
     Attributes:
-        sets: names of :data:`~mitsonar.mapping.benchmark_sets.SETS`, or paths of recordings and runs.
+        sets: names of :data:`~mitsonar.mapping.benchmark_sets.SETS`, or paths of recordings and runs. The beginning of a name
+            up to a hyphen means all of these sets: ``dive``, ``dive-aris3000``.
         textures: of :data:`~mitsonar.mapping.benchmark_sets.TEXTURES`, for simulated sets.
-        noises: of :data:`~mitsonar.mapping.benchmark_sets.NOISES`, for simulated sets.
+        noises: of :data:`~mitsonar.mapping.benchmark_sets.NOISES`, for simulated sets; dives have their preset's.
         methods: as :func:`~mitsonar.estimation.named_estimators.create_estimator` takes them; none: :data:`METHODS`, without
             those whose packages are not installed.
-        frames: of each set at most; None: :data:`FRAMES` of a simulated one, all of a recording.
+        frames: of each set at most; None: 40 of a dive, 260 of another simulated set, all of a recording.
         geometry: file that tells how the pictures of recordings are laid out.
         bound: poses of the Cramer-Rao bound of a simulated set; 0: none.
     """
 
-    sets: Sequence[str] = tuple(SETS)
+    sets: Sequence[str] = SET_WORDS
     textures: Sequence[str] = tuple(TEXTURES)
     noises: Sequence[str] = ("none",)
     methods: Sequence[str] = ()
@@ -102,7 +102,7 @@ def benchmark_odometry(
     cells = list(_cells(wanted))
     methods, notes = _methods(wanted)
     cases = [case for cell in cells for case in _cases(cell, methods, wanted)]
-    settings = {"frames": wanted.frames or FRAMES, "limit": wanted.frames, "seed": SEED, "lengths_m": LENGTHS_M}
+    settings = {"limit": wanted.frames, "seed": SEED, "lengths_m": LENGTHS_M}
     bench = _Bench(RunDirectory.begin(out, BENCHMARK, settings, resume=resume, overwrite=overwrite), wanted)
     bench.run.start()
     known = bench.rows()
@@ -152,11 +152,17 @@ def _cells(wanted: Wanted) -> Iterator[Case]:
     if wanted.frames is not None and wanted.frames < 3:
         raise MitsonarError(f"{argument('frames')} must be at least 3: got {wanted.frames}")
     for name in dict.fromkeys(wanted.sets):
-        if name in SETS:
-            yield from (Case(name, texture, noise, "") for texture in wanted.textures for noise in wanted.noises)
+        sets = [one for one in SETS if f"{one}-".startswith(f"{name}-")]
+        if sets:
+            yield from (
+                Case(one, texture, noise, "")
+                for one in sets
+                for texture in wanted.textures
+                for noise in (wanted.noises if SETS[one].flight is None else (PRESET,))
+            )
         elif not Path(name).exists():
             raise MitsonarError(
-                f"unknown set {name!r}: {nearest_names(name, SETS)}; or give the path of a recording or a run"
+                f"unknown set {name!r}: {nearest_names(name, SET_WORDS)}; or give the path of a recording or a run"
             )
         else:
             if record_at(name) is not SonarFrames:
@@ -217,7 +223,9 @@ class _Bench:
         """Make a row; render its set where it is missing."""
         rendered = None
         if case.name in SETS:
-            rendered = RenderedSet(case.name, case.texture, case.noise, self.wanted.frames or FRAMES, self.out)
+            rendered = RenderedSet(
+                case.name, case.texture, case.noise, self.wanted.frames or SETS[case.name].frames, self.out
+            )
             source = rendered.source(begin)
         else:
             with warnings.catch_warnings(record=True) as told:
