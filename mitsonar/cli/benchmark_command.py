@@ -25,14 +25,16 @@ def odometry_benchmark(
     set_: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", help="rocks, slope, hull, or the path of a recording or a run; several times (default: those three)."
+            "--set",
+            help="dive, rocks, slope, hull, or the path of a recording or a run; several times (default: those four). "
+            "dive means 36 dives of six sonars; dive-aris3000 or dive-aris3000-gentle-3 picks some.",
         ),
     ] = None,
     texture: Annotated[
         list[str] | None, typer.Option(help="Of simulated sets: still or speckle; several times (default: both).")
     ] = None,
     noise: Annotated[
-        list[str] | None, typer.Option(help="Of simulated sets: none, low or high; several times (default: none).")
+        list[str] | None, typer.Option(help="Of rocks, slope and hull: none, low or high; several times (default: none).")
     ] = None,
     method: Annotated[
         list[str] | None,
@@ -43,7 +45,8 @@ def odometry_benchmark(
         ),
     ] = None,
     frames: Annotated[
-        int | None, typer.Option(help="Frames of each set (default: 260 of a simulated one, all of a recording).")
+        int | None,
+        typer.Option(help="Frames of each set (default: 40 of a dive, 260 of another simulated set, all of a recording)."),
     ] = None,
     geometry: Geometry = None,
     bound: Annotated[int, typer.Option(min=0, help="Poses of the Cramer-Rao bound of simulated sets; 0: none.")] = 3,

@@ -52,6 +52,20 @@ class Apart(NamedTuple):
     roll_rad: float
 
 
+NOT_APART = Apart(0.0, 0.0, 0.0)
+
+UNKNOWN_PER_S = Apart(0.06, math.radians(4.0), math.radians(3.0))
+"""How fast height [m/s], pitch and roll [rad/s] of a vehicle change on a calm day, root mean square.
+
+Heave of 4 cm in 3 s, pitch of 2 deg in 2.3 s, roll of 2 deg in 2.9 s. What nothing tells may change as fast."""
+
+UNKNOWN_MOST = Apart(0.04, math.radians(2.0), math.radians(2.0))
+"""How far they are apart in frames that are far apart in time, root mean square."""
+
+COARSE = 12
+"""Ranges and bearings at which the apparent motion of a heave, a pitch and a roll is computed."""
+
+
 @dataclass(frozen=True)
 class Attitude:
     """Height and attitude of the sonar over the visible surface.
@@ -67,6 +81,7 @@ class Attitude:
         first: height by first echoes; None where they do not show it, or contradict the height as given.
         doubt: how first echoes contradict the height as given, which counts nevertheless; empty where they do not.
         apart: height, pitch and roll of each frame, less their mean; empty where they are not known, or all the same.
+        unsure: standard deviation of their change from one frame to the other; 0 where it is known.
     """
 
     height_m: float
@@ -79,6 +94,7 @@ class Attitude:
     given_m: float | None = None
     first: FirstEchoes | None = None
     apart: tuple[Apart, ...] = ()
+    unsure: Apart = NOT_APART
 
     @property
     def floor_m(self) -> float:
@@ -97,8 +113,22 @@ class Attitude:
 
     def of_frame(self, number: int, lift_m: float = 0.0) -> tuple[float, float, float]:
         """Return height [m], pitch and roll [rad] of one of the frames, over ground that is raised by ``lift_m``."""
-        apart = self.apart[number] if self.apart else Apart(0.0, 0.0, 0.0)
+        apart = self.apart[number] if self.apart else NOT_APART
         return self.height_m + apart.height_m - lift_m, self.pitch_rad + apart.pitch_rad, self.roll_rad + apart.roll_rad
+
+    def widened(self, covariance: NDArray[np.float64], frames: SonarFrames, heave: bool = True) -> NDArray[np.float64]:
+        """Return the covariance of a motion ``(3, 3)`` with what unknown heave, pitch and roll add.
+
+        Args:
+            covariance: of sideways, forward [m], yaw [rad], were height and attitude the same in both frames.
+            frames: both.
+            heave: whether heave counts; not where it was estimated.
+        """
+        std = np.array(self.unsure) * [heave, 1, 1]
+        if not std.any():
+            return covariance
+        seen = self.ground(frames).motions_of_lean(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
+        return np.asarray(covariance + seen @ seen.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:
         """Return the level ground that the cells show, of the mean of the frames or of one of them."""
@@ -123,7 +153,8 @@ def attitude_of(
     Raises:
         MitsonarError: no pitch; a height neither given nor measured, or not above 0 or the relief.
     """
-    lean = _mean_lean(frames)
+    leans = _leans(frames)
+    lean = None if leans is None else leans.mean(axis=0)
     pitch = pitch_rad if pitch_rad is not None else (None if lean is None else float(lean[0]))
     given = height_m if height_m is not None else _mean(frames.height_m)
     if pitch is None or (given is None and relief_m is not None):
@@ -141,7 +172,7 @@ def attitude_of(
     if given is not None and relief_m is not None:
         if not given - relief_m > 0:
             raise MitsonarError(f"the height over the visible surface must be above 0: got {given:g} m less {relief_m:g} m")
-        return Attitude(given - relief_m, STD_MEASURED * given, pitch, roll)
+        return Attitude(given - relief_m, STD_MEASURED * given, pitch, roll, apart=_apart(frames), unsure=_unsure(frames))
     found = echo_heights(frames, pitch, roll)
     if given is None and found.first is None:
         raise MitsonarError(
@@ -151,7 +182,7 @@ def attitude_of(
     attitude = (
         _over_rising(found, given, pitch, roll) if _rises(found, given) else _over_level(found.first, given, pitch, roll)
     )
-    return replace(attitude, apart=_apart(frames))
+    return replace(attitude, apart=_apart(frames), unsure=_unsure(frames))
 
 
 def _rises(found: EchoHeights, given_m: float | None) -> bool:
@@ -195,19 +226,33 @@ def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, 
 
 
 def _apart(frames: SonarFrames) -> tuple[Apart, ...]:
-    """Return height, pitch and roll of each frame less their mean, by the poses; empty where they are all the same."""
-    if frames.poses is None or not np.isfinite(frames.poses[:, 2:5]).all():
+    """Return height, pitch and roll of each frame less their mean; empty where they are not known, or all the same."""
+    leans = _leans(frames)
+    if leans is None:
         return ()
-    apart = frames.poses[:, 2:5] - frames.poses[:, 2:5].mean(axis=0)
+    heights = np.zeros(len(leans)) if frames.poses is None else np.nan_to_num(frames.poses[:, 2])
+    known = np.column_stack([heights, leans])
+    apart = known - known.mean(axis=0)
     return () if (np.abs(apart) < SAME).all() else tuple(Apart(*(float(value) for value in row)) for row in apart)
 
 
-def _mean_lean(frames: SonarFrames) -> NDArray[np.float64] | None:
-    """Return the mean of pitch and roll ``(2,)``, by the poses or by the sonar's own sensors; None where unknown."""
+def _unsure(frames: SonarFrames) -> Apart:
+    """Return how far the frames may be apart in what nothing tells. One pitch and roll for all frames tells no change."""
+    time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
+    step_s = abs(float(time_s[-1] - time_s[0]))
+    leans = _leans(frames)
+    heave = frames.poses is not None and bool(np.isfinite(frames.poses[:, 2]).all())
+    lean = leans is not None and (heave or bool((np.abs(leans - leans[0]) > SAME).any()))
+    rates = zip(UNKNOWN_PER_S, UNKNOWN_MOST, (heave, lean, lean), strict=True)
+    return Apart(*(0.0 if known else min(rate * step_s, most) for rate, most, known in rates))
+
+
+def _leans(frames: SonarFrames) -> NDArray[np.float64] | None:
+    """Return pitch and roll of each frame ``(frames, 2)``, by the poses or the sonar's own sensors; None where unknown."""
     table, columns = (frames.attitude_rad, slice(0, 2)) if frames.poses is None else (frames.poses, slice(3, 5))
     if table is None or not np.isfinite(table[:, columns]).all():
         return None
-    return np.asarray(table.mean(axis=0)[columns])
+    return np.asarray(table[:, columns])
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:

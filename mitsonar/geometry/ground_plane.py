@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -15,6 +15,9 @@ from mitsonar.instruments.imaging_sonar import Bearing
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
 __all__ = ["GroundGeometry", "arc_elevation", "moved", "nearest_known"]
+
+SMALL = 1e-4
+"""Step of differences [m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,35 @@ class GroundGeometry:
         else:
             turning = (aside - (s / radius) * along) / np.sqrt(radius * radius - s * s)
         return np.stack([along, turning], axis=-1)
+
+    def motions_of_lean(self, along: int, half_rad: float) -> NDArray[np.float64]:
+        """Compute the motions that a change of height, pitch and roll looks like from one ping to the next.
+
+        The motion that moves the lit ground's ranges and bearings most alike, by least squares: ranges in bins, bearings in
+        beams.
+
+        Args:
+            along: how many ranges and bearings of the cells count.
+            half_rad: half the opening of the beams, which limits the lit ground [rad].
+
+        Returns:
+            Sideways, forward [m], yaw [rad] a metre of height, a radian of pitch and of roll, as columns ``(3, 3)``; 0 where
+            the ground that is lit does not tell a motion.
+        """
+        bin_m, beam_rad = (float(np.median(np.abs(np.diff(axis)))) for axis in (self.range_m, self.bearing_rad))
+        ranges, bearings = (np.linspace(axis[0], axis[-1], along) for axis in (self.range_m, self.bearing_rad))
+        few = replace(self, range_m=ranges, bearing_rad=bearings)
+        lit = np.isfinite(few.points).all(axis=-1) & (np.abs(few.elevation(few.points)) <= half_rad)
+        if lit.sum() < 3:
+            return np.zeros((3, 3))
+        scale, points = np.array([bin_m, beam_rad]), few.points[lit]
+        by_motion = few.derivative[lit] / scale[:, None]
+        changes = []
+        for name in ("height_m", "pitch_rad", "roll_rad"):
+            ends = [replace(few, **{name: getattr(few, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
+            changes.append((np.stack(ends[1], axis=-1) - np.stack(ends[0], axis=-1)) / (2 * SMALL) / scale)
+        found = np.linalg.lstsq(by_motion.reshape(-1, 3), np.stack(changes, axis=-1).reshape(-1, 3), rcond=None)[0]
+        return np.asarray(found)
 
     def _in_sonar(self, points: NDArray[np.floating]) -> tuple[NDArray[np.floating], ...]:
         """Return starboard, forward, up of ground points in the sonar's own axes."""

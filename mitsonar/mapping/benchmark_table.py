@@ -1,12 +1,15 @@
-"""The tables of the odometry benchmark as Markdown: drift of all, then a part for each set, texture and noise."""
+"""The tables of the odometry benchmark as Markdown: dives, drift of the other sets, then a part for each of these."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
 
+import numpy as np
+
 from mitsonar.estimation.benchmark_tables import Cells, markdown
 from mitsonar.estimation.estimator import PlainTable
+from mitsonar.mapping.benchmark_sets import DIVE
 from mitsonar.motion.motion_errors import AXES
 
 __all__ = ["benchmark_lines"]
@@ -19,8 +22,46 @@ UNITS = " / ".join(f"{axis.name} {axis.unit}" for axis in AXES)
 
 def benchmark_lines(rows: Sequence[PlainTable]) -> list[str]:
     """Return the rows, in their order, as lines of Markdown."""
-    parts = [list(group) for _, group in groupby(rows, key=_cell)]
-    return [*_overview(parts), *(line for part in parts for line in _part(part))]
+    dives = [row for row in rows if row["set"].startswith(f"{DIVE}-")]
+    parts = [list(group) for _, group in groupby([row for row in rows if row not in dives], key=_cell)]
+    return [*_dives(dives), *_overview(parts), *(line for part in parts for line in _part(part))]
+
+
+def _dives(rows: Sequence[PlainTable]) -> Iterator[str]:
+    """Yield a table a method: a line a sonar, texture and flight, over the worlds of these."""
+    for method in dict.fromkeys(row["method"] for row in rows):
+        flown: dict[tuple[str, str, str], list[PlainTable]] = {}
+        for row in rows:
+            if row["method"] == method:
+                preset, flight = _flown(row["set"])
+                flown.setdefault((preset, row["texture"], flight), []).append(row)
+        worlds = max(len(of) for of in flown.values())
+        yield from ("", f"**Dives, {method}**: RMSE and bound: {UNITS}; of {worlds} worlds, drift is the median", "")
+        yield from markdown([_dive(*key, of) for key, of in flown.items()], tuple(DIVE_CELLS), DIVE_CELLS)
+
+
+def _flown(name: str) -> tuple[str, str]:
+    """Return preset and flight of a dive's name."""
+    preset, flight, _ = name.removeprefix(f"{DIVE}-").rsplit("-", 2)
+    return preset, flight
+
+
+def _dive(preset: str, texture: str, flight: str, rows: Sequence[PlainTable]) -> PlainTable:
+    """Return the line of a dive from the rows of its worlds."""
+    known = [row for row in rows if "path_m" in row]
+    line: PlainTable = {"sonar": preset, "texture": texture, "flight": flight, "pairs": sum(row["pairs"] for row in rows)}
+    line |= {"failures": sum(row["failures"] for row in rows), "ms": float(np.median([row["ms"] for row in rows]))}
+    if not known:
+        return line
+    for name in ("rmse", "bound"):
+        if all(row.get(name) is not None for row in known):
+            line[name] = np.sqrt(np.mean([np.square(row[name]) for row in known], axis=0)).tolist()
+    tried = [(row["nees"], row["pairs"] - row["failures"]) for row in known if row.get("nees") is not None]
+    if tried:
+        line["nees"] = float(np.average([nees for nees, _ in tried], weights=[count for _, count in tried]))
+    drifts = [row["end_percent"] for row in known if row["end_percent"] is not None]
+    line["end_percent"] = float(np.median(drifts)) if drifts else None
+    return line
 
 
 def _overview(parts: list[list[PlainTable]]) -> Iterator[str]:
@@ -107,6 +148,18 @@ CELLS: Cells = {
     "closure": lambda row: _three(row["closure"]) if "closure" in row else "-",
     "fail": lambda row: f"{row['failures']} of {row['pairs']}",
     "ms": lambda row: f"{row['ms']:.0f}",
+}
+
+DIVE_CELLS: Cells = {
+    "sonar": lambda row: str(row["sonar"]),
+    "texture": lambda row: str(row["texture"]),
+    "flight": lambda row: str(row["flight"]),
+    "rejected": lambda row: f"{row['failures']} of {row['pairs']}",
+    "RMSE": CELLS["RMSE"],
+    "bound": lambda row: _three(row["bound"]) if "bound" in row else "-",
+    "NEES": lambda row: "-" if row.get("nees") is None else f"{row['nees']:.2f}",
+    "drift %": lambda row: "-" if row.get("end_percent") is None else f"{row['end_percent']:.2f}",
+    "ms": CELLS["ms"],
 }
 
 COLUMNS = ("method", "drift %", "drift deg / 100 m", "end %", "RMSE", "/ bound", "nees", "fail", "ms")

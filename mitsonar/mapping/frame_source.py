@@ -217,7 +217,8 @@ class FrameSource:
     def read(self, index: ArrayLike) -> SonarFrames:
         """Read frames of these numbers ``(n,)`` as estimators may use them.
 
-        Their poses have height, pitch and roll, but position and heading 0, so that no truth can leak.
+        Their poses have height, pitch and roll, but position and heading 0, so that no truth can leak. Where only pitch and
+        roll are known, the height is nan.
 
         Raises:
             MitsonarError: frames that are not there, or pixels that cannot be read.
@@ -234,11 +235,14 @@ class FrameSource:
         if self.noise is not None:
             numbers = chosen.astype(np.int64) + self.first_number
             image = self.noise.apply(to_float32(image), seed=self.seed, frames=numbers)
+        poses = self.attitudes(chosen)
+        if poses is not None and self.poses is None:
+            poses[:, 2] = np.nan
         frames = replace(
             self.like,
             image=image,
             time_s=self.time_s[chosen],
-            poses=self.attitudes(chosen),
+            poses=poses,
             attitude_rad=None,
             height_m=None if self.height_m is None else self.height_m[chosen],
         )

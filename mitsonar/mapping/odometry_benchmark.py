@@ -53,8 +53,8 @@ class Wanted:
     """Rows that are asked for: every method on every set, texture and level of noise.
 
     Attributes:
-        sets: names of :data:`~mitsonar.mapping.benchmark_sets.SETS`, or paths of recordings and runs. The beginning of a name
-            up to a hyphen means all of these sets: ``dive``, ``dive-aris3000``.
+        sets: names of :data:`~mitsonar.mapping.benchmark_sets.SETS`, or paths of recordings and runs. The beginning
+            of a name up to a hyphen means all of these sets: ``dive``, ``dive-aris3000``.
         textures: of :data:`~mitsonar.mapping.benchmark_sets.TEXTURES`, for simulated sets.
         noises: of :data:`~mitsonar.mapping.benchmark_sets.NOISES`, for simulated sets; dives have their preset's.
         methods: as :func:`~mitsonar.estimation.named_estimators.create_estimator` takes them; none: :data:`METHODS`, without

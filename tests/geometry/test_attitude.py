@@ -6,10 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_frames import over_ground
 from helpers import lit_plane
 
-from mitsonar.geometry.attitude import STD_GIVEN, STD_MEASURED, attitude_of
+from mitsonar.estimation.named_estimators import create_estimator
+from mitsonar.geometry.attitude import STD_GIVEN, STD_MEASURED, UNKNOWN_MOST, UNKNOWN_PER_S, attitude_of
+from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.motion.trajectory import Trajectory
 
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)
 SONAR = Sonar(range_min=2.0, range_max=7.0, range_bins=800)
@@ -113,3 +117,49 @@ def test_each_frame_has_its_own_height_pitch_and_roll() -> None:
     )
     assert found.ground(frames, 1).pitch_rad == pytest.approx(0.62)
     assert found.ground(frames).pitch_rad == pytest.approx(0.61)
+
+
+@pytest.mark.parametrize(
+    ("axis", "change", "within"), [(2, 0.006, 0.25), (3, np.radians(0.4), 0.25), (4, np.radians(0.3), 1.0)]
+)
+def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, change: float, within: float) -> None:
+    """Frames that heave, pitch or roll, registered as if they did not: the error is the one that the covariance expects.
+
+    Of a roll by its size only: sideways and yaw share it as the frames' own contrast decides.
+    """
+    poses = np.tile([0.0, 0.0, 2.5, np.radians(35), 0.0, 0.0], (2, 1))
+    poses[1, axis] += change
+    frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])))
+    estimator = create_estimator("direct")
+    known = estimator.estimate(frames)
+    blind = poses.mean(axis=0, keepdims=True).repeat(2, axis=0)
+    blind[:, 2] = np.nan
+    unknown = estimator.estimate(replace(frames, poses=blind))
+    assert known.covariance is not None
+    assert unknown.covariance is not None
+    attitude = attitude_of(replace(frames, poses=blind), "a test", None, None)
+    seen = attitude.ground(frames).motions_of_lean(12, np.radians(frames.sonar.elevation_fov_deg) / 2)[:, axis - 2] * change
+    error = np.array(unknown.motion) - np.array(known.motion)
+    np.testing.assert_allclose(error, seen, atol=within * np.abs(seen).max() + 2e-4)
+    assert (np.linalg.eigvalsh(unknown.covariance - known.covariance) > -1e-9).all()
+
+
+def test_heave_looks_like_a_step_along_the_grazing_ray() -> None:
+    """Of a single range and a single beam, in closed form: d forward = -h / x d height."""
+    narrow = GroundGeometry(np.array([4.0, 4.001]), np.array([-1e-6, 1e-6]), "azimuth", 2.4, np.radians(35))
+    seen = narrow.motions_of_lean(2, np.radians(7))
+    assert seen[1, 0] == pytest.approx(-2.4 / 3.2, rel=1e-3)
+
+
+def test_what_is_known_does_not_widen() -> None:
+    frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
+    frames = replace(frames, time_s=np.array([0.0, 0.1]))
+    poses = np.tile([0.0, 0.0, HEIGHT_M, PITCH_RAD, 0.0, 0.0], (2, 1))
+    told = poses * [0, 0, np.nan, 1, 1, 0]
+    by_sensors = told + np.array([[0, 0, 0, 0, 0, 0], [0, 0, 0, 0.001, 0, 0]])
+    heave, pitch, roll = (0.1 * rate for rate in UNKNOWN_PER_S)
+    for table, unsure in ((poses, (0, 0, 0)), (by_sensors, (heave, 0, 0)), (told, (heave, pitch, roll))):
+        found = attitude_of(replace(frames, poses=table), "a test", None, None)
+        assert found.unsure == pytest.approx(unsure)
+    slow = attitude_of(replace(frames, poses=told, time_s=np.array([0.0, 9.0])), "a test", None, None)
+    assert slow.unsure == UNKNOWN_MOST

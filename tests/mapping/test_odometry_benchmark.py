@@ -20,7 +20,7 @@ from mitsonar.estimation.zero import Zero
 from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.mapping import benchmark_row, benchmark_sets, odometry_benchmark, odometry_run
 from mitsonar.mapping.benchmark_row import Case, measured_row
-from mitsonar.mapping.benchmark_sets import SETS, STEP_M, RenderedSet, benchmark_course
+from mitsonar.mapping.benchmark_sets import SETS, STEP_M, RenderedSet, benchmark_course, dive_course
 from mitsonar.mapping.benchmark_table import benchmark_lines
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
@@ -79,6 +79,8 @@ def test_a_set_stands_where_its_sonar_sees_the_ground() -> None:
     """The height over a slope follows the course; the path has the length of its steps."""
     for name, one in SETS.items():
         path = one.path(260, 20.0)
+        if one.flight is not None:
+            continue
         height = path.poses[:, 2] - np.tan(np.radians(one.slope_deg)) * path.poses[:, 1]
         assert (height > 0.3).all(), name
         assert path_length(path) == pytest.approx(259 * STEP_M)
@@ -86,6 +88,47 @@ def test_a_set_stands_where_its_sonar_sees_the_ground() -> None:
         levels = [one.sonar("speckle", noise).noise_level_db for noise in ("none", "low", "high")]
         assert levels[:2] == [None, load_sonar(one.preset).noise_level_db]
         assert levels[2] == pytest.approx(float(levels[1] or 0) + one.raised_db)
+
+
+def test_a_dive_moves_as_on_a_calm_day() -> None:
+    level, gentle = (SETS[f"dive-aris3000-{flight}-11"].path(400, 20.0) for flight in ("level", "gentle"))
+    assert path_length(level) == pytest.approx(399 * 0.04)
+    np.testing.assert_allclose(level.poses[:, [0, 4, 5]], 0, atol=1e-12)
+    np.testing.assert_allclose(np.diff(level.time_s), 0.1)
+    vehicle = dive_course(400, 10.0, 11, 1.0)
+    np.testing.assert_allclose(np.ptp(vehicle, axis=0)[2:] / 2, [0.04, *np.radians([2, 2, 8])], rtol=0.02)
+    np.testing.assert_allclose(np.linalg.norm(motions(vehicle)[:, :2], axis=1), 0.04)
+    np.testing.assert_allclose(gentle.poses[:, :2], vehicle[:, :2])
+    assert not np.allclose(SETS["dive-aris3000-gentle-3"].path(400, 20.0).poses, gentle.poses)
+
+
+def test_a_dive_has_its_presets_own_settings() -> None:
+    for name, one in SETS.items():
+        if one.flight is not None:
+            kept = load_sonar(one.preset)
+            made = one.sonar("speckle", "preset")
+            assert (made.model, made.quality, made.noise_level_db) == ("coherent", kept.quality, kept.noise_level_db), name
+            assert made.coding == kept.coding
+
+
+def test_dives_are_a_table_over_their_worlds() -> None:
+    """Failures add up, squared errors and NEES are means, drift is the median."""
+    row = {"texture": "still", "noise": "preset", "method": "direct", "frames": 40, "pairs": 39, "note": "", "path_m": 1.5}
+    rows = [
+        row | {"set": f"dive-didson300-level-{seed}", "failures": seed == 3, "rmse": [rmse, 0.5, 0.01], "nees": nees}
+        | {"bound": [0.1, 0.1, 0.001], "end_percent": drift, "ms": 20.0}
+        for seed, rmse, nees, drift in ((3, 3.0, 1.0, 0.5), (11, 4.0, 2.0, 0.9), (20, 0.0, 0.5, 2.5))
+    ]  # fmt: skip
+    lost = {name: value for name, value in rows[0].items() if name not in ("path_m", "rmse", "nees", "bound", "end_percent")}
+    lost |= {"set": "dive-didson300-gentle-3", "failures": 39}
+    lines = [" ".join(line.split()) for line in benchmark_lines([*rows, lost])]
+    nees = (38 * 1.0 + 39 * 2.0 + 39 * 0.5) / 116
+    rms = np.sqrt(25 / 3)
+    assert (
+        f"| didson300 | still | level | 1 of 117 | {rms:.2f} / 0.50 / 0.010 | 0.10 / 0.10 / 0.001 | {nees:.2f} | 0.90 | 20 |"
+    ) in lines
+    assert "| didson300 | still | gentle | 39 of 39 | - | - | - | - | 20 |" in lines
+    assert sum("still" in line for line in lines) == 2
 
 
 def test_a_slope_turns_all_of_a_world() -> None:
@@ -292,6 +335,23 @@ def test_what_cannot_be_made_is_one_sentence(mitsonar: Command, options: list[st
     assert reason in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "bench").exists()
+
+
+def test_a_word_before_a_hyphen_means_all_such_sets(tmp_path: Path, monkeypatch: Any) -> None:
+    asked: list[str] = []
+
+    def measured(self: Any, case: Case, *_: Any) -> Row:
+        asked.append(case.name)
+        raise MitsonarError("not rendered")
+
+    monkeypatch.setattr(odometry_benchmark._Bench, "measure", measured)
+    benchmark_odometry(Wanted(("dive-gemini-720is",), ("still",), methods=("zero",)), tmp_path / "few")
+    flown = [f"dive-gemini-720is-{flight}-{seed}" for flight in ("level", "gentle") for seed in (3, 11, 20)]
+    assert asked == flown
+    asked.clear()
+    benchmark_odometry(Wanted(methods=("zero",)), tmp_path / "all")
+    assert len(asked) == 2 * (36 + 3)
+    assert {"rocks", *flown} < set(asked)
 
 
 def small_hull(self: ShipHull, seed: int) -> World:

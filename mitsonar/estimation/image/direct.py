@@ -244,7 +244,9 @@ class Direct:
         height = fit.by_height[:3] * task.attitude.height_std_m
         covariance = model * fit.covariance[:3, :3] + np.outer(height, height)
         motion = Motion(*(float(x) for x in v))
-        reason = _rejection(fit, covariance, v - np.array(start)) or prior_rejection(motion, covariance, task.prior)
+        reason = _rejection(fit, covariance, v - np.array(start))
+        covariance = task.attitude.widened(covariance, task.frames, heave=not self.heave_std_m)
+        reason = reason or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about, **task.attitude.about}
         if fit.excess != UNMEASURED:
             about["stands_out"] = stands_out(fit.independent, fit.excess)

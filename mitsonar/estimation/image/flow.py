@@ -133,7 +133,8 @@ class Flow:
         blocks = _blocks(fit.structure)
         reason = attitude.reason or _rejection(fit, blocks, unseen)
         about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen, **attitude.about}
-        return Estimate(Motion(*(float(x) for x in v)), fit.covariance, not reason, reason, about)
+        covariance = None if fit.covariance is None else attitude.widened(fit.covariance, frames)
+        return Estimate(Motion(*(float(x) for x in v)), covariance, not reason, reason, about)
 
     def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
         """Run rounds of flow and match from a start; None where there is nothing to match."""

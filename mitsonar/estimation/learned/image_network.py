@@ -156,7 +156,7 @@ class ImageNetwork(Trained):
         found = self._from(frames, images, ground, None if prior is None else prior.motion)
         if found.covariance is not None and _correlation_of_answer(images, ground, found.motion) < NOISY:
             found = self._again(frames, images, ground, found)
-        found = self._judged(found, prior, "zero" if prior is None else "prior", attitude, ground)
+        found = self._judged(frames, found, prior, "zero" if prior is None else "prior", attitude, ground)
         doubtful = found.valid and _correlation_of_answer(images, ground, found.motion) < LEAST_AT_BEST
         is_near = prior is not None and not self._rejection_of_size(Motion(*(3 * prior.std)))
         if is_near or (found.valid and not doubtful):
@@ -167,17 +167,24 @@ class ImageNetwork(Trained):
         second = self._from(frames, images, ground, elsewhere.motion)
         if self._rejection_of_size(second.motion, elsewhere.motion):  # phase errs by more than training's motions
             second = self._from(frames, images, ground, second.motion)
-        second = self._judged(second, prior, "phase", attitude, ground)
+        second = self._judged(frames, second, prior, "phase", attitude, ground)
         if doubtful and (not second.valid or _correlation_of_answer(images, ground, second.motion) < LEAST_AT_BEST):
             return found
         return second
 
     def _judged(
-        self, found: Estimate, prior: MotionPrior | None, named: str, attitude: Attitude, ground: Ground
+        self,
+        frames: SonarFrames,
+        found: Estimate,
+        prior: MotionPrior | None,
+        named: str,
+        attitude: Attitude,
+        ground: Ground,
     ) -> Estimate:
         """Return an estimate that names its start, with the covariance of motions beyond training where it is one.
 
-        Heights less certain than those of training join it. It is rejected where it contradicts a prior.
+        Heights less certain than those of training join it, and unknown heave, pitch and roll. It is rejected where it
+        contradicts a prior.
         """
         covariance = found.covariance
         if covariance is not None:
@@ -186,6 +193,7 @@ class ImageNetwork(Trained):
             if unsure > 0:
                 by_height = _by_height(ground, found.motion)
                 covariance = covariance + unsure * np.outer(by_height, by_height)
+            covariance = attitude.widened(covariance, frames)
         reason = found.reason or prior_rejection(found.motion, covariance, prior)
         return replace(
             found,

@@ -195,7 +195,9 @@ class Trained:
         trained_at = self._checkpoint.trained_at
         low, high = trained_at["height_m"]
         heights = [np.nanmean(frames.height_m)] if frames.height_m is not None and np.isfinite(frames.height_m).any() else []
-        if heights and frames.poses is not None:  # over z = 0: straight below there may be a rock
+        if (
+            heights and frames.poses is not None and np.isfinite(frames.poses[:, 2]).all()
+        ):  # over z = 0: straight below there may be a rock
             heights.append(frames.poses[:, 2].mean())
         if heights and not any(low * (1 - HEIGHT_OFF) <= height <= high * (1 + HEIGHT_OFF) for height in heights):
             return f"the sonar stood at {heights[0]:.2f} m: {self._checkpoint.fixed} are fixed by training"
