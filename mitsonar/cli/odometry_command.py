@@ -69,7 +69,7 @@ def odometry(
         int | None,
         typer.Option(
             help="Motions over which loops are closed; covariances are raised to what they leave over. 0: none. Default: 8 "
-            "with contrast, else 0."
+            "with contrast, half the motions where there are fewer than 16, else 0."
         ),
     ] = None,
     sensors: Annotated[

@@ -141,8 +141,9 @@ def views_for(where: str, views: tuple[str, ...], kind: str, reading: Reading) -
 
 
 def usual_loop(source: Source) -> int:
-    """Return over how many motions loops are closed where the user does not tell it; 0: none."""
-    return 0 if source.contrast is None else LOOP
+    """Return over how many motions loops are closed where the user does not say; 0: none. Short records have short loops."""
+    half = (len(source) - 1) // 2
+    return 0 if source.contrast is None or half < 2 else min(LOOP, half)
 
 
 def _views_of(where: str, estimator: ViewReader, reading: Reading) -> ViewSource:
