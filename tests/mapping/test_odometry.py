@@ -418,10 +418,10 @@ def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
 
 def test_loops_are_closed_of_contrast_unless_told() -> None:
     """Over eight motions, or half of them where there are fewer than sixteen."""
-    for frames, motions in ((20, 8), (12, 5), (6, 2), (4, 0)):
+    for frames, steps in ((20, 8), (12, 5), (6, 2), (4, 0)):
         source = FrameSource.of(over_ground(sway(frames)))
         assert usual_loop(source) == 0
-        assert usual_loop(source.with_contrast(LocalContrast())) == motions
+        assert usual_loop(source.with_contrast(LocalContrast())) == steps
 
 
 def test_the_attitude_of_a_long_recording_is_its_own(tmp_path: Path) -> None:
