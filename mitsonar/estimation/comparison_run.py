@@ -32,6 +32,7 @@ from mitsonar.estimation.benchmark import (
 )
 from mitsonar.estimation.benchmark_tables import FEWEST_SCENES, Comparison
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
+from mitsonar.estimation.external.own_estimator import OwnEstimator
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
 from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
 from mitsonar.io.provenance import digest, versions
@@ -207,13 +208,20 @@ def _methods(estimators: str | Sequence[EstimatorLike] | Mapping[str, EstimatorL
         estimators = [text for text in dict.fromkeys(estimators.split(",")) if text]
     methods: dict[str, AnyEstimator] = {}
     for one in estimators:
-        name = (
-            os.fspath(one) if isinstance(one, str | os.PathLike) else (one if isinstance(one, type) else type(one)).__name__
-        )
+        name = _name_of(one)
         if name in methods:
             raise MitsonarError(f"two estimators are named {name}: give a dictionary, with a name for each")
         methods[name] = create_estimator(one)
     return methods
+
+
+def _name_of(estimator: EstimatorLike) -> str:
+    """Return the name of a row: a text as it is, the class of anything else, be it wrapped or not."""
+    if isinstance(estimator, OwnEstimator):
+        return estimator.path
+    if isinstance(estimator, str | os.PathLike):
+        return os.fspath(estimator)
+    return (estimator if isinstance(estimator, type) else type(estimator)).__name__
 
 
 def _settings(bench: Bench, asked: _Asked) -> PlainTable:

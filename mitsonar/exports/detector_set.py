@@ -79,7 +79,8 @@ def detector_recipe(
     if views.frames < parts:
         raise MitsonarError(f"--frames must be at least {parts}, one for each part of --split: got {views.frames}")
     of_recipe = str(scene).lower().endswith((".yaml", ".yml")) or str(scene) in shipped_recipes()
-    fields, rules, notes = _of_recipe(str(scene), views) if of_recipe else _of_scene(str(scene), views, sonar)
+    chosen = "sonar.range_max" in (changes or {})
+    fields, rules, notes = _of_recipe(str(scene), views) if of_recipe else _of_scene(str(scene), views, sonar, chosen)
     if of_recipe and sonar is not None:
         fields["sonar"] = _sonar_fields(sonar)
     flight = fields["flight"]
@@ -126,8 +127,10 @@ def _of_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, s
     return fields, [(shape, "") for shape in ground if shape in recipe.family(0).build(0).shape_names], []
 
 
-def _of_scene(name: str, views: DetectorViews, sonar: str | None) -> tuple[Keys, list[tuple[str, str]], list[str]]:
-    """Return the keys of a recipe of a scene file."""
+def _of_scene(
+    name: str, views: DetectorViews, sonar: str | None, chosen: bool
+) -> tuple[Keys, list[tuple[str, str]], list[str]]:
+    """Return the keys of a recipe of a scene file; the window is cut to the ground unless the user has chosen it."""
     path = find_scene(name).resolve()
     loaded = load_scene(path)
     names, boxes = shape_names_in(loaded), shape_boxes_in(loaded)
@@ -151,7 +154,7 @@ def _of_scene(name: str, views: DetectorViews, sonar: str | None) -> tuple[Keys,
         raise MitsonarError(f"{path} has no sensor of type imaging_sonar: name a sonar, --sonar oculus-m750d-1200khz")
     left_out = list(dict.fromkeys(name for name, flat in zip(names, ground, strict=True) if flat))
     notes = [f"ground, without a class: {', '.join(left_out)}"]
-    keys, note = _within(instrument, keys, size)
+    keys, note = (keys, []) if chosen else _within(instrument, keys, size)
     fields: Keys = {
         "name": path.stem,
         "about": f"views of {path.name} for a detector",

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -219,6 +220,15 @@ def test_a_collada_file_without_its_package_names_the_extra(
 STAYS = "what is whole on disk stays, and the same command"
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Whoever runs the tests in the background may have had Ctrl-C ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_ends_a_command_with_a_sentence(
     number: signal.Signals, code: int, capfd: pytest.CaptureFixture[str]
@@ -262,6 +272,7 @@ def test_a_signal_ends_a_child_that_a_command_has_forked() -> None:
     assert run_python(script) == f"{int(signal.SIGTERM)}\n"
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar: Command, tmp_path: Path) -> None:
     words = ["render", "objects", "--sonar", "didson300", "--model", "physical", "--quality", "draft", "-o", "run"]

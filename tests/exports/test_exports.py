@@ -25,6 +25,7 @@ from mitsonar.exports.named_exports import export_to
 from mitsonar.exports.run_length import compressed, runs_of
 from mitsonar.geometry.scan_conversion import nearest_cells
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.frame_store import FrameStore
@@ -572,6 +573,17 @@ def test_views_of_a_scene_are_clear_of_its_objects_and_drawn_in_pitch(tmp_path: 
     assert len(np.unique(plan.poses, axis=0)) == 60
     again, _, _ = detector_recipe(tmp_path / "scene.xml", views, "oculus-m750d-1200khz")
     np.testing.assert_array_equal(Plan.of(again).poses, plan.poses)
+
+
+def test_a_window_is_cut_to_the_ground_unless_it_is_chosen(tmp_path: Path, variant: str) -> None:
+    (tmp_path / "scene.xml").write_text(SCENE)
+    named = tmp_path / "scene.xml", DetectorViews(6, heights=(0.6, 1.8)), "oculus-m750d-750khz"
+    cut, _, notes = detector_recipe(*named)
+    assert cut.instrument.range_max < 20
+    assert any("so that fans fit into" in note for note in notes)
+    chosen, _, notes = detector_recipe(*named, {"sonar.range_max": 3.0})
+    assert (chosen.instrument.range_max, chosen.instrument.range_bins) == (3.0, load_sonar(named[2]).range_bins)
+    assert not any("so that fans fit into" in note for note in notes)
 
 
 def test_visible_labels_reach_beyond_the_half_power_beam(variant: str) -> None:

@@ -300,7 +300,7 @@ def test_a_launch_is_recorded_once_and_not_for_every_call(flat: mi.Scene) -> Non
         list(simulator.pings([Pose(k, 0, 2.5 + 0.01 * k, PITCH, 0, 0.3 * k)] * 2, first=7 * k))
     ((launch, _),) = simulator._launches.values()
     recorded: Any = launch
-    assert recorded.n_recordings == 1
+    assert recorded._recorded.n_recordings == 1
     list(simulator.pings([POSE] * 3))
     list(simulator.pings([POSE] * 3, labels=True))
     assert len(simulator._launches) == 3
