@@ -37,7 +37,7 @@ from mitsonar.estimation.benchmark import (  # noqa: E402
     rows_of,
     with_prior,
 )
-from mitsonar.estimation.comparison_run import compare  # noqa: E402
+from mitsonar.estimation.comparison_run import _methods, compare  # noqa: E402
 from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
@@ -160,6 +160,7 @@ def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:
     assert found.motion == pytest.approx([own.labels.high[0], own.labels.low[1], 0.0])
     wanted = torch.cat([*torch.from_numpy(pairs.sonar_frames(3).image)], dim=1)
     assert torch.equal(estimator._made._network.seen[0, 0], wanted)
+    assert list(_methods([estimator])) == ["Sums"], "the row of a table is named after the network, not after what wraps it"
 
 
 @pytest.mark.thorough
