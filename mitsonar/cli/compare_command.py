@@ -30,6 +30,10 @@ def compare(
         ),
     ] = "none",
     part: Annotated[str | None, typer.Option(help="train, validation, test (default if the split has one) or all.")] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(help="sequence or scene (default: that of the networks' training, else of the data set)."),
+    ] = None,
     pairs: Annotated[int | None, typer.Option(min=2, help="Largest number of pairs, one a sequence.")] = None,
     perturb: Annotated[
         bool, typer.Option("--perturb", help="Add rows with wrong height, pitch, roll, sound speed and heave.")
@@ -59,6 +63,7 @@ def compare(
         estimators,
         noise=noise,
         part=part,
+        split=split,
         pairs=pairs,
         perturb=perturb,
         jitter=jitter,

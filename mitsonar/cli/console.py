@@ -143,7 +143,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "compare": {
         "height_m": "NAME:height_m=METRES",
         "pitch_rad": "NAME:pitch_deg=DEGREES",
-        **{name: f"--{name}" for name in ("reference", "perturb", "jitter", "prior", "part")},
+        **{name: f"--{name}" for name in ("reference", "perturb", "jitter", "prior", "part", "split")},
     },
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},

@@ -43,8 +43,8 @@ def evaluate(
 ) -> None:
     """Evaluate a trained network beside always answering zero. Bootstrap by scene, then sequence.
 
-    `large` is the RMSE of motions beyond half the largest (10..20 mm of 20). `as in the thesis` (Almanza-Medina) has yaw
-    in 1/100 deg.
+    `large` is the RMSE of motions beyond half the largest (10..20 mm of 20). Almanza-Medina prints yaw in
+    deg/100.
     """
     checkpoint = checkpoint_from(run)
     from mitsonar.estimation.benchmark_tables import FEWEST_SCENES

@@ -18,7 +18,7 @@ __all__ = ["export"]
 def export(
     run: Run,
     onnx: Annotated[Path, typer.Option("--onnx", help="The .onnx file to write.")],
-    batch: Annotated[str, typer.Option(help="Samples at a time: a number, or `dynamic`.")] = "1",
+    batch: Annotated[str, typer.Option(help="Samples at a time: a number, or `dynamic` for any.")] = "dynamic",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a network with its weights as ONNX. The metadata of the file define inputs and outputs."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -127,12 +126,10 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 class TrainingBar:
     """Progress of a training on standard error.
 
-    A terminal shows a bar, and a line for each validation. Otherwise a line is printed for each validation and every half
-    minute.
+    A terminal shows a bar, and a line for each validation. Otherwise a line is printed for each row of the log.
     """
 
-    def __init__(self, every_s: float = 30.0) -> None:
-        self.every_s, self.said = every_s, time.monotonic()
+    def __init__(self) -> None:
         self.inner: Progress | None = None
 
     def __enter__(self) -> TrainingBar:
@@ -146,9 +143,8 @@ class TrainingBar:
         """Show a report."""
         if sys.stderr.isatty():
             self._draw(report)
-        elif report.validated or time.monotonic() - self.said >= self.every_s:
+        elif report.logged:
             typer.echo(progress_line(report) + (validation_text(report) if report.validated else ""), err=True)
-            self.said = time.monotonic()
 
     def _draw(self, report: TrainingReport) -> None:
         if self.inner is None:
@@ -165,16 +161,16 @@ class TrainingBar:
 
 
 def progress_line(report: TrainingReport) -> str:
-    """Format the progress of a training: ``epoch 1.26 at 18/s, 0.5 min, loss 15.3, RMSE 10.9/11.9 mm 0.232 deg``."""
+    """Format the progress of a training: ``epoch 1.26 at 18/s, 0.5 min, loss 15, training RMSE 10.9/11.9 mm 0.232 deg``."""
     return (
         f"epoch {report.epoch:.2f} at {report.per_second:.3g}/s, {report.minutes:.1f} min, loss {report.loss:.3g}, "
-        f"RMSE {_rmse(report.rmse, report)}"
+        f"training RMSE {_rmse(report.rmse, report)}"
     )
 
 
 def validation_text(report: TrainingReport) -> str:
-    """Format the last validation: ``; noise none 2.84/1.00 mm 0.052 deg``."""
-    return "".join(f"; noise {level} {_rmse(values, report)}" for level, values in report.validation.items())
+    """Format the last validation: ``; validation, noise none 2.84/1.00 mm 0.052 deg``."""
+    return "".join(f"; validation, noise {level} {_rmse(values, report)}" for level, values in report.validation.items())
 
 
 def _rmse(values: list[float], report: TrainingReport) -> str:

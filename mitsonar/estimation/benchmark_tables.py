@@ -146,9 +146,9 @@ def _interval(row: PlainTable) -> str:
 
 
 CELLS: Cells = {
-    "method": lambda row: str(row["method"]),
+    "method": lambda row: str(row["method"]) + (f" (learnt {row['learnt']})" if row.get("learnt") else ""),
     "RMSE": lambda row: _three(row["rmse"]),
-    "as in the thesis": lambda row: _joined(row["thesis"], 2),
+    "RMSE, mm / mm / deg/100": lambda row: _joined(row["thesis"], 2),
     "95 % interval": _interval,
     "median": lambda row: _three(row["median"]),
     "95 %": lambda row: _three(row["p95"]),

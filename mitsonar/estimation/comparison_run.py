@@ -9,15 +9,17 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
+from mitsonar.config.data_recipe import Recipe, Split
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
 from mitsonar.datasets.response_samples import ImpulseSamples
+from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, counted, meant
 from mitsonar.estimation.benchmark import (
@@ -55,6 +57,7 @@ class _Asked(NamedTuple):
 
     noise: str
     part: str | None
+    split: str | None
     pairs: int | None
     perturb: bool
     jitter: bool
@@ -75,6 +78,7 @@ class Bench:
         numbers: of the samples that are estimated.
         truth: motions of the sonar ``(n, 3)`` [m, m, rad].
         scenes: number of each pair's scene ``(n,)``.
+        learnt: by network, the number of pairs that its training has seen.
     """
 
     methods: dict[str, AnyEstimator]
@@ -83,6 +87,7 @@ class Bench:
     numbers: list[int]
     truth: Array
     scenes: NDArray[np.int64]
+    learnt: dict[str, int]
 
     @property
     def first(self) -> Samples:
@@ -96,6 +101,7 @@ def compare(
     *,
     noise: str = "none",
     part: str | None = None,
+    split: str | None = None,
     pairs: int | None = None,
     perturb: bool = False,
     jitter: bool = False,
@@ -114,6 +120,8 @@ def compare(
             them, a list, or a dictionary by the names of the rows; default: all that need no training.
         noise: levels, commas between them, or ``;``.
         part: of the data set; default: the one that training does not use.
+        split: ``sequence`` or ``scene``; default: that with which networks among the estimators were trained on this data
+            set, else the data set's own.
         pairs: at most so many; default: all.
         perturb: add rows in which estimators get wrong inputs.
         jitter: add a row with jittered rays.
@@ -130,7 +138,7 @@ def compare(
     Raises:
         MitsonarError: unknown names, too few pairs, or another comparison in the folder.
     """
-    asked = _Asked(noise, part, pairs, perturb, jitter, prior, limit, reference, seed)
+    asked = _Asked(noise, part, split, pairs, perturb, jitter, prior, limit, reference, seed)
     data = str(data)
     bench = _bench(data, estimators, asked)
     settings = _settings(bench, asked)
@@ -156,8 +164,15 @@ def compare(
         tables += [_table(bench, asked, level, variation, answers[level, variation], bounds) for variation in variations]
     scenes = len(np.unique(bench.scenes))
     notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
+    notes = notes if scenes < FEWEST_SCENES else []
+    notes += [
+        f"{name} has learnt from {count} of the {counted(len(bench.numbers), 'pair')}: its errors on them are no measure; "
+        f"give {argument('part')} {bench.first.split.unseen}, or other data"
+        for name, count in bench.learnt.items()
+        if count
+    ]
     report = {"data": data, "model": modality_of(bench.first.recipe).sonar.model, **settings, "scenes": scenes}
-    report |= {"notes": notes if scenes < FEWEST_SCENES else [], "tables": tables, **versions(("mitsonar",))}
+    report |= {"notes": notes, "tables": tables, **versions(("mitsonar",))}
     kept.finish(report)
     return Comparison(report)
 
@@ -186,7 +201,11 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
         raise MitsonarError(f"{perturb} and {jitter} render anew, and recorded frames have no world: leave them out")
     words = list(dict.fromkeys(asked.noise.split(";" if ";" in asked.noise else ",")))
     levels = {word: modality.noise_model(word) for word in words}
-    options = {"part": asked.part or recipe.split.unseen, "one_a_sequence": recipe.recorded is None, "seed": asked.seed}
+    split = _split(asked.split, methods, recipe)
+    options = {
+        **{"part": asked.part or split.unseen, "split": split},
+        **{"one_a_sequence": recipe.recorded is None, "seed": asked.seed},
+    }
     samples = {level: samples_of(modality, data, noise=level, **options) for level in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
@@ -197,7 +216,32 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
     truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
-    return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]])
+    learnt = {name: int(one.checkpoint.learnt(first)[numbers].sum()) for name, one in _networks(methods).items()}
+    return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]], learnt)
+
+
+def _split(asked: str | None, methods: Mapping[str, AnyEstimator], recipe: Recipe) -> Split:
+    """Return the split that is asked for, or that of the networks which were trained on this data set, or the data set's.
+
+    Raises:
+        MitsonarError: an unknown split, or networks of different ones.
+    """
+    if asked is not None:
+        return split_for(asked, recipe)
+    known = {name: one.checkpoint.split_of_training(recipe) for name, one in _networks(methods).items()}
+    theirs = {name: split for name, split in known.items() if split is not None}
+    if len({split.model_dump_json() for split in theirs.values()}) > 1:
+        told = ", ".join(f"{name} by {split.by}" for name, split in theirs.items())
+        raise MitsonarError(
+            f"the networks were trained on other parts of this data set: {told}; choose {argument('split')}, and those rows "
+            "are marked that hold pairs which training has seen"
+        )
+    return next(iter(theirs.values()), recipe.split)
+
+
+def _networks(methods: Mapping[str, AnyEstimator]) -> dict[str, Any]:
+    """Return the estimators that a checkpoint makes."""
+    return {name: one for name, one in methods.items() if hasattr(one, "checkpoint")}
 
 
 def _methods(estimators: str | Sequence[EstimatorLike] | Mapping[str, EstimatorLike]) -> dict[str, AnyEstimator]:
@@ -233,6 +277,7 @@ def _settings(bench: Bench, asked: _Asked) -> PlainTable:
         "digest": digest(chosen_of.motion.tobytes(), chosen_of.pose.tobytes(), recipe_text),
         "methods": list(bench.methods),
         "part": asked.part,
+        "split": bench.first.split.model_dump(),
         "pairs": len(bench.numbers),
         "seed": asked.seed,
         **({"networks": networks} if networks else {}),
@@ -288,7 +333,7 @@ def _table(
         "limits": {law: _finite(in_units(std)) for law, std in bounds.items()},
         "limit_law": law,
         "reference": reference,
-        "rows": [row.plain() for row in rows],
+        "rows": [{**row.plain(), "learnt": bench.learnt.get(row.method.removesuffix(PRIOR), 0)} for row in rows],
     }
 
 

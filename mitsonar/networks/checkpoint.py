@@ -8,16 +8,18 @@ import os
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from mitsonar.config.data_recipe import Recipe, Split
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.datasets.batches import Batches
 from mitsonar.datasets.modality import Fields
+from mitsonar.datasets.sample_index import Part, split_for
 from mitsonar.errors import MitsonarError, meant, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
@@ -27,6 +29,10 @@ from mitsonar.networks.checkpoint_faults import FILE, LARGEST, WORDS, are_number
 from mitsonar.networks.create import NETWORKS, create_network
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.shipped import SHIPPED, shipped_path
+
+if TYPE_CHECKING:
+    from mitsonar.datasets.response_samples import ImpulseSamples
+    from mitsonar.datasets.torch_pairs import SonarPairs
 
 __all__ = ["FILE", "FORMAT", "WORDS", "Checkpoint"]
 
@@ -216,6 +222,35 @@ class Checkpoint:
         if not chosen or not all(are_numbers(rmse, len(self.labels["names"])) for rmse in chosen):
             return None
         return np.asarray(np.sqrt((np.array(chosen, dtype=float) ** 2).mean(axis=0)))
+
+    def split_of_training(self, recipe: Recipe) -> Split | None:
+        """Return how training has split the data set of a recipe; None where it was trained on other data.
+
+        Raises:
+            MitsonarError: the file holds no split.
+        """
+        if self.trained.get("rendered") or self.data_recipe != recipe.model_dump(mode="json"):
+            return None
+        return split_for(self.recipe.get("split"), recipe)
+
+    def learnt(self, samples: SonarPairs | ImpulseSamples) -> NDArray[np.bool_]:
+        """Return which samples of a data set training may have seen ``(samples,)``: all of whose motions it was given.
+
+        Raises:
+            MitsonarError: the file holds no split.
+        """
+        split = self.split_of_training(samples.recipe)
+        if split is None:
+            return np.zeros(len(samples), dtype=bool)
+        part, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
+        seen = Part.of(samples.store, "train", split, length)
+        share = part if isinstance(part, int | float) else 1.0
+        first = seen.first[seen.first + length <= share * len(samples.store)]
+        given = np.zeros(len(samples.store) + length, dtype=bool)  # motions from each frame to the next
+        for step in range(max(length - 1, 1)):
+            given[first + step] = True
+        steps = range(max(samples.frames - 1, 1))
+        return np.asarray(np.all([given[samples.first + step] for step in steps], axis=0))
 
     def decode(self, answer: Tensor | GaussianHead) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Decode the output of the network.

@@ -23,7 +23,7 @@ from mitsonar.networks.gaussian_head import GaussianHead
 __all__ = ["onnx_of"]
 
 
-def onnx_of(checkpoint: Checkpoint, batch: int | None = 1) -> bytes:
+def onnx_of(checkpoint: Checkpoint, batch: int | None = None) -> bytes:
     """Write a checkpoint as ONNX, and return the file's content.
 
     Inputs: ``image`` in the checkpoint's arrangement, grey values 0..1, and ``cartesian`` for ``both`` coordinates;

@@ -18,7 +18,7 @@ from mitsonar.datasets.response_pairs import ImpulsePairs
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.datasets.torch_pairs import SonarPairs
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, counted
 from mitsonar.estimation.benchmark import Answers, chosen, rows_of
 from mitsonar.estimation.learned.trained_network import (
     ANGLE_OFF_DEG,
@@ -187,7 +187,7 @@ def _report(
         "scenes": subject.scenes,
         "names": list(checkpoint.labels["names"]),
         "seed": subject.seed,
-        "notes": [*others, *_notes(checkpoint, recipe, part)],
+        "notes": [*others, *_learnt_of(checkpoint, samples, subject), *_notes(checkpoint, recipe)],
         "tables": tables,
     }
 
@@ -339,12 +339,16 @@ def _other_channel(trained: ChannelSonar, other: ChannelSonar, name: str) -> lis
     return [f"trained with another channel sonar than that of {name}: {', '.join(changed)} differ"] if changed else []
 
 
-def _notes(checkpoint: Checkpoint, recipe: Recipe, part: str | None) -> list[str]:
-    """Describe other differences from training, and pairs that training has seen."""
+def _learnt_of(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
+    """Say how many of the pairs training has seen, if any."""
+    seen = int(checkpoint.learnt(samples)[subject.numbers].sum())
+    count = counted(len(subject.numbers), "pair")
+    return [f"training has seen {seen} of these {count}: errors on them are no measure"] if seen else []
+
+
+def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:
+    """Describe other differences from training."""
     found = []
-    same = checkpoint.data_recipe == recipe.model_dump(mode="json")
-    if same and part in ("train", "all"):
-        found.append(f"part {part} of this data set holds pairs that training has seen")
     model = modality_of(recipe).sonar.model
     if model not in checkpoint.model.split(" and "):
         found.append(f"trained on the {checkpoint.model} model, evaluated on the {model} model")

@@ -13,7 +13,7 @@ from mitsonar.training.training_types import JsonObject
 __all__ = ["refuse_tables", "report_lines", "save_tables"]
 
 COLUMNS = (
-    *("method", "RMSE", "as in the thesis", "95 % interval", "median", "95 %", "slope", "bias", "large", "skill", "nees"),
+    *("method", "RMSE", "RMSE, mm / mm / deg/100", "95 % interval", "median", "95 %", "slope", "bias", "large", "skill", "nees"),
     *("ms", "inputs"),
 )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -250,6 +251,7 @@ def batches(
         "collate_fn": together,
         "pin_memory": device.type == "cuda",
         "multiprocessing_context": "spawn" if workers else None,  # a fork is unsafe once the ray tracer runs
+        "worker_init_fn": _leave_signals,
     }
     size = recipe.batch // share[1]
     if isinstance(material.samples, RenderedPairs):
@@ -257,6 +259,12 @@ def batches(
     assert material.numbers is not None
     order = Order(material.numbers, recipe.batch, recipe.seed, start, stop, share)
     return DataLoader(_Stored(material.samples), batch_sampler=order, **words)
+
+
+def _leave_signals(worker: int) -> None:
+    """Ignore signals in a process that reads: where they reach all of a job, the first process ends the others."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 class Order(Sampler[list[tuple[int, int]]]):

@@ -29,9 +29,15 @@ if TYPE_CHECKING:
 
 __all__ = ["TRAINING", "RunFolder", "StateFile", "column", "curve_figure"]
 
+EVENTS = "tensorboard"
+"""Folder of what TensorBoard shows, in the folder of a training."""
+
+TRAINED = "training"
+"""What the columns of the log are of that hold the RMSE of the samples that a network learns from."""
+
 TRAINING = RunKind(
     "training",
-    outputs=("recipe.yaml", "last.ckpt", "network.ckpt", "log.csv", "curve.png"),
+    outputs=("recipe.yaml", "last.ckpt", "network.ckpt", "log.csv", "curve.png", EVENTS),
     notes={
         **{"gain": float | None, "threads": int, "accelerator": str, "epoch_samples": int, "steps": int, "machine": dict},
         **{"steps_done": int, "minutes": float},
@@ -136,10 +142,8 @@ class RunFolder:
             self.run.finished = finished
             self.run.note(**notes)
 
-    def log(self, rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...]) -> None:
-        """Write ``log.csv`` and ``curve.png``."""
-        if not rows:
-            return
+    def log(self, rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...], *, drawn: bool) -> None:
+        """Write ``log.csv``, and ``curve.png`` if it is to be drawn."""
         text = io.StringIO()
         table = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
         table.writeheader()
@@ -147,6 +151,8 @@ class RunFolder:
             {key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()} for row in rows
         )
         write_whole(self.path / "log.csv", text.getvalue().encode())
+        if not drawn:
+            return
         buffer = io.BytesIO()
         curve_figure(rows, zero, axes).savefig(buffer, format="png", dpi=110)
         write_whole(self.path / "curve.png", buffer.getvalue())
@@ -159,15 +165,15 @@ def machine() -> JsonObject:
 
 
 def column(level: str, axis: Axis) -> str:
-    """Return the name of a column of the log: the validation RMSE of one axis at a level of noise."""
+    """Return the name of a column of the log: the RMSE of one axis in training, or in validation at a level of noise."""
     return f"{level} {axis.name} ({axis.unit})"
 
 
 def curve_figure(rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ...]) -> Figure:
-    """Draw the loss, and the validation RMSE of each axis, against the training samples seen.
+    """Draw the loss, and the RMSE of each axis in training and validation, against the training samples seen.
 
     Args:
-        rows: of the log.
+        rows: of the log; one at least with a validation.
         zero: RMSE of always answering no motion, in the units of ``axes``.
         axes: names and units of the estimates.
     """
@@ -180,15 +186,19 @@ def curve_figure(rows: list[JsonObject], zero: list[float], axes: tuple[Axis, ..
     panels[0].plot(pairs, [row["loss"] for row in rows], color="0.2", marker=".")
     panels[0].set(title="training loss", ylabel="loss")
     suffix = f" {axes[0].name} ({axes[0].unit})"
-    levels = [key.removesuffix(suffix) for key in rows[0] if key.endswith(suffix)]
+    shown = [key.removesuffix(suffix) for key in rows[0] if key.endswith(suffix)]
     for panel, axis, still in zip(panels[1:], axes, zero, strict=True):
-        curves = [[row[column(level, axis)] for row in rows] for level in levels]
-        for level, curve in zip(levels, curves, strict=True):
-            panel.plot(pairs, curve, marker=".", label=f"noise {level}")
+        curves = []
+        for what in shown:
+            points = [(row["pairs"], row[column(what, axis)]) for row in rows if row.get(column(what, axis)) is not None]
+            curves.append([value for _, value in points])
+            style = {"color": "0.6"} if what == TRAINED else {"marker": "."}
+            panel.plot(*zip(*points, strict=True), label=what if what == TRAINED else f"validation, noise {what}", **style)
         panel.axhline(still, color="0.6", linestyle=":", label="no motion" if len(axes) > 1 else "zero")
-        panel.set(title=f"validation, {axis.name}", ylabel=f"RMSE ({axis.unit})", yscale="log")
-        if min(np.min(curves), still) > 0:
-            panel.set_ylim(min(np.min(curves), still / 5) / 1.2, max(np.max(curves), still) * 1.2)
+        panel.set(title=axis.name, ylabel=f"RMSE ({axis.unit})", yscale="log")
+        lowest, highest = min(map(min, curves)), max(map(max, curves))
+        if min(lowest, still) > 0:
+            panel.set_ylim(min(lowest, still / 5) / 1.2, max(highest, still) * 1.2)
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         panel.yaxis.set_major_formatter(FormatStrFormatter("%g"))
         panel.yaxis.set_minor_formatter(NullFormatter())

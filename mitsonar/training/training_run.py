@@ -6,6 +6,7 @@ the same number of threads.
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 import warnings
@@ -16,6 +17,8 @@ from pathlib import Path
 
 import lightning
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils import deterministic
 
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.errors import MitsonarError, MitsonarWarning
@@ -23,7 +26,7 @@ from mitsonar.io.provenance import other_versions
 from mitsonar.io.run_directory import RunDirectory
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_data import Material, material_of
-from mitsonar.training.training_folder import RunFolder, StateFile
+from mitsonar.training.training_folder import EVENTS, RunFolder, StateFile
 from mitsonar.training.training_journal import STATE_MINUTES, Journal, Pace, TrainingReport
 from mitsonar.training.training_step import NetworkTraining, network_for
 from mitsonar.training.training_types import JsonObject
@@ -119,6 +122,7 @@ class _Run:
         threads = hardware.threads or (known.count("threads", MOST_AT_ONCE) if known is not None else None)
         material = material_of(self.recipe, self.data, render=self.render, gain=gain)
         network = network_for(self.recipe, material)
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # convolutions are faster
         with _quiet(), _settings(threads), torch.random.fork_rng(devices=[]):
             module = NetworkTraining(network, self.recipe, material)
             journal = Journal(self.folder, module, material, pace)
@@ -217,7 +221,7 @@ def _trainer(module: NetworkTraining, folder: RunFolder, journal: Journal, hardw
             gradient_clip_val=module.recipe.optimiser.clip,
             callbacks=[journal],
             plugins=[StateFile()],
-            logger=False,
+            logger=_tensorboard(folder),
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -236,7 +240,15 @@ def _trainer(module: NetworkTraining, folder: RunFolder, journal: Journal, hardw
         )
     if trainer.strategy.root_device.type == "cpu":
         torch.use_deterministic_algorithms(True)
+        deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # a seventh of the time
     return trainer
+
+
+def _tensorboard(folder: RunFolder) -> TensorBoardLogger | bool:
+    """Return what writes the rows of the log for TensorBoard, where that is installed."""
+    if not folder.writes or importlib.util.find_spec("tensorboard") is None:
+        return False
+    return TensorBoardLogger(folder.path, name="", version=EVENTS)
 
 
 def _workers(workers: int | None, known: RunDirectory | None, render: bool, trainer: lightning.Trainer) -> int:
@@ -289,12 +301,14 @@ def _quiet() -> Iterator[None]:
 @contextmanager
 def _settings(threads: int | None) -> Iterator[None]:
     """Set the threads and algorithms of torch for this training, and restore them afterwards."""
-    had, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    had, exact = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
+    filled = deterministic.fill_uninitialized_memory  # type: ignore[attr-defined]
     if threads:
         torch.set_num_threads(threads)
     try:
         yield
     finally:
         torch.set_num_threads(had)
-        torch.use_deterministic_algorithms(deterministic, warn_only=warn_only)
+        torch.use_deterministic_algorithms(exact, warn_only=warn_only)
+        deterministic.fill_uninitialized_memory = filled  # type: ignore[attr-defined]

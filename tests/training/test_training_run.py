@@ -489,10 +489,16 @@ def test_a_run_keeps_what_it_promises(
     assert load_training_recipe(out / "recipe.yaml") == told
 
 
-def test_a_run_that_was_stopped_before_it_validated_asks_for_more_minutes(made: Path, tmp_path: Path) -> None:
+def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path) -> None:
+    """Even the first step's; a run without a network, which was killed, asks for more minutes."""
     told = recipe(steps=3, validate={"every_steps": 100, "pairs": 4, "noise": ["none"]})
     with pytest.raises(KeyboardInterrupt):
         train(told, made, tmp_path / "run", threads=1, stop=lambda: True)
+    kept = Checkpoint.load(tmp_path / "run")
+    (row,) = csv.DictReader((tmp_path / "run" / "log.csv").open())
+    assert (kept.trained["steps"], int(row["step"])) == (1, 1)
+    assert float(row["none sideways (mm)"]) == pytest.approx(kept.metrics["none"]["rmse"][0], rel=1e-4)
+    (tmp_path / "run" / "network.ckpt").unlink()
     with pytest.raises(
         MitsonarError, match=r"stopped before it validated once, and has used its 1e-09 minutes .* resume it with more"
     ):
@@ -633,7 +639,7 @@ def test_the_command_line_trains_stops_in_time_and_goes_on(made: Path, tmp_path:
     assert "RMSE, noise none" in done.stdout
     assert f"network: {out / 'network.ckpt'}" in done.stdout
     assert all(line.startswith("epoch ") for line in done.stderr.splitlines()), done.stderr
-    assert "; noise none " in done.stderr
+    assert "; validation, noise none " in done.stderr
     state = torch.load(out / "last.ckpt", weights_only=True)["global_step"]
     assert 6 <= state < 2000
     kept = load_training_recipe(out / "recipe.yaml")
@@ -646,6 +652,35 @@ def test_the_command_line_trains_stops_in_time_and_goes_on(made: Path, tmp_path:
     assert refused.exit_code == 2
     assert refused.stderr.startswith("error: ")
     assert "--resume" in refused.stderr
+
+
+def test_rows_of_the_log_between_validations_tell_the_errors_in_training(
+    made: Path, tmp_path: Path, bare_curves: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a row for each line that is printed; the picture and TensorBoard show them, too."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    monkeypatch.setattr("mitsonar.training.training_folder.curve_figure", bare_curves)
+    monkeypatch.setattr("mitsonar.training.training_journal.LOG_SECONDS", 0.0)
+    told, out = tmp_path / "mine.yaml", tmp_path / "run"
+    validate = {"every_steps": 4, "pairs": 4, "noise": ["none"]}
+    told.write_text(yaml.safe_dump({**FIELDS, "steps": 6, "validate": validate}))
+    done = run_command(told, "--data", made, "-o", out, "--threads", 1)
+    assert done.exit_code == 0, done.output
+    rows = list(csv.DictReader((out / "log.csv").open()))
+    assert [int(row["step"]) for row in rows] == [1, 2, 3, 4, 5, 6]
+    assert [row["none sideways (mm)"] != "" for row in rows] == [False, False, False, True, False, True]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("epoch ")]
+    for line, row in zip(lines, rows, strict=True):
+        assert f"training RMSE {float(row['training sideways (mm)']):.3g}/" in line
+        assert ("; validation, noise none " in line) == (row["none sideways (mm)"] != "")
+    assert (out / "curve.png").stat().st_size > 10_000
+    events = EventAccumulator(str(out / "tensorboard")).Reload()
+    loss, validated = (events.Scalars(name) for name in ("loss", "none sideways (mm)"))
+    assert [one.step for one in loss] == [1, 2, 3, 4, 5, 6]
+    assert [one.value for one in validated] == pytest.approx(
+        [float(rows[k]["none sideways (mm)"]) for k in (3, 5)], rel=1e-4
+    )
 
 
 def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_path: Path) -> None:
@@ -664,6 +699,25 @@ def test_ctrl_c_keeps_the_state_of_a_whole_step(made: Path, whole: Path, tmp_pat
     assert torch.load(out / "last.ckpt", weights_only=True)["global_step"] in (9, 10)
     train(told, made, out, resume=True, threads=1)
     assert_same(weights(out), weights(whole))
+
+
+@pytest.mark.thorough
+@pytest.mark.e2e
+def test_a_signal_to_all_processes_of_a_training_stops_it_after_its_step(made: Path, tmp_path: Path) -> None:
+    """As a cluster sends it: the process that reads samples does not end before the one that trains."""
+    told, out = tmp_path / "mine.yaml", tmp_path / "run"
+    told.write_text(yaml.safe_dump({**FIELDS, "steps": 100_000, "validate": {"every_steps": 3, "pairs": 4}}))
+    words = ("train", told, "--data", made, "-o", out, "--threads", 1, "--workers", 1)
+    call = [sys.executable, "-m", "mitsonar", *map(str, words)]
+    with subprocess.Popen(call, stderr=subprocess.PIPE, text=True, start_new_session=True) as running:
+        assert running.stderr is not None
+        assert running.stderr.readline().startswith("epoch ")
+        os.killpg(running.pid, signal.SIGTERM)
+        said = running.stderr.read()
+    assert running.returncode == 143, said
+    assert "Traceback" not in said
+    steps = torch.load(out / "last.ckpt", weights_only=True)["global_step"]
+    assert steps == int(list(csv.DictReader((out / "log.csv").open()))[-1]["step"])
 
 
 @pytest.mark.slow

@@ -114,6 +114,11 @@ class Trained:
     """What serves other sonars."""
 
     @property
+    def checkpoint(self) -> Checkpoint:
+        """Return the checkpoint."""
+        return self._checkpoint
+
+    @property
     def heights(self) -> tuple[float, float]:
         """Lowest and highest of training [m]."""
         low, high = self._checkpoint.trained_at["height_m"]
