@@ -165,7 +165,7 @@ class Split(RecipePart):
     """Division of the frames into training, validation and test, unless a reader asks for another."""
 
     by: Literal["sequence", "scene", "sample"] = Field(
-        "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks: to show it only"
+        "sequence", description="what is dealt out: sequences, whole scenes, or samples, which leaks (but test: sequences)"
     )
     train: float = Field(0.95, ge=0, le=1)
     validation: float = Field(0.05, ge=0, le=1)

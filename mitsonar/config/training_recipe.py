@@ -177,7 +177,7 @@ class TrainingRecipe(_Part):
     augment: list[Literal["mirror", "reverse", "strangers"]] = Field(
         default_factory=list, description="changes of samples, for networks that know the ground"
     )
-    split: str | Keys = Field("sequence", description="sequence, scene, or keys of a data set recipe's split")
+    split: str | Keys = Field("sequence", description="sequence, scene, sample, or keys of a data set recipe's split")
     loss: Loss = Field(default_factory=Loss)
     optimiser: Optimiser = Field(default_factory=Optimiser)
     batch: int = Field(4, ge=1, le=65_536, description="samples of a step, over all devices")
@@ -221,8 +221,8 @@ class TrainingRecipe(_Part):
             raise ValueError("augment is for inputs with ground: set input.ground: true, or leave augment out")
         if isinstance(self.split, dict):
             split_from(self.split)
-        elif self.split not in ("sequence", "scene"):
-            raise ValueError(f"split must be sequence, scene, or keys as in a data set recipe: got {self.split!r}")
+        elif self.split not in ("sequence", "scene", "sample"):
+            raise ValueError(f"split must be sequence, scene, sample, or keys as in a data set recipe: got {self.split!r}")
         return self
 
     @property

@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 
 from mitsonar.config.data_recipe import Recipe, Split, split_from
 from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.split import deal, world_of
+from mitsonar.datasets.split import deal, deal_samples, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 
-__all__ = ["AnySplit", "Part", "split_for"]
+__all__ = ["SPLITS", "AnySplit", "Part", "split_for"]
 
 AnySplit: TypeAlias = str | Split | Fields | None
 """A split by name, as an object, or by the keys of a recipe; None: the recipe's own."""
+
+
+SPLITS = ("sequence", "scene", "sample")
+"""Names of splits."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +73,8 @@ class Part:
         scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
         first = np.arange(max(0, len(sequence) - frames + 1))
         first = first[sequence[first] == sequence[first + frames - 1]]
-        if dealt.by == "sample":  # neighbours share frames and motion: validation meets what training has used
-            number = np.arange(len(first), dtype=np.int32)
-            first = first[deal(number.astype(np.int64), number, dealt, part)]
+        if dealt.by == "sample":
+            first = first[deal_samples(sequence[first], dealt, part)]
         else:
             first = first[deal(world_of(store.recipe, store.scenes)[scene], sequence, dealt, part)[first]]
         if not len(first):
@@ -108,5 +111,7 @@ def split_for(split: AnySplit, recipe: Recipe) -> Split:
             return recipe.split if recipe.split.by == "sequence" else Split()
         case "scene":
             return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
+        case "sample":
+            return recipe.split if recipe.split.by == "sample" else Split(by="sample", train=0.9, test=0.05)
         case _:
-            raise MitsonarError(f"split must be sequence, scene, or keys as in a recipe: got {split!r}")
+            raise MitsonarError(f"split must be {', '.join(SPLITS)}, or keys as in a recipe: got {split!r}")

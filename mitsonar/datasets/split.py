@@ -10,7 +10,7 @@ from mitsonar.datasets.plan import Scene
 from mitsonar.errors import MitsonarError, meant
 from mitsonar.worlds.world import Family
 
-__all__ = ["PARTS", "deal", "world_of"]
+__all__ = ["PARTS", "deal", "deal_samples", "world_of"]
 
 PARTS = ("train", "validation", "test")
 
@@ -59,6 +59,31 @@ def deal(world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, pa
     ends = np.cumsum(counts)
     index = PARTS.index(part)
     return np.isin(owner, dealt[ends[index] - counts[index] : ends[index]])
+
+
+def deal_samples(sequence: NDArray[np.int32], split: Split, part: str) -> NDArray[np.bool_]:
+    """Mark the samples ``(samples,)`` of a part. Training and validation share sequences, whose samples are assigned one by
+    one: these have the same motion and a frame in common. The test part, if there is one, is whole sequences.
+
+    Args:
+        sequence: of each sample ``(samples,)``.
+        split: shares of the parts, and the seed.
+        part: ``train``, ``validation``, ``test`` or ``all``.
+
+    Raises:
+        MitsonarError: as of :func:`deal`.
+    """
+    number = np.arange(len(sequence), dtype=np.int32)
+    if part not in PARTS or not split.test:
+        return deal(number.astype(np.int64), number, split, part)
+    whole = Split(by="sequence", train=1 - split.test, validation=0.0, test=split.test, seed=split.seed)
+    if part == "test":
+        return deal(sequence.astype(np.int64), sequence, whole, part)
+    marked = deal(sequence.astype(np.int64), sequence, whole, "train")
+    rest = 1 - split.test
+    shared = split.model_copy(update={"train": split.train / rest, "validation": split.validation / rest, "test": 0.0})
+    marked[marked] = deal(number[marked].astype(np.int64), number[marked], shared, part)
+    return marked
 
 
 def _counts(total: int, shares: NDArray[np.float64]) -> NDArray[np.int64]:

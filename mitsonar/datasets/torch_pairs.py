@@ -208,9 +208,11 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
     Args:
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
-        split: ``sequence`` (Almanza-Medina's: 95 % and 5 % of the sequences), ``scene`` (80, 10 and 10 % of the scenes:
-            other worlds than those of training; scenes of one world stay together), or by, train, validation, test and seed
-            as a dictionary or :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
+        split: ``scene`` (80, 10 and 10 % of the scenes: other worlds than those of training; scenes of one world stay
+            together), ``sequence`` (95 and 5 % of the sequences), ``sample`` (Almanza-Medina's: samples are dealt out one by
+            one, 90 and 5 %, so that those for validation have a frame in common with those of training; 5 % of the
+            sequences are for test), or by, train, validation, test and seed as a dictionary or
+            :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
         frames: number of frames of a sample; with 1 the labels are heights; default: the recipe's.
         views: which views; default: all.
         kind: ``image`` or ``vector``; default: what is stored.

@@ -13,7 +13,19 @@ from mitsonar.training.training_types import JsonObject
 __all__ = ["refuse_tables", "report_lines", "save_tables"]
 
 COLUMNS = (
-    *("method", "RMSE", "RMSE, mm / mm / deg/100", "95 % interval", "median", "95 %", "slope", "bias", "large", "skill", "nees"),
+    *(
+        "method",
+        "RMSE",
+        "RMSE, mm / mm / deg/100",
+        "95 % interval",
+        "median",
+        "95 %",
+        "slope",
+        "bias",
+        "large",
+        "skill",
+        "nees",
+    ),
     *("ms", "inputs"),
 )
 

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.generation import make_dataset
+from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, complaint
 from mitsonar.io.provenance import plain_json, refuse_other, versions
@@ -244,12 +245,14 @@ class TableBuilder:
         unseen = self._made(other if gain is None else other.model_copy(update={"gain": gain}), fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
         noises = list(table.noises)
-        scores = [
-            _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_progress(crew.watch, f"{name}, {samples}")))
-            for url, part, samples in ((seen, "validation", "validation"), (unseen, "all", "unseen scenes"))
-        ]
-        reached = _reached(checkpoint, recipe, self._run(name))
-        found = Found(recipe=name, validation=scores[0], unseen=scores[1], reached=reached)
+        parts = {"validation": (seen, "validation"), "unseen": (unseen, "all")}
+        if split_for(recipe.split_of, data).test:
+            parts["test"] = seen, "test"
+        scores = {
+            what: _scores(evaluate(checkpoint, url, noise=noises, part=part, begin=_progress(crew.watch, f"{name}, {what}")))
+            for what, (url, part) in parts.items()
+        }
+        found = Found(recipe=name, **scores, reached=_reached(checkpoint, recipe, self._run(name)))
         (self.folder / "rows").mkdir(exist_ok=True)
         write_json(self.folder / "rows" / f"{name}.json", found.model_dump(mode="json"))
 

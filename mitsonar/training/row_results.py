@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import Field
+
 from mitsonar.training.document_tables import Errors, Strict
 
 __all__ = ["Found", "Part", "Reached", "RowScore"]
 
-Part = Literal["validation", "unseen"]
+Part = Literal["validation", "test", "unseen"]
 """Samples that a row is scored on."""
 
 
@@ -52,7 +54,7 @@ class Reached(Strict):
         batch: samples of one step.
         rate: initial learning rate.
         precision: of the training.
-        split: how validation samples are separated from training: ``sequence`` or ``scene``.
+        split: how validation samples are separated from training: ``sample``, ``sequence`` or ``scene``.
         date: day on which training ended.
     """
 
@@ -78,15 +80,18 @@ class Found(Strict):
     Attributes:
         recipe: name of the row.
         validation: errors by noise, on the part of the data set that is not used for training.
+        test: errors by noise, on the sequences that are kept from training and validation; empty where there are none.
         unseen: errors by noise, on the scenes of a data set with another seed.
         reached: scale of the training.
     """
 
     recipe: str
     validation: dict[str, RowScore]
+    test: dict[str, RowScore] = Field(default_factory=dict)
     unseen: dict[str, RowScore]
     reached: Reached
 
-    def score(self, part: Part, noise: str) -> RowScore:
-        """Return the errors on one part with one noise."""
-        return (self.validation if part == "validation" else self.unseen)[noise]
+    def score(self, part: Part, noise: str) -> RowScore | None:
+        """Return the errors on one part with one noise; None where there are no such samples."""
+        scores: dict[str, RowScore] = getattr(self, part)
+        return scores.get(noise)

@@ -244,6 +244,23 @@ def test_no_image_and_by_scene_no_world_is_in_two_parts(made: Path, by: str) -> 
         assert [len(pairs) for pairs in parts.values()] == [15 * 4, 9 * 4, 6 * 4]
 
 
+def test_samples_dealt_out_one_by_one_share_sequences_but_those_for_test_do_not(made: Path) -> None:
+    """Every sample is in one part. Without a test part the draw is that of samples alone."""
+    split = Split(by="sample", train=0.6, validation=0.2, test=0.2)
+    train, validation, test = parts_of(made, split)
+    every = [*train.first, *validation.first, *test.first]
+    assert sorted(every) == list(SonarPairs(made, part="all").first)
+    assert [len(pairs) for pairs in (train, validation, test)] == [72, 24, 24]  # of 30 sequences of 4 samples
+    of = [set(pairs.sequence[pairs.first]) for pairs in (train, validation, test)]
+    assert len(of[2]) == 6
+    assert of[1] <= of[0]
+    assert not of[2] & (of[0] | of[1])
+    named = SonarPairs(made, part="test", split="sample")
+    assert (named.split.by, named.split.test) == ("sample", 0.05)
+    alone = parts_of(made, Split(by="sample", train=0.7, validation=0.3))[:1]
+    assert len(alone[0]) == 84
+
+
 @pytest.mark.thorough
 def test_scenes_of_one_world_stay_together(tmp_path: Path) -> None:
     """A scene file, or a picture as seabed, is the same world whatever the seed."""
@@ -263,7 +280,8 @@ def test_scenes_of_one_world_stay_together(tmp_path: Path) -> None:
 
 
 def parts_of(url: Path, split: Split) -> list[SonarPairs]:
-    return [SonarPairs(url, part=part, split=split) for part in ("train", "validation", "test")]
+    parts = ("train", "validation", "test") if split.test else ("train", "validation")
+    return [SonarPairs(url, part=part, split=split) for part in parts]
 
 
 def test_parts_do_not_depend_on_the_seed_of_noise_and_order(made: Path) -> None:
@@ -282,7 +300,7 @@ def test_parts_that_are_not_there_are_refused(made: Path) -> None:
         SonarPairs(made, part="training")
     with pytest.raises(MitsonarError, match="no test part"):
         SonarPairs(made, part="test", split="sequence")
-    with pytest.raises(MitsonarError, match=r"sequence, scene, or keys .*got 'world'"):
+    with pytest.raises(MitsonarError, match=r"sequence, scene, sample, or keys .*got 'world'"):
         SonarPairs(made, split="world")
     with pytest.raises(MitsonarError, match="unknown split key trian: did you mean train"):
         SonarPairs(made, split={"trian": 0.5})

@@ -378,9 +378,7 @@ def test_workers_of_odometry_say_the_same(mitsonar: Command, run: Path, tmp_path
     assert first == second
 
 
-def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(
-    mitsonar: Command, made: Path, tmp_path: Path
-) -> None:
+def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     """By default it takes the part that training left out; another split is told, with the number of pairs that it mixes."""
     by_scene = {"by": "scene", "train": 0.67, "validation": 0.33, "seed": 2}
     about: JsonObject = {"recipe": {"split": by_scene}, "metrics": {"none": {"rmse": [3.0, 2.0, 0.1]}}}
@@ -401,7 +399,9 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(
     assert f"has learnt from {mixed} of the {len(by_sequence)} pairs" in done.stderr
     refused(mitsonar("compare", made, "--split", "world"), "split must be sequence, scene")
     other = constant(SonarPairs(made, part="all", labels="normx10"), recipe={"split": "sequence"})
-    with pytest.raises(MitsonarError, match="trained on other parts of this data set: a by scene, b by sequence; choose split"):
+    with pytest.raises(
+        MitsonarError, match="trained on other parts of this data set: a by scene, b by sequence; choose split"
+    ):
         compare(made, {"a": ImageNetwork(told), "b": ImageNetwork(other)}, limit=0)
     rendered = replace(told, trained={"rendered": True})
     assert not rendered.learnt(by_sequence).any()
