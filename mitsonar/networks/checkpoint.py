@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, TypeAlias
@@ -125,6 +125,17 @@ class Checkpoint:
         }
         plain: Fields = {key: value if key == "weights" else _plain(value, key) for key, value in table.items()}
         return cls(**plain)
+
+    def halved(self) -> Self:
+        """Return the checkpoint with matrices and filters of half precision, about half as large; statistics stay whole.
+
+        :meth:`build` computes with whole precision again.
+        """
+        weights = {
+            name: values.half() if values.is_floating_point() and values.dim() > 1 else values
+            for name, values in self.weights.items()
+        }
+        return replace(self, weights=weights)
 
     def build(self) -> nn.Module:
         """Build the network with its weights, in evaluation mode. The state of torch's random numbers does not change.

@@ -577,6 +577,24 @@ def test_onnx_says_the_same() -> None:
     assert (about["network"], about["mitsonar_version"]) == ("cnn4b", checkpoint.version)
 
 
+def test_a_checkpoint_of_half_size_says_nearly_the_same(mitsonar: Command, tmp_path: Path) -> None:
+    checkpoint = trained_like("posenet")
+    checkpoint.save(tmp_path / "network.ckpt")
+    done = mitsonar("export", tmp_path, "--half", tmp_path / "half.ckpt")
+    assert done.returncode == 0, done.stderr
+    small = Checkpoint.load(tmp_path / "half.ckpt")
+    sizes = [(tmp_path / name).stat().st_size for name in ("half.ckpt", "network.ckpt")]
+    assert sizes[0] < 0.6 * sizes[1]
+    image = torch.rand((4, 1, 64, 64), generator=torch.Generator().manual_seed(1))
+    found, wanted = small.build()(image), checkpoint.build()(image)
+    assert found.dtype == torch.float32
+    assert float((found - wanted).abs().max()) < 2e-3 * float(wanted.abs().max())
+    assert (small.options, small.labels, small.trained) == (checkpoint.options, checkpoint.labels, checkpoint.trained)
+    refused(mitsonar("export", tmp_path), "nothing to write: give --onnx FILE.onnx, --half FILE.ckpt, or both")
+    refused(mitsonar("export", tmp_path, "--half", tmp_path / "half.ckpt"), "half.ckpt")
+    refused(mitsonar("export", tmp_path, "--half", tmp_path / "half.onnx"), "--half must name an .ckpt file")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["posenet", "sfmnet", "cnn1b", "cnn4posenet", "posenet_dual"])
 def test_every_network_becomes_onnx(name: str) -> None:
