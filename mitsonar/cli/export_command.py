@@ -24,7 +24,7 @@ def export(
     batch: Annotated[str, typer.Option(help="Samples at a time of ONNX: a number, or `dynamic` for any.")] = "dynamic",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write a network with its weights as ONNX, whose metadata define inputs and outputs, or as a checkpoint of half size."""
+    """Write a network as ONNX, whose metadata define inputs and outputs, or as a checkpoint of half the size."""
     from mitsonar.io.whole_files import write_whole
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):

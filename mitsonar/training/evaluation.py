@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +172,8 @@ def _report(
     ``notes`` are sentences that a reader of the tables needs. ``tables`` has one table for each level of noise. The rows of
     a table are of the network and of ``zero``, and hold the fields of
     :class:`~mitsonar.estimation.benchmark.BenchmarkRow` in mm, mm, deg (heights: mm), and ``thesis``, the RMSE in mm, mm,
-    1/100 deg. ``beyond`` holds the shares of true motions and of estimates outside the range of training.
+    1/100 deg. ``beyond`` holds the shares of true motions and of estimates outside the range of training, ``correlations``
+    those of the network's errors between any two axes.
     """
     recipe = DataStore.open(data).recipe
     return {
@@ -260,7 +262,20 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
         scale = np.ones(1)
     for row in rows:
         row["thesis"] = [value * factor for value, factor in zip(row["rmse"], scale.tolist(), strict=True)]
-    return {"limits": {}, "reference": "zero", "rows": rows, "beyond": beyond}
+    correlations = _correlations(estimates - truth, len(rows[0]["rmse"]))
+    return {"limits": {}, "reference": "zero", "rows": rows, "beyond": beyond, "correlations": correlations}
+
+
+def _correlations(error: Array, axes: int) -> dict[str, float | None]:
+    """Return the correlations of the errors of any two axes ``(n, axes)``; None where an axis has none."""
+    error = error[:, :axes] - error[:, :axes].mean(axis=0)
+    size = np.sqrt((error**2).sum(axis=0))
+    return {
+        f"{AXES[one].name}-{AXES[other].name}": float(error[:, one] @ error[:, other] / (size[one] * size[other]))
+        if size[one] * size[other] > 0
+        else None
+        for one, other in combinations(range(axes), 2)
+    }
 
 
 def _with_yaw(motion: Array) -> Array:

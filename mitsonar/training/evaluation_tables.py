@@ -13,20 +13,8 @@ from mitsonar.training.training_types import JsonObject
 __all__ = ["refuse_tables", "report_lines", "save_tables"]
 
 COLUMNS = (
-    *(
-        "method",
-        "RMSE",
-        "RMSE, mm / mm / deg/100",
-        "95 % interval",
-        "median",
-        "95 %",
-        "slope",
-        "bias",
-        "large",
-        "skill",
-        "nees",
-    ),
-    *("ms", "inputs"),
+    *("method", "RMSE", "RMSE, mm / mm / deg/100", "95 % interval", "median", "95 %", "slope", "bias", "large"),
+    *("skill", "nees", "ms", "inputs"),
 )
 
 
@@ -44,6 +32,9 @@ def report_lines(report: JsonObject) -> list[str]:
         lines.append(
             f"beyond the targets of training: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the answers  "
         )
+        told = [f"{axes} {'-' if value is None else f'{value:.2f}'}" for axes, value in table["correlations"].items()]
+        if told:
+            lines.append(f"correlations of errors: {', '.join(told)}  ")
     return lines
 
 

@@ -418,6 +418,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         "| zero",
         "fixed by training",
         "trained on",
+        "correlations of errors: sideways-forward ",
     ):
         assert said in done.stdout
     assert "training has seen 17 of these 18 pairs: errors on them are no measure" in done.stderr
@@ -431,6 +432,11 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         row, zero = table["rows"]
         assert np.allclose(row["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
         assert np.allclose(row["thesis"], np.array(row["rmse"]) * [1, 1, 100])
+        together = np.corrcoef(error.T)[[0, 0, 1], [1, 2, 2]]
+        assert table["correlations"] == {
+            name: pytest.approx(value, rel=1e-4)
+            for name, value in zip(("sideways-forward", "sideways-yaw", "forward-yaw"), together, strict=True)
+        }
         assert np.allclose(row["median"], np.median(np.abs(error), axis=0), rtol=1e-5)
         assert np.allclose(row["bias"], error.mean(axis=0), rtol=1e-5)
         assert np.allclose(row["slope"], (SAYS * motion).sum(axis=0) / power, rtol=1e-4, atol=1e-7)
