@@ -155,7 +155,7 @@ class Odometry:
         if doubts:
             told.append(
                 f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
-                f"counts all the same: {_usual(doubts)}; check height and pitch"
+                f"counts all the same: {_usual(doubts)}; check height and pitch (faint ground near the sonar looks so, too)"
             )
         return told
 
