@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,7 +34,12 @@ Span = Annotated[float, typer.Option("--span-db", help="Levels from full scale d
 def recordings() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Look at recordings of real sonars and at runs, and convert them.", no_args_is_help=True)
-    for command in (info, show, video, answered(convert, {"beams": "--beams"})):
+    for command in (
+        info,
+        show,
+        video,
+        answered(convert, {"beams": "--beams", "crop_bins": "--crop-bins", "crop_beams": "--crop-beams"}),
+    ):
         app.command()(command)
     return app
 
@@ -139,6 +145,10 @@ def convert(
     beams: Annotated[
         int | None, typer.Option(help="Beams of an ARIS file: 48, 64, 96 or 128 (default: those of the frames).")
     ] = None,
+    crop_bins: Annotated[
+        str | None, typer.Option("--crop-bins", help="Bins to keep: first,end, numbered from 0, the end not counted.")
+    ] = None,
+    crop_beams: Annotated[str | None, typer.Option("--crop-beams", help="Beams to keep, likewise, from port.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
 ) -> None:
@@ -155,9 +165,13 @@ def convert(
     recording = _opened(file, topic, geometry)
     _say_notes(recording)
     chosen = recording.part(part)
+    spans = [None if text is None else _span(text, option) for text, option in ((crop_bins, "bins"), (crop_beams, "beams"))]
     if len(recording.parts) > 1:
         number = recording.longest if part is None else part
         say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {counted(len(recording), 'frame')}")
+    if any(spans):
+        chosen = chosen.cropped(*spans)
+        recording, part = replace(recording, parts=(chosen,)), None
     made = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":
@@ -168,6 +182,18 @@ def convert(
         else:
             made = write_frames(recording, part, out, overwrite=overwrite, resume=resume, progress=progress)
     say(f"{counted(len(chosen), 'frame')} in {made}")
+
+
+def _span(text: str, what: str) -> tuple[int, int]:
+    """Return the numbers of a span.
+
+    Raises:
+        MitsonarError: something else than two whole numbers.
+    """
+    words = text.split(",")
+    if len(words) != 2 or not all(word.strip().isdecimal() for word in words):
+        raise MitsonarError(f"--crop-{what} is two whole numbers, first,end, such as 0,512: got {text!r}")
+    return int(words[0]), int(words[1])
 
 
 def _opened(file: str, topic: str | None, geometry: Path | None) -> Recording:

@@ -44,6 +44,14 @@ class LabelledPart(Part):
         """
         return replace(super().read(index), **self.labels(np.asarray(index, dtype=np.intp)))
 
+    def _read_within(self, rows: slice, columns: slice) -> dict[str, Any]:
+        """Return the fields that read pixels and their labels, of these bins and beams."""
+
+        def labels(index: Index) -> Labels:
+            return {name: values[:, rows, columns] for name, values in self.labels(index).items()}
+
+        return {**super()._read_within(rows, columns), "labels": labels}
+
 
 def recording_at(
     where: str | Path, *, sequence: int | None = None, view: str | None = None, geometry: str | Path | None = None

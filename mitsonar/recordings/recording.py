@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.errors import MitsonarError, counted
+from mitsonar.errors import MitsonarError, argument, counted
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["CHUNK_BYTES", "Facts", "Part", "Pixels", "Recording", "in_time_order", "runs_of"]
@@ -67,12 +67,54 @@ class Part:
         known = {name: getattr(self, name)[chosen] for name in per_frame if getattr(self, name) is not None}
         return replace(self.like, image=self.images(chosen), time_s=self.time_s[chosen], **known)
 
+    def cropped(self, bins: tuple[int, int] | None, beams: tuple[int, int] | None) -> Part:
+        """Return the part with these bins and beams only, from the first of a pair to before the second; None: all.
+
+        Raises:
+            MitsonarError: fewer than two of either, or some that are not there.
+        """
+        rows, columns = (
+            _within(what, span, len(axis))
+            for what, span, axis in (("bins", bins, self.like.range_m), ("beams", beams, self.like.bearing_rad))
+        )
+        range_m, bearing_rad = self.like.range_m[rows], self.like.bearing_rad[columns]
+        half_m, width_rad = (float(np.diff(axis).mean()) for axis in (range_m, bearing_rad))
+        sonar = self.like.sonar.replace(
+            beams=len(bearing_rad),
+            range_bins=len(range_m),
+            range_min=max(0.0, float(range_m[0] - half_m / 2)),
+            range_max=float(range_m[-1] + half_m / 2),
+            azimuth_fov_deg=min(self.like.sonar.azimuth_fov_deg, float(np.degrees(width_rad)) * len(bearing_rad)),
+        )
+        image = self.like.image[:, rows, columns]
+        like = replace(self.like, image=image, range_m=range_m, bearing_rad=bearing_rad, sonar=sonar)
+        return replace(self, like=like, **self._read_within(rows, columns))
+
+    def _read_within(self, rows: slice, columns: slice) -> dict[str, Any]:
+        """Return the fields that read pixels, of these bins and beams."""
+        return {"images": lambda index: self.images(index)[:, rows, columns]}
+
     def chunks(self) -> Iterator[SonarFrames]:
         """Read all frames, some at a time, so that memory does not grow with the file."""
         cells = max(1, len(self.like.range_m) * len(self.like.bearing_rad))
         count = max(1, CHUNK_BYTES // (4 * cells))
         for start in range(0, len(self), count):
             yield self.read(np.arange(start, min(start + count, len(self))))
+
+
+def _within(what: str, span: tuple[int, int] | None, count: int) -> slice:
+    """Return the slice of a span of bins or beams.
+
+    Raises:
+        MitsonarError: it holds fewer than two, or some that are not there.
+    """
+    first, end = (0, count) if span is None else span
+    if not (0 <= first < end - 1 and end <= count):
+        raise MitsonarError(
+            f"{argument(f'crop_{what}')} is first,end of two {what} or more, numbered from 0, the end not counted, within "
+            f"0,{count}: got {first},{end}"
+        )
+    return slice(first, end)
 
 
 @dataclass(frozen=True)

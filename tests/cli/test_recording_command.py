@@ -37,6 +37,28 @@ def places(frames: SonarFrames, tmp_path_factory: pytest.TempPathFactory) -> dic
     return {"npz": folder / "frames.npz", "zarr": folder / "run", "mcap": folder / "run.mcap"}
 
 
+@pytest.mark.parametrize("kind", essence(["npz", "mcap"]))
+def test_a_crop_keeps_bins_and_beams_with_their_axes(
+    mitsonar: Command, places: dict[str, Path], frames: SonarFrames, tmp_path: Path, kind: str
+) -> None:
+    done = mitsonar(
+        "recording", "convert", places[kind], "-o", tmp_path / "c", "--crop-bins", "20,84", "--crop-beams", "8,40"
+    )
+    assert done.returncode == 0, done
+    found, rows, columns = SonarFrames.load(tmp_path / "c" / "frames.npz"), slice(20, 84), slice(8, 40)
+    np.testing.assert_array_equal(found.image, frames.image[:, rows, columns])
+    np.testing.assert_allclose(found.range_m, frames.range_m[rows])
+    np.testing.assert_allclose(found.bearing_rad, frames.bearing_rad[columns], atol=1e-7)
+    assert (found.sonar.range_bins, found.sonar.beams) == (64, 32)
+    assert found.sonar.range_min == pytest.approx(frames.range_m[20] - 0.5 * np.diff(frames.range_m)[0], abs=1e-6)
+    if kind == "npz":
+        assert found.elevation_rad is not None
+        assert found.elevation_rad.shape == found.image.shape
+    whole = mitsonar("recording", "convert", places[kind], "-o", tmp_path / "w", "--crop-beams", "0,96")
+    assert whole.returncode == 0
+    assert SonarFrames.load(tmp_path / "w" / "frames.npz").sonar.azimuth_fov_deg <= frames.sonar.azimuth_fov_deg
+
+
 @pytest.mark.parametrize("kind", ["npz", "zarr", "mcap"])
 def test_info_of_any_frames(mitsonar: Command, places: dict[str, Path], frames: SonarFrames, kind: str) -> None:
     done = mitsonar("recording", "info", places[kind], "--json")
@@ -146,6 +168,8 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
         (["convert", "FRAMES", "-o", "a.bag"], "unknown ending"),
         (["convert", "FRAMES", "-o", "a.mcap", "--resume"], "--resume is for folders"),
         (["convert", "FRAMES", "-o", "a.mcap", "--part", "3"], "has no part 3"),
+        (["convert", "FRAMES", "-o", "a", "--crop-bins", "20"], "--crop-bins is two whole numbers, first,end"),
+        (["convert", "FRAMES", "-o", "a", "--crop-beams", "90,97"], "--crop-beams is first,end of two beams or more"),
         (["convert", "FRAMES", "-o", "a", "--full"], "--full and --labels are of MCAP files"),
         (["video", "FRAMES", "-o", "a.mp4", "--rate", "0"], "--rate must lie"),
         (["show", "FRAMES", "-o", "a.png", "--span-db", "-1"], "the span must lie"),
