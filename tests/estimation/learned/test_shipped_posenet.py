@@ -27,7 +27,7 @@ UNSEEN, GAIN = 730_022, 0.0462
 def pairs(tmp_path_factory: pytest.TempPathFactory) -> SonarPairs:
     """Two worlds of twelve pairs."""
     path = tmp_path_factory.mktemp("unseen") / "unseen.zarr"
-    scenes = [{"count": 2, "sequences": 12, "world": {"size_m": 12, "a_side": [8, 12]}}]
+    scenes = [{"count": 2, "sequences": 12, "world": {"size_m": 30}}]
     fields = {"scenes": scenes, "flight.pings": 2, "seed": UNSEEN, "gain": GAIN}
     make_dataset(load_recipe("rocky-field", fields), str(path))
     return SonarPairs(path, part="all")
@@ -56,9 +56,9 @@ def test_it_refuses_what_it_has_not_learnt(pairs: SonarPairs) -> None:
     assert frames.poses is not None
     assert frames.height_m is not None
     higher, steeper = frames.poses.copy(), frames.poses.copy()
-    higher[:, 2] += 0.5
+    higher[:, 2] += 1.0
     steeper[:, 3] += np.radians(5)
-    for changed in (replace(frames, poses=higher, height_m=frames.height_m + 0.5), replace(frames, poses=steeper)):
+    for changed in (replace(frames, poses=higher, height_m=frames.height_m + 1.0), replace(frames, poses=steeper)):
         found = network.estimate(changed)
         assert not found.valid
         assert "height 2.5 m, pitch 35 deg are fixed by training" in found.reason
