@@ -432,7 +432,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         row, zero = table["rows"]
         assert np.allclose(row["rmse"], np.sqrt((error**2).mean(axis=0)), rtol=1e-5)
         assert np.allclose(row["thesis"], np.array(row["rmse"]) * [1, 1, 100])
-        together = np.corrcoef(error.T)[[0, 0, 1], [1, 2, 2]]
+        together = np.asarray(np.corrcoef(error.T))[[0, 0, 1], [1, 2, 2]]
         assert table["correlations"] == {
             name: pytest.approx(value, rel=1e-4)
             for name, value in zip(("sideways-forward", "sideways-yaw", "forward-yaw"), together, strict=True)
