@@ -40,6 +40,7 @@ TABLE_52 = (
     *("impulse-standard", "impulse-two-receivers", "impulse-40khz", "impulse-60khz", "impulse-100khz", "impulse-160khz"),
     *("impulse-narrow", "impulse-circular-4800", "impulse-wideband-9600", "impulse-wideband-19200"),
     *("impulse-circular-19200", "impulse-high-objects", "impulse-ten-80khz", "impulse-ten-160khz", "impulse-ten-320khz"),
+    *("scatterers-standard", "scatterers-wideband-19200"),
 )
 SMALL = 0.01
 """Scales below this one train small networks on coarse data, one row of each table: a check of the steps, no result."""
