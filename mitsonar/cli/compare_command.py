@@ -32,7 +32,7 @@ def compare(
     part: Annotated[str | None, typer.Option(help="train, validation, test (default if the split has one) or all.")] = None,
     split: Annotated[
         str | None,
-        typer.Option(help="sequence or scene (default: that of the networks' training, else of the data set)."),
+        typer.Option(help="sequence, scene or sample (default: that of the networks' training, else of the data set)."),
     ] = None,
     pairs: Annotated[int | None, typer.Option(min=2, help="Largest number of pairs, one a sequence.")] = None,
     perturb: Annotated[

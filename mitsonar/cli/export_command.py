@@ -35,17 +35,17 @@ def export(
         if path is not None:
             _refuse_place(option, path, suffix, overwrite=overwrite)
     checkpoint = checkpoint_from(run)
-    said = f"{checkpoint.network} of mitsonar {checkpoint.version}"
+    network = f"{checkpoint.network} of mitsonar {checkpoint.version}"
     if half is not None:
         content = checkpoint.halved().to_bytes()
         write_whole(half, content)
-        say(f"{said}, {len(content):,} bytes: {half}")
+        say(f"{network}, {len(content):,} bytes: {half}")
     if onnx is not None:
         from mitsonar.networks.onnx_export import onnx_of
 
         content = onnx_of(checkpoint, None if batch == "dynamic" else int(batch))
         write_whole(onnx, content)
-        say(f"{said}, {len(content):,} bytes: {onnx}")
+        say(f"{network}, {len(content):,} bytes: {onnx}")
 
 
 def _refuse_place(option: str, path: Path, suffix: str, *, overwrite: bool) -> None:

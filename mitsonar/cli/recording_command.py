@@ -171,7 +171,9 @@ def convert(
         say(f"part {number} of {len(recording.parts):,}: {len(chosen):,} of {counted(len(recording), 'frame')}")
     if any(spans):
         chosen = chosen.cropped(*spans)
-        recording, part = replace(recording, parts=(chosen,)), None
+        # a resumed conversion compares formats, so that it does not go on with another crop
+        crop = ", ".join(f"{what} {text}" for what, text in (("bins", crop_bins), ("beams", crop_beams)) if text)
+        recording, part = replace(recording, format=f"{crop} of {recording.format}", parts=(chosen,)), None
     made = out
     with progress_bar("converting", len(chosen), "frames") as progress:
         if out.suffix == ".mcap":

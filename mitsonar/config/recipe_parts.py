@@ -23,7 +23,10 @@ from mitsonar.errors import shortened
 from mitsonar.motion.pose import Pose
 from mitsonar.worlds.world import Interval
 
-__all__ = ["Flight", "MirrorKeys", "Mount", "ReceiverSpec", "RecipePart", "Recorded", "RecordedSource", "Scenes", "Split"]
+__all__ = [
+    *("SPLITS", "Flight", "MirrorKeys", "Mount", "ReceiverSpec", "RecipePart", "Recorded", "RecordedSource", "Scenes"),
+    "Split",
+]
 
 
 class RecipePart(BaseModel):
@@ -159,6 +162,10 @@ class Flight(RecipePart):
     def heights(self) -> tuple[float, float]:
         """Return lowest and highest height [m]."""
         return (self.height_m, self.height_m) if isinstance(self.height_m, float | int) else self.height_m
+
+
+SPLITS = ("sequence", "scene", "sample")
+"""Names of splits, as :attr:`Split.by`."""
 
 
 class Split(RecipePart):

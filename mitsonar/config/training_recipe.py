@@ -16,6 +16,7 @@ from mitsonar.acoustics.noise import load_noise
 from mitsonar.acoustics.signal_to_noise import snr_of
 from mitsonar.config.data_recipe import Split, split_from
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
+from mitsonar.config.recipe_parts import SPLITS
 from mitsonar.errors import MitsonarError, complaint, shortened
 
 __all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
@@ -221,8 +222,8 @@ class TrainingRecipe(_Part):
             raise ValueError("augment is for inputs with ground: set input.ground: true, or leave augment out")
         if isinstance(self.split, dict):
             split_from(self.split)
-        elif self.split not in ("sequence", "scene", "sample"):
-            raise ValueError(f"split must be sequence, scene, sample, or keys as in a data set recipe: got {self.split!r}")
+        elif self.split not in SPLITS:
+            raise ValueError(f"split must be {', '.join(SPLITS)}, or keys as in a data set recipe: got {self.split!r}")
         return self
 
     @property

@@ -9,19 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.config.data_recipe import Recipe, Split, split_from
+from mitsonar.config.recipe_parts import SPLITS
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.split import deal, deal_samples, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 
-__all__ = ["SPLITS", "AnySplit", "Part", "split_for"]
+__all__ = ["AnySplit", "Part", "split_for"]
 
 AnySplit: TypeAlias = str | Split | Fields | None
 """A split by name, as an object, or by the keys of a recipe; None: the recipe's own."""
-
-
-SPLITS = ("sequence", "scene", "sample")
-"""Names of splits."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +109,6 @@ def split_for(split: AnySplit, recipe: Recipe) -> Split:
         case "scene":
             return recipe.split if recipe.split.by == "scene" else Split(by="scene", train=0.8, validation=0.1, test=0.1)
         case "sample":
-            return recipe.split if recipe.split.by == "sample" else Split(by="sample", train=0.9, test=0.05)
+            return recipe.split if recipe.split.by == "sample" else Split(by="sample", train=0.9, validation=0.05, test=0.05)
         case _:
             raise MitsonarError(f"split must be {', '.join(SPLITS)}, or keys as in a recipe: got {split!r}")

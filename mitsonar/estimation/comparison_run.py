@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,9 @@ from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
 from mitsonar.io.provenance import digest, versions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import cluster_resamples, in_units
+
+if TYPE_CHECKING:
+    from mitsonar.networks.checkpoint import Checkpoint
 
 __all__ = ["Estimators", "compare"]
 
@@ -120,8 +123,8 @@ def compare(
             them, a list, or a dictionary by the names of the rows; default: all that need no training.
         noise: levels, commas between them, or ``;``.
         part: of the data set; default: the one that training does not use.
-        split: ``sequence`` or ``scene``; default: that with which networks among the estimators were trained on this data
-            set, else the data set's own.
+        split: ``sequence``, ``scene`` or ``sample``; default: that with which networks among the estimators were trained on
+            this data set, else the data set's own.
         pairs: at most so many; default: all.
         perturb: add rows in which estimators get wrong inputs.
         jitter: add a row with jittered rays.
@@ -166,7 +169,7 @@ def compare(
     notes = [f"{counted(scenes, 'scene')} only: the 95 % intervals are too narrow; compare on {FEWEST_SCENES} or more"]
     notes = notes if scenes < FEWEST_SCENES else []
     notes += [
-        f"{name} has learnt from {count} of the {counted(len(bench.numbers), 'pair')}: its errors on them are no measure; "
+        f"{name} was trained on {count} of the {counted(len(bench.numbers), 'pair')}, whose errors are too small; "
         f"give {argument('part')} {bench.first.split.unseen}, or other data"
         for name, count in bench.learnt.items()
         if count
@@ -216,7 +219,10 @@ def _bench(data: str, estimators: Estimators, asked: _Asked) -> Bench:
     # of the sonar: the labels of a data set are the vehicle's motions, and a mount may turn or offset them
     pose = first.chosen.pose
     truth = np.array([motions(pose[first.frame_numbers(number)][[0, -1]])[0] for number in numbers])
-    learnt = {name: int(one.checkpoint.learnt(first)[numbers].sum()) for name, one in _networks(methods).items()}
+    learnt = {
+        name: int(np.any([one.learnt(first)[numbers] for one in of], axis=0).sum())
+        for name, of in _checkpoints(methods).items()
+    }
     return Bench(methods, levels, samples, numbers, truth, first.scene[first.first[numbers]], learnt)
 
 
@@ -228,20 +234,20 @@ def _split(asked: str | None, methods: Mapping[str, AnyEstimator], recipe: Recip
     """
     if asked is not None:
         return split_for(asked, recipe)
-    known = {name: one.checkpoint.split_of_training(recipe) for name, one in _networks(methods).items()}
-    theirs = {name: split for name, split in known.items() if split is not None}
-    if len({split.model_dump_json() for split in theirs.values()}) > 1:
-        told = ", ".join(f"{name} by {split.by}" for name, split in theirs.items())
+    known = [(name, one.split_of_training(recipe)) for name, of in _checkpoints(methods).items() for one in of]
+    theirs = [(name, split) for name, split in known if split is not None]
+    if len({split.model_dump_json() for _, split in theirs}) > 1:
+        splits = ", ".join(f"{name} by {split.by}" for name, split in theirs)
         raise MitsonarError(
-            f"the networks were trained on other parts of this data set: {told}; choose {argument('split')}, and those rows "
-            "are marked that hold pairs which training has seen"
+            f"the networks were trained on other parts of this data set: {splits}; choose {argument('split')}, which marks "
+            "rows with pairs that training has seen"
         )
-    return next(iter(theirs.values()), recipe.split)
+    return theirs[0][1] if theirs else recipe.split
 
 
-def _networks(methods: Mapping[str, AnyEstimator]) -> dict[str, Any]:
-    """Return the estimators that a checkpoint makes."""
-    return {name: one for name, one in methods.items() if hasattr(one, "checkpoint")}
+def _checkpoints(methods: Mapping[str, AnyEstimator]) -> dict[str, tuple[Checkpoint, ...]]:
+    """Return the checkpoints of those estimators that have some."""
+    return {name: getattr(one, "checkpoints") for name, one in methods.items() if hasattr(one, "checkpoints")}  # noqa: B009
 
 
 def _methods(estimators: str | Sequence[EstimatorLike] | Mapping[str, EstimatorLike]) -> dict[str, AnyEstimator]:

@@ -78,13 +78,13 @@ class Part:
             for what, span, axis in (("bins", bins, self.like.range_m), ("beams", beams, self.like.bearing_rad))
         )
         range_m, bearing_rad = self.like.range_m[rows], self.like.bearing_rad[columns]
-        half_m, width_rad = (float(np.diff(axis).mean()) for axis in (range_m, bearing_rad))
+        step_m, step_rad = (float(np.diff(axis).mean()) for axis in (range_m, bearing_rad))
         sonar = self.like.sonar.replace(
             beams=len(bearing_rad),
             range_bins=len(range_m),
-            range_min=max(0.0, float(range_m[0] - half_m / 2)),
-            range_max=float(range_m[-1] + half_m / 2),
-            azimuth_fov_deg=min(self.like.sonar.azimuth_fov_deg, float(np.degrees(width_rad)) * len(bearing_rad)),
+            range_min=max(0.0, float(range_m[0] - step_m / 2)),
+            range_max=float(range_m[-1] + step_m / 2),
+            azimuth_fov_deg=min(self.like.sonar.azimuth_fov_deg, float(np.degrees(step_rad)) * len(bearing_rad)),
         )
         image = self.like.image[:, rows, columns]
         like = replace(self.like, image=image, range_m=range_m, bearing_rad=bearing_rad, sonar=sonar)

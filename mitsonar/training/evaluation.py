@@ -267,13 +267,11 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
 
 
 def _correlations(error: Array, axes: int) -> dict[str, float | None]:
-    """Return the correlations of the errors of any two axes ``(n, axes)``; None where an axis has none."""
-    error = error[:, :axes] - error[:, :axes].mean(axis=0)
-    size = np.sqrt((error**2).sum(axis=0))
+    """Return the correlations of the errors of any two axes ``(n, axes)``; None where an axis has no error."""
+    with np.errstate(invalid="ignore"):
+        table = np.atleast_2d(np.corrcoef(error[:, :axes], rowvar=False))
     return {
-        f"{AXES[one].name}-{AXES[other].name}": float(error[:, one] @ error[:, other] / (size[one] * size[other]))
-        if size[one] * size[other] > 0
-        else None
+        f"{AXES[one].name}-{AXES[other].name}": float(table[one, other]) if np.isfinite(table[one, other]) else None
         for one, other in combinations(range(axes), 2)
     }
 
@@ -355,10 +353,10 @@ def _other_channel(trained: ChannelSonar, other: ChannelSonar, name: str) -> lis
 
 
 def _learnt_of(checkpoint: Checkpoint, samples: SonarPairs | ImpulsePairs, subject: _Subject) -> list[str]:
-    """Say how many of the pairs training has seen, if any."""
+    """Return a sentence on how many of the pairs training has seen, if any."""
     seen = int(checkpoint.learnt(samples)[subject.numbers].sum())
     count = counted(len(subject.numbers), "pair")
-    return [f"training has seen {seen} of these {count}: errors on them are no measure"] if seen else []
+    return [f"training has seen {seen} of these {count}: their errors do not show how it does on others"] if seen else []
 
 
 def _notes(checkpoint: Checkpoint, recipe: Recipe) -> list[str]:

@@ -32,9 +32,9 @@ def report_lines(report: JsonObject) -> list[str]:
         lines.append(
             f"beyond the targets of training: {beyond['true']:.1%} of the samples, {beyond['answers']:.1%} of the answers  "
         )
-        told = [f"{axes} {'-' if value is None else f'{value:.2f}'}" for axes, value in table["correlations"].items()]
-        if told:
-            lines.append(f"correlations of errors: {', '.join(told)}  ")
+        known = [f"{axes} {'-' if value is None else f'{value:.2f}'}" for axes, value in table["correlations"].items()]
+        if known:
+            lines.append(f"correlations of errors: {', '.join(known)}  ")
     return lines
 
 

@@ -34,14 +34,14 @@ GAIN = (
     " *high noise*: here the mean echo is 0.44 of the scale of this noise. The gain of Almanza-Medina is not known, and "
     "must have been several times larger: the baseline there hardly feels the noise (table 3.8: 8.39 and 8.16 mm)."
 )
-"""What a table tells of its columns with high noise."""
+"""Note on columns with high noise."""
 
 OF_PARTS: dict[Part, str] = {
     "validation": "the network that a training keeps is the best on them.",
     "test": "*other sequences*: one pair a sequence of those kept from training and validation, of the same scenes.",
     "unseen": "*unseen scenes*: one pair a sequence of a data set with another seed, whose scenes no network has seen.",
 }
-"""What a table tells of each."""
+"""Note on each."""
 
 REACHED: dict[str, Callable[[Found], str]] = {
     "pairs to learn from": lambda found: f"{found.reached.training_pairs:,}",
@@ -52,6 +52,7 @@ REACHED: dict[str, Callable[[Found], str]] = {
     "scored pairs: validation, unseen (scenes)": lambda found: (
         f"{found.validation['none'].pairs:,}, {found.unseen['none'].pairs:,} ({found.unseen['none'].scenes})"
     ),
+    "scored pairs: other sequences": lambda found: f"{found.test['none'].pairs:,}" if found.test else "-",
     "on": lambda found: f"{found.reached.device}; {found.reached.machine}, threads: {found.reached.threads}",
     "date": lambda found: found.reached.date,
 }

@@ -54,6 +54,8 @@ def test_a_crop_keeps_bins_and_beams_with_their_axes(
     if kind == "npz":
         assert found.elevation_rad is not None
         assert found.elevation_rad.shape == found.image.shape
+    other = ("recording", "convert", places[kind], "-o", tmp_path / "c", "--crop-bins", "20,84", "--crop-beams", "9,41")
+    refused(mitsonar(*other, "--resume"), "beams 8,40", "beams 9,41")
     whole = mitsonar("recording", "convert", places[kind], "-o", tmp_path / "w", "--crop-beams", "0,96")
     assert whole.returncode == 0
     assert SonarFrames.load(tmp_path / "w" / "frames.npz").sonar.azimuth_fov_deg <= frames.sonar.azimuth_fov_deg

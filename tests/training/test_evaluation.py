@@ -32,6 +32,7 @@ pytestmark = [
 
 from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.comparison_run import compare  # noqa: E402
+from mitsonar.estimation.learned.height_ensemble import HeightEnsemble  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
@@ -388,7 +389,7 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     found = compare(made, {"zero": "zero", "net": ImageNetwork(told)}, limit=0)
     assert (found.report["pairs"], found.report["split"]["by"]) == (6, "scene")
     assert [row["learnt"] for row in found.rows] == [0, 0]
-    assert not any("learnt" in sentence for sentence in found.notes)
+    assert not any("was trained on" in sentence for sentence in found.notes)
     by_sequence = SonarPairs(made, part="train", split="sequence", one_a_sequence=True)
     mixed = sum(first in taught for first in by_sequence.first)
     assert 0 < mixed < len(by_sequence)
@@ -396,13 +397,15 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     done = mitsonar("compare", made, *words)
     assert done.returncode == 0, done.stderr
     assert f"network.ckpt (learnt {mixed})" in done.stdout
-    assert f"has learnt from {mixed} of the {len(by_sequence)} pairs" in done.stderr
+    assert f"was trained on {mixed} of the {len(by_sequence)} pairs" in done.stderr
     refused(mitsonar("compare", made, "--split", "world"), "split must be sequence, scene")
     other = constant(SonarPairs(made, part="all", labels="normx10"), recipe={"split": "sequence"})
     with pytest.raises(
         MitsonarError, match="trained on other parts of this data set: a by scene, b by sequence; choose split"
     ):
         compare(made, {"a": ImageNetwork(told), "b": ImageNetwork(other)}, limit=0)
+    both = compare(made, {"both": HeightEnsemble([ImageNetwork(told), ImageNetwork(told)])}, part="train", limit=0)
+    assert [row["learnt"] for row in both.rows] == [both.report["pairs"]]
     rendered = replace(told, trained={"rendered": True})
     assert not rendered.learnt(by_sequence).any()
 
@@ -421,7 +424,7 @@ def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, r
         "correlations of errors: sideways-forward ",
     ):
         assert said in done.stdout
-    assert "training has seen 17 of these 18 pairs: errors on them are no measure" in done.stderr
+    assert "training has seen 17 of these 18 pairs: their errors do not show how it does on others" in done.stderr
     assert "3 scenes only" in done.stderr
     report = json.loads((tmp_path / "out" / "table.json").read_text())
     truth = SonarPairs(made, part="all", one_a_sequence=True)

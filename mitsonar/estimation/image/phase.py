@@ -113,9 +113,10 @@ def _windowed(image: Floats, window: Floats) -> Floats:
 def _spectrum_by_angle(image: Floats, larger: float) -> Floats:
     """Logarithm of the spectrum's magnitude over half a turn ``(angles, frequencies)``, less the mean over angles.
 
-    The frequencies are the same on the ground where pixels are so many times larger.
+    The frequencies are the same on the ground where pixels are so many times larger, as far as these show them. Pixels of a
+    fan of 40 m have 0.14 m; then the upper half of what they show is used.
     """
-    band = [min(larger * end, HIGHEST) for end in BAND]
+    band = min(larger * BAND[0], HIGHEST / 2), min(larger * BAND[1], HIGHEST)
     size = 2 * cv2.getOptimalDFTSize(max(image.shape))
     magnitude = np.fft.fftshift(np.abs(np.fft.rfft2(image, (size, size))), axes=0).astype(np.float32)
     angle = (np.arange(ANGLES, dtype=np.float32)[:, None] + 0.5) / ANGLES * np.pi - np.pi / 2

@@ -12,6 +12,7 @@ from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.learned.image_network import ImageNetwork
 from mitsonar.estimation.learned.view_network import ViewNetwork
 from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 
@@ -47,6 +48,11 @@ class HeightEnsemble:
     @property
     def _members(self) -> list[ImageNetwork | ViewNetwork]:
         return [one for one in self.networks if isinstance(one, ImageNetwork | ViewNetwork)]
+
+    @property
+    def checkpoints(self) -> tuple[Checkpoint, ...]:
+        """Return the checkpoints of all networks."""
+        return tuple(checkpoint for one in self._members for checkpoint in one.checkpoints)
 
     @property
     def consumes(self) -> type:

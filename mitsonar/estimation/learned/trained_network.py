@@ -114,9 +114,9 @@ class Trained:
     """What serves other sonars."""
 
     @property
-    def checkpoint(self) -> Checkpoint:
+    def checkpoints(self) -> tuple[Checkpoint, ...]:
         """Return the checkpoint."""
-        return self._checkpoint
+        return (self._checkpoint,)
 
     @property
     def heights(self) -> tuple[float, float]:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from drawn_frames import over_ground
 from helpers import box, essence, scene
 
 from mitsonar.acoustics.noise import NOISE_MODELS
@@ -18,6 +19,7 @@ from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
@@ -111,6 +113,17 @@ def test_sign_and_size_of_each_axis(pair: Pair, method: str, axis: int, size: fl
     assert found.valid, found.reason
     beyond = 3 if method in TRAINED and abs(size) > 1 else 1  # beyond what it has learnt: phase finds where it starts
     assert (np.abs(error) < beyond * np.array(ALLOWED[method])).all(), f"mm, mm, deg: {error}"
+
+
+@pytest.mark.parametrize("method", CLASSICAL)
+def test_a_fan_of_forty_metres_is_answered(method: str) -> None:
+    """Its pixels of the ground are wider than the texture by whose spectrum ``phase`` finds turns in smaller fans."""
+    sonar = load_sonar("oculus-m750d-750khz").replace(beams=128, range_bins=512)
+    poses = np.array([[0, 0, 4.0, np.radians(20), 0, 0], [0, 0.3, 4.0, np.radians(20), 0, 0.01]])
+    frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar)
+    found = create_estimator(method).estimate(frames)
+    assert found.valid or found.reason
+    assert not found.valid or abs(found.motion.forward - 0.3) < 0.07  # half a pixel
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -1,4 +1,4 @@
-"""The PoseNet that comes along: two frames in one geometry, and a motion, on worlds that it has not seen."""
+"""The shipped PoseNet: motions over worlds that it has not seen, and what it refuses."""
 
 from __future__ import annotations
 
