@@ -108,7 +108,7 @@ class GroundNodes:
         return np.asarray(nodes[:, row, column], dtype=np.float64)
 
     def lifted_shift(self, v: Doubles) -> Doubles:
-        """Return the derivative of :meth:`shift` by the height [m/m, rad/m], to first order in the motion."""
+        """Return the derivative of :meth:`shift` by the height [m/m, rad/m]."""
         change = HEIGHT_STEP * self.attitude.height_m
-        higher = self._derivative(self._ground(None, -change))
-        return np.asarray(np.tensordot(v / change, higher - self.derivative, axes=1))
+        higher, lower = (self.shift(v, back=False, lift_m=lift_m) for lift_m in (-change, change))
+        return (higher - lower) / (2 * change)

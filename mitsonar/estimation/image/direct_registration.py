@@ -14,10 +14,16 @@ from mitsonar.estimation.image.direct_blocks import by_block, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
 
-__all__ = ["FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"]
+__all__ = [
+    *("FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"),
+    "without_illumination",
+]
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+
+ILLUMINATION = (12.0, 4.0)
+"""Bins and beams beyond which brightness belongs to the sonar, which moves, and not to the ground."""
 
 STILL = np.array([3e-5, 3e-5, 6e-6])
 """Steps below which an iteration ends [m, m, rad]."""
@@ -252,17 +258,18 @@ def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
 
 
 def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held: Doubles, converged: bool) -> Fit:
-    """Assess the motion from the gradients of single cells, and from slopes of one frame times those of the other.
+    """Assess the motion from slopes of one frame times those of the other, and from the pulls of blocks.
 
-    Sums of gradients over blocks tell less: what interpolation leaves over changes sign within a block and cancels there.
+    These hold whatever errs together within a block: noise, speckle, relief, in both ways of drawing at once.
     """
     true = np.sum([_by_motion(cells.derivative, _cross(side, cells, level)) for side in at.sides], axis=0)
     # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
     sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
     undone = np.linalg.inv(sound + np.diag(held))
-    pulls = np.sum([_by_motion(cells.derivative, _squared_pulls(side, cells)) for side in at.sides], axis=0)
+    pulls = np.sum([(cells.derivative * side.pull).sum(axis=1) for side in at.sides], axis=0)
+    each = undone @ _together(pulls, cells)
     # what is known before errs, too: where the frames tell nothing it is all that is known
-    spread = alike_cells(level) * ((pulls + pulls.T) / 2 + at.scale**2 * np.diag(held))
+    known = undone * (alike_cells(level) * at.scale**2 * held) @ undone.T
     side = at.sides[0]
     informed = [_information(cells.derivative, one.slopes) for one in at.sides]
     shares = _together((np.tensordot(undone, informed[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
@@ -272,20 +279,13 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
     independent, excess = before.size / alike_cells(level), _excess(side, cells)
     return Fit(
         converged=converged,
-        covariance=ambiguity(excess.mean, independent) * undone @ spread @ undone,
+        covariance=ambiguity(excess.mean, independent) * (each @ each.T + (known + known.T) / 2),
         by_height=undone @ by_height,
         correlation=correlation_of(before, after),
         independent=independent,
         blocks=spread_of(shares),
         excess=excess,
     )
-
-
-def _squared_pulls(side: _Side, cells: Cells) -> Doubles:
-    """Return sums of the squared pulls of single cells over patches: along bins, of both, along beams ``(3, patches)``."""
-    residual = side.after - side.before
-    along, across = side.along * residual, side.across * residual
-    return products_by_block(((along, along), (along, across), (across, across)), cells.patch) * side.patches**2
 
 
 def _excess(side: _Side, cells: Cells) -> Excess:
@@ -306,6 +306,12 @@ def smoothed(image: Floats, level: DirectLevel) -> Floats:
     if level.step == 1:
         return blurred(image, bins, beams)
     return blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
+
+
+def without_illumination(image: Floats, level: DirectLevel) -> Floats:
+    """Every so many bins of the smoothed image, less what is as coarse as the illumination."""
+    fine, (bins, beams) = smoothed(image, level), ILLUMINATION
+    return fine - blurred(fine, bins / level.step, beams)
 
 
 @lru_cache(maxsize=16)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import correlation_of, spread_of
-from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
+from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.direct_nodes import GroundNodes
 from mitsonar.estimation.image.direct_registration import (
@@ -25,9 +25,9 @@ from mitsonar.estimation.image.direct_registration import (
     cauchy,
     is_resolved,
     noise_of,
-    smoothed,
+    without_illumination,
 )
-from mitsonar.estimation.image.image_slopes import blurred, sampled, slopes_of
+from mitsonar.estimation.image.image_slopes import sampled, slopes_of
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -48,9 +48,6 @@ RELIEF_BLOCK = (32, 12)
 
 RELIEF_STD = 0.048
 """Standard deviation of a block's height, as part of the sonar's: 0.12 m at 2.5 m."""
-
-ILLUMINATION = (12.0, 4.0)
-"""Bins and beams beyond which brightness belongs to the sonar, which moves, and not to the ground."""
 
 ALIKE = 20.0
 """Residuals that count as one: those of a block err together where its ground is not as the model has it."""
@@ -100,8 +97,7 @@ class _ReliefLevel:
     def __init__(self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel) -> None:
         self.level = level
         self.nodes, self.cells = nodes, Cells(nodes, level)
-        slow = ILLUMINATION[0] / level.step, ILLUMINATION[1]
-        self.images = tuple(one - blurred(one, *slow) for one in (smoothed(image, level) for image in images))
+        self.images = tuple(without_illumination(image, level) for image in images)
         self.shape = self.images[0].shape
         self.block = max(1, RELIEF_BLOCK[0] // level.step), RELIEF_BLOCK[1]
         self.blocks = cell_blocks(self.shape, self.block)
@@ -169,17 +165,20 @@ class _ReliefLevel:
 
         ``shown`` is the row and column of each cell in the frame of the blocks; None: that is this frame.
         """
-        pairs = [weighted[k] * other for k in range(3) for other in (*jacobian[:3], residual)]
-        pairs += [weighted[3] * other for other in (*jacobian, residual)]
+        pairs = [(weighted[k], other) for k in range(3) for other in jacobian[k:3]]  # the rest is symmetric
+        pairs += [(weighted[k], residual) for k in range(3)]
+        pairs += [(weighted[3], other) for other in (*jacobian, residual)]
         if shown is None:
-            return by_block(np.stack(pairs), self.block)
-        place = [
-            np.clip(where // edge, 0, count - 1).astype(np.intp)
-            for where, edge, count in zip(shown, self.block, self.blocks, strict=True)
-        ]
-        number = (place[0] * self.blocks[1] + place[1]).ravel()
-        count = self.blocks[0] * self.blocks[1]
-        return np.stack([np.bincount(number, one.ravel(), minlength=count) for one in pairs])
+            sums = products_by_block(pairs, self.block)
+        else:
+            place = [
+                np.clip(where // edge, 0, count - 1).astype(np.intp)
+                for where, edge, count in zip(shown, self.block, self.blocks, strict=True)
+            ]
+            number = (place[0] * self.blocks[1] + place[1]).ravel()
+            count = self.blocks[0] * self.blocks[1]
+            sums = np.stack([np.bincount(number, (a * b).ravel(), minlength=count) for a, b in pairs])
+        return np.asarray(sums[[0, 1, 2, 6, 1, 3, 4, 7, 2, 4, 5, 8, *range(9, 14)]])
 
     def _places(self, shift: Floats) -> tuple[Floats, Floats]:
         """Return rows and columns of displaced cells."""

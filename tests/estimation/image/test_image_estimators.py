@@ -16,7 +16,7 @@ from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.estimation.named_estimators import create_estimator, estimators_for
 from mitsonar.estimation.zero import Zero
-from mitsonar.geometry.attitude import Attitude, attitude_of
+from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
@@ -166,6 +166,22 @@ def test_direct_tells_heave_apart_from_forward(simulator: Simulator) -> None:
     assert abs(free[1]) < abs(stiff[1]) / 2
     about = Direct(heave_std_m=0.01).estimate(frames).about
     assert about["heave_m"] == pytest.approx(0.005, abs=3e-3)
+
+
+def test_a_wrong_height_of_a_sonar_that_rolls_is_within_the_covariance() -> None:
+    """Where the sonar rolls and heaves between two frames, a wrong height moves the ground aside: two routes to the error."""
+    sonar = load_sonar("didson300").replace(model="physical")
+    second = [0.0, 0.04, 2.51, np.radians(35.5), np.radians(1.5), 0.0]
+    poses = np.array([[0, 0, 2.5, np.radians(35), 0, 0], second])
+    frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar)
+    low, told, high = (Direct(height_m=height_m, relief_m=0.0).estimate(frames) for height_m in (2.48, 2.5, 2.52))
+    assert low.valid
+    assert high.valid
+    assert told.covariance is not None
+    by_height = (np.array(high.motion) - low.motion) / 0.04
+    assert abs(by_height[2]) > np.radians(0.02)  # a yaw of 0.02 deg a metre
+    shift = STD_MEASURED * 2.5 * by_height
+    assert shift @ np.linalg.solve(told.covariance, shift) < 2
 
 
 def test_swapped_frames_tell_the_opposite_motion(pair: Pair) -> None:
