@@ -54,10 +54,10 @@ class Apart(NamedTuple):
 
 NOT_APART = Apart(0.0, 0.0, 0.0)
 
-UNKNOWN_PER_S = Apart(0.06, math.radians(4.0), math.radians(3.0))
+UNKNOWN_PER_S = Apart(0.06, math.radians(4.0), math.radians(4.0))
 """How fast height [m/s], pitch and roll [rad/s] of a vehicle change on a calm day, root mean square.
 
-Heave of 4 cm in 3 s, pitch of 2 deg in 2.3 s, roll of 2 deg in 2.9 s. What nothing tells may change as fast."""
+Heave of 4 cm in 3 s, pitch and roll of 2 deg in 2.2 s. What nothing tells may change as fast."""
 
 UNKNOWN_MOST = Apart(0.04, math.radians(2.0), math.radians(2.0))
 """How far they are apart in frames that are far apart in time, root mean square."""
@@ -116,15 +116,14 @@ class Attitude:
         apart = self.apart[number] if self.apart else NOT_APART
         return self.height_m + apart.height_m - lift_m, self.pitch_rad + apart.pitch_rad, self.roll_rad + apart.roll_rad
 
-    def widened(self, covariance: NDArray[np.float64], frames: SonarFrames, heave: bool = True) -> NDArray[np.float64]:
+    def widened(self, covariance: NDArray[np.float64], frames: SonarFrames) -> NDArray[np.float64]:
         """Return the covariance of a motion ``(3, 3)`` with what unknown heave, pitch and roll add.
 
         Args:
             covariance: of sideways, forward [m], yaw [rad], were height and attitude the same in both frames.
             frames: both.
-            heave: whether heave counts; not where it was estimated.
         """
-        std = np.array(self.unsure) * [heave, 1, 1]
+        std = np.array(self.unsure)
         if not std.any():
             return covariance
         seen = self.ground(frames).motions_of_lean(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std

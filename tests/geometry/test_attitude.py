@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drawn_frames import SONAR as FLOOR_SONAR
 from drawn_frames import over_ground
 from helpers import lit_plane
 
@@ -13,6 +14,7 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.attitude import STD_GIVEN, STD_MEASURED, UNKNOWN_MOST, UNKNOWN_PER_S, attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.named_sonars import load_sonar
 from mitsonar.motion.trajectory import Trajectory
 
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)
@@ -119,17 +121,17 @@ def test_each_frame_has_its_own_height_pitch_and_roll() -> None:
     assert found.ground(frames).pitch_rad == pytest.approx(0.61)
 
 
-@pytest.mark.parametrize(
-    ("axis", "change", "within"), [(2, 0.006, 0.25), (3, np.radians(0.4), 0.25), (4, np.radians(0.3), 1.0)]
-)
-def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, change: float, within: float) -> None:
+@pytest.mark.parametrize(("axis", "change"), [(2, 0.006), (3, np.radians(0.4)), (4, np.radians(0.4))])
+def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, change: float) -> None:
     """Frames that heave, pitch or roll, registered as if they did not: the error is the one that the covariance expects.
 
-    Of a roll by its size only: sideways and yaw share it as the frames' own contrast decides.
+    :meth:`GroundGeometry.motions_of_lean` tells that of heave and pitch; sideways and yaw share that of a roll as frames'
+    contrast decides. Pitch hardly shows, since it leaves ranges as they are, nor a roll where bearings are azimuths.
     """
     poses = np.tile([0.0, 0.0, 2.5, np.radians(35), 0.0, 0.0], (2, 1))
     poses[1, axis] += change
-    frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])))
+    sonar = load_sonar("didson300").replace(model="physical") if axis == 4 else FLOOR_SONAR
+    frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar)
     estimator = create_estimator("direct")
     known = estimator.estimate(frames)
     blind = poses.mean(axis=0, keepdims=True).repeat(2, axis=0)
@@ -137,11 +139,16 @@ def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, ch
     unknown = estimator.estimate(replace(frames, poses=blind))
     assert known.covariance is not None
     assert unknown.covariance is not None
-    attitude = attitude_of(replace(frames, poses=blind), "a test", None, None)
-    seen = attitude.ground(frames).motions_of_lean(12, np.radians(frames.sonar.elevation_fov_deg) / 2)[:, axis - 2] * change
     error = np.array(unknown.motion) - np.array(known.motion)
-    np.testing.assert_allclose(error, seen, atol=within * np.abs(seen).max() + 2e-4)
-    assert (np.linalg.eigvalsh(unknown.covariance - known.covariance) > -1e-9).all()
+    if axis != 4:
+        attitude = attitude_of(replace(frames, poses=blind), "a test", None, None)
+        seen = (
+            attitude.ground(frames).motions_of_lean(12, np.radians(frames.sonar.elevation_fov_deg) / 2)[:, axis - 2] * change
+        )
+        np.testing.assert_allclose(error, seen, atol=0.25 * np.abs(seen).max() + 2e-4)
+    assert error @ np.linalg.solve(unknown.covariance, error) < 2
+    if axis != 3:
+        assert error @ np.linalg.solve(known.covariance, error) > 5
 
 
 def test_heave_looks_like_a_step_along_the_grazing_ray() -> None:

@@ -263,7 +263,8 @@ class Direct:
         covariance = model * fit.covariance[:3, :3] + np.outer(height, height)
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start))
-        covariance = task.attitude.widened(covariance, task.frames, heave=not self.heave_std_m)
+        lean = fit.by_lean[:3] * task.attitude.unsure * ([0, 1, 1] if self.heave_std_m else [1, 1, 1])
+        covariance = covariance + lean @ lean.T
         reason = reason or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about, **task.attitude.about}
         if fit.excess != UNMEASURED:

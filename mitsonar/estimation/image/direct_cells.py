@@ -95,6 +95,14 @@ class Cells:
         """Return the derivative of :meth:`shift` by the height at the middles of the patches ``(2, patches)`` [1/m]."""
         return self._on_patches(self.nodes.lifted_shift(v))
 
+    def leaning_shift_of_cells(self, v: Doubles) -> list[Floats]:
+        """Return the derivatives of :meth:`shift` by how frames lean, each ``(2, bins, beams)``."""
+        return [self._on_all(nodes) for nodes in self.nodes.leaning_shift(v)]
+
+    def leaning_shift(self, v: Doubles) -> Doubles:
+        """Return the derivatives of :meth:`shift` by how frames lean, in the middles of the patches ``(3, 2, patches)``."""
+        return self._on_patches(self.nodes.leaning_shift(v))
+
 
 class CellGrid(NamedTuple):
     """Cells of every so many bins and their patches; splines from the nodes, in bins ``[0]`` and beams ``[1]``.

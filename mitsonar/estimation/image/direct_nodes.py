@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
 from mitsonar.geometry.lit_ground import margin_of_light
-from mitsonar.motion.composition import inverse
+from mitsonar.motion.composition import Motion, inverse
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["NODES", "GroundNodes", "node_axes"]
@@ -20,6 +20,9 @@ Doubles = NDArray[np.float64]
 
 NODES = (33, 17)
 """Nodes along range and bearing."""
+
+LEAN_STEP = 1e-4
+"""Step of heights [m], pitch and roll [rad] of a frame for numerical derivatives."""
 
 HEIGHT_STEP = 0.05
 """Step of the height for numerical derivatives, as a part of it."""
@@ -99,13 +102,35 @@ class GroundNodes:
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
             ground, other = replace(ground, height_m=ground.height_m + half), replace(other, height_m=other.height_m - half)
-        motion = inverse(v[:3]) if back else v[:3]
-        radius, bearing = other.to_polar(moved(ground.points, motion))
-        nodes = np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
+        nodes = self._between(ground, other, inverse(v[:3]) if back else v[:3])
         # a cell that meets level ground may not meet ground that lies lower
         known = self._from_nodes_of_frames[int(back)]
         row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else known
         return np.asarray(nodes[:, row, column], dtype=np.float64)
+
+    def _between(self, ground: GroundGeometry, other: GroundGeometry, motion: Doubles | Motion) -> Doubles:
+        """Return the displacement of the ground of the nodes of one frame in another ``(2, nodes, nodes)``; nan off it."""
+        radius, bearing = other.to_polar(moved(ground.points, motion))
+        return np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
+
+    def leaning_shift(self, v: Doubles) -> Doubles:
+        """Return the derivative of :meth:`shift` by what the second frame's height, pitch and roll exceed the first's.
+
+        Returns:
+            Ranges [m] and bearings [rad] a metre of height, a radian of pitch, of roll ``(3, 2, nodes, nodes)``.
+        """
+        row, column = self._from_nodes_of_frames[0]
+        changes = []
+        for name in ("height_m", "pitch_rad", "roll_rad"):
+            ends = []
+            for sign in (-1, 1):
+                ground, other = (
+                    replace(one, **{name: getattr(one, name) + way * sign * LEAN_STEP / 2})
+                    for one, way in zip(self._of_frames, (-1, 1), strict=True)
+                )
+                ends.append(self._between(ground, other, v[:3]))
+            changes.append((ends[1] - ends[0]) / (2 * LEAN_STEP))
+        return np.nan_to_num(np.stack(changes)[:, :, row, column])
 
     def lifted_shift(self, v: Doubles) -> Doubles:
         """Return the derivative of :meth:`shift` by the height [m/m, rad/m]."""

@@ -67,14 +67,17 @@ SAMPLED = (5, 3)
 
 
 class Fit(NamedTuple):
-    """The quality of a motion: covariance from the residuals, derivative by the height, correlation, sizes.
+    """The quality of a motion: covariance from the residuals, derivatives, correlation, sizes.
 
-    ``excess`` is how much the correlation exceeds that of displaced frames.
+    ``by_height`` is the derivative by the height ``(3,)``, ``by_lean`` that by how far height, pitch and roll of the second
+    frame exceed those of the first ``(3, 3)``; their signs do not matter to a covariance. ``excess`` is how much the
+    correlation exceeds that of displaced frames.
     """
 
     converged: bool
     covariance: Doubles
     by_height: Doubles
+    by_lean: Doubles
     correlation: float
     independent: float
     blocks: float
@@ -273,14 +276,17 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
     side = at.sides[0]
     informed = [_information(cells.derivative, one.slopes) for one in at.sides]
     shares = _together((np.tensordot(undone, informed[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
-    lifted = cells.lifted_shift(v)
-    by_height = np.sum([_flat(one) @ lifted.ravel() for one in informed], axis=0)
+    by_height, by_lean = (
+        undone @ np.sum([_flat(one) @ _flat(shift).T for one in informed], axis=0)
+        for shift in (cells.lifted_shift(v)[None], cells.leaning_shift(v))
+    )
     before, after = side.before[side.inner], side.after[side.inner]
     independent, excess = before.size / alike_cells(level), _excess(side, cells)
     return Fit(
         converged=converged,
         covariance=ambiguity(excess.mean, independent) * (each @ each.T + (known + known.T) / 2),
-        by_height=undone @ by_height,
+        by_height=by_height[:, 0],
+        by_lean=by_lean,
         correlation=correlation_of(before, after),
         independent=independent,
         blocks=spread_of(shares),

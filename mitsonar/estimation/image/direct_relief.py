@@ -91,6 +91,23 @@ class _Equations(NamedTuple):
         return self.pulls - self.both * pulled
 
 
+class _Drawn(NamedTuple):
+    """One frame drawn at the cells of the other, each ``(bins, beams)``: levels before and after, which cells count, slopes
+    over bins and beams, derivatives of the residual by motion and height, the same with weights ``(4, bins, beams)``, noise.
+
+    ``shown`` is the row and column of each cell in the frame of the blocks; None: that is this frame.
+    """
+
+    before: Floats
+    after: Floats
+    inside: NDArray[np.bool_]
+    slopes: tuple[Floats, Floats]
+    jacobian: Floats
+    weighted: Floats
+    scale: float
+    shown: tuple[Floats, Floats] | None
+
+
 class _ReliefLevel:
     """One level: its frames and cells, and derivatives at the motion with which it begins."""
 
@@ -131,9 +148,33 @@ class _ReliefLevel:
 
     def equations(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> _Equations | None:
         """Return the normal equations at a motion and heights; None where too few cells remain."""
+        sides = self._drawn(v, heights)
+        if sides is None:
+            return None
+        one = sides[0]
+        summed = (self._summed(side, side.after - side.before) for side in sides)
+        total = np.sum(list(summed), axis=0)  # motion by motion and by residual, height by motion, by itself and by residual
+        by_motion, both, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
+        correlation = correlation_of(one.before[one.inside], one.after[one.inside])
+        normal, pulls = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
+        return _Equations(
+            normal, both, height[0], pulls, height[1], ALIKE * one.scale**2, correlation, int(one.inside.sum())
+        )
+
+    def pulls_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the derivatives of the pulls of motion and heights by how the frames lean ``(3, 4, blocks)``."""
+        sides, shifts = self._drawn(v, heights), self.cells.leaning_shift_of_cells(v)
+        assert sides is not None
+        sums = [
+            np.sum([self._summed(side, side.slopes[0] * bins + side.slopes[1] * beams) for side in sides], axis=0)
+            for bins, beams in shifts
+        ]
+        return np.stack(sums)[:, [3, 7, 11, 16]]
+
+    def _drawn(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> list[_Drawn] | None:
+        """Return each frame drawn at the cells of the other; None where too few cells remain."""
         relief = on_cells(heights.reshape(self.blocks), self.shape, self.block)
-        scale, correlation, count = 0.0, 0.0, 0
-        sums: list[NDArray[np.float64]] = []
+        scale, found = 0.0, []
         for back, derivatives in zip((False, True), self.sides, strict=True):
             level_shift = self.cells.shift(v, back=back)
             lift = relief if not back else sampled(relief, *self._places(level_shift))
@@ -146,25 +187,16 @@ class _ReliefLevel:
             residual = after - before
             if not back:
                 scale = noise_of(residual[inside][::5])
-                correlation, count = correlation_of(before[inside], after[inside]), int(inside.sum())
             weight = cauchy(residual, scale) * inside
-            by_bin, by_beam = slopes_of((before + after) * np.float32(0.5), self.level, scale)
-            sign = np.float32(-1 if back else 1)
-            jacobian = (by_bin * derivatives[:, 0] + by_beam * derivatives[:, 1]) * sign
+            slopes = slopes_of((before + after) * np.float32(0.5), self.level, scale)
+            jacobian = (slopes[0] * derivatives[:, 0] + slopes[1] * derivatives[:, 1]) * np.float32(-1 if back else 1)
             shown = self._places(level_shift) if back else None  # heights are those of the first frame's blocks
-            sums.append(self._summed(jacobian, jacobian * weight, residual, shown))
-        total = np.sum(sums, axis=0)  # motion by motion and by residual, height by motion, by itself and by residual
-        by_motion, both, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
-        normal, pulls = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
-        return _Equations(normal, both, height[0], pulls, height[1], ALIKE * scale**2, correlation, count)
+            found.append(_Drawn(before, after, inside, slopes, jacobian, jacobian * weight, scale, shown))
+        return found
 
-    def _summed(
-        self, jacobian: Floats, weighted: Floats, residual: Floats, shown: tuple[Floats, Floats] | None
-    ) -> NDArray[np.float64]:
-        """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all.
-
-        ``shown`` is the row and column of each cell in the frame of the blocks; None: that is this frame.
-        """
+    def _summed(self, side: _Drawn, residual: Floats) -> NDArray[np.float64]:
+        """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all."""
+        jacobian, weighted, shown = side.jacobian, side.weighted, side.shown
         pairs = [(weighted[k], other) for k in range(3) for other in jacobian[k:3]]  # the rest is symmetric
         pairs += [(weighted[k], residual) for k in range(3)]
         pairs += [(weighted[3], other) for other in (*jacobian, residual)]
@@ -236,11 +268,20 @@ def registered_over_relief(
                 break
     assert found is not None
     assert heights is not None
-    return v, _assessed(found, prior, heights - at.mean, level, converged=converged)
+    leaning = at.pulls_by_lean(v, heights) if np.array(attitude.unsure).any() else None
+    return v, _assessed(found, prior, heights - at.mean, level, leaning, converged=converged)
 
 
-def _assessed(found: _Equations, prior: float, off: NDArray[np.float64], level: DirectLevel, *, converged: bool) -> Fit:
-    """Return the covariance, and how the motion depends on the mean height.
+def _assessed(
+    found: _Equations,
+    prior: float,
+    off: NDArray[np.float64],
+    level: DirectLevel,
+    leaning: NDArray[np.float64] | None,
+    *,
+    converged: bool,
+) -> Fit:
+    """Return the covariance, and how the motion depends on the mean height and on how the frames lean.
 
     The covariance is that of the blocks' pulls, which hold whatever errs together within a block: noise, speckle, relief.
     """
@@ -248,10 +289,15 @@ def _assessed(found: _Equations, prior: float, off: NDArray[np.float64], level: 
     undone = np.linalg.inv(normal)
     held = found.noise * prior
     each = undone @ found.pulls_alone(prior, off)
+    by_lean = np.zeros((3, 3))
+    if leaning is not None:
+        alone = leaning[:, :3] - found.both * (leaning[:, 3:] / (found.height + held))
+        by_lean = undone @ alone.sum(axis=-1).T
     return Fit(
         converged=converged,
         covariance=np.asarray(each @ each.T, dtype=np.float64),
         by_height=undone @ (found.both @ (held / (found.height + held))),
+        by_lean=by_lean,
         correlation=found.correlation,
         independent=found.cells / alike_cells(level),
         blocks=spread_of(found.height),

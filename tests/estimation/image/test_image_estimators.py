@@ -169,7 +169,7 @@ def test_direct_tells_heave_apart_from_forward(simulator: Simulator) -> None:
 
 
 def test_a_wrong_height_of_a_sonar_that_rolls_is_within_the_covariance() -> None:
-    """Where the sonar rolls and heaves between two frames, a wrong height moves the ground aside: two routes to the error."""
+    """Where the sonar rolls and heaves between frames, a wrong height moves the ground aside: two routes to the error."""
     sonar = load_sonar("didson300").replace(model="physical")
     second = [0.0, 0.04, 2.51, np.radians(35.5), np.radians(1.5), 0.0]
     poses = np.array([[0, 0, 2.5, np.radians(35), 0, 0], second])
