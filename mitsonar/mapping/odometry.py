@@ -157,6 +157,8 @@ class Odometry:
                 f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
                 f"counts all the same: {_usual(doubts)}; check height and pitch (faint ground near the sonar looks so, too)"
             )
+        untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
+        told.extend(f"{one}: its errors may be larger than its covariances tell" for one in untrained)
         return told
 
 

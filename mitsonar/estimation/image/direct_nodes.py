@@ -117,8 +117,11 @@ class GroundNodes:
         """Return the derivative of :meth:`shift` by what the second frame's height, pitch and roll exceed the first's.
 
         Returns:
-            Ranges [m] and bearings [rad] a metre of height, a radian of pitch, of roll ``(3, 2, nodes, nodes)``.
+            Ranges [m] and bearings [rad] a metre of height, a radian of pitch, of roll ``(3, 2, nodes, nodes)``; 0 where all of
+            them are known.
         """
+        if not any(self.attitude.unsure):
+            return np.zeros((3, *self.derivative.shape[1:]))
         row, column = self._from_nodes_of_frames[0]
         changes = []
         for name in ("height_m", "pitch_rad", "roll_rad"):

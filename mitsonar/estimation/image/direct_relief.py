@@ -268,7 +268,7 @@ def registered_over_relief(
                 break
     assert found is not None
     assert heights is not None
-    leaning = at.pulls_by_lean(v, heights) if np.array(attitude.unsure).any() else None
+    leaning = at.pulls_by_lean(v, heights) if any(attitude.unsure) else None
     return v, _assessed(found, prior, heights - at.mean, level, leaning, converged=converged)
 
 

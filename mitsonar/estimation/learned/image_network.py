@@ -31,6 +31,7 @@ from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
+from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.motion.composition import Motion, inverse
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
@@ -70,6 +71,9 @@ NOISY = 0.83
 Without noise hulls have 0.84 and more, rocky fields 0.95; in high noise they have 0.82 and less, and 0.75 to 0.91. With 0.75
 six of 200 pairs of hulls in high noise stopped short: squared errors of 8 to 44 times the covariance.
 """
+
+OTHER_FAN = 1.5
+"""Fans so many times wider or narrower than that of training are reported."""
 
 FAR_MODEL = 4.0
 """Squared errors over the network's covariance for motions far beyond training, measured on rocky fields."""
@@ -200,8 +204,19 @@ class ImageNetwork(Trained):
             covariance=covariance,
             valid=not reason,
             reason=reason,
-            about={**found.about, **attitude.about, "start": named},
+            about={**found.about, **attitude.about, **self._untrained(frames), "start": named},
         )
+
+    def _untrained(self, frames: SonarFrames) -> dict[str, str]:
+        """Return what an estimate must report of frames unlike those of training, of a network that takes any sonar."""
+        found, trained = [], sonar_from(dict(self._checkpoint.data_recipe["sonar"]))
+        if frames.sonar.model == "coherent" and "coherent" not in self._checkpoint.model:
+            found.append("speckle")
+        has = TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad)
+        fan_deg = TrainedInstrument.of(trained).azimuth_fov_deg
+        if abs(math.log(has.azimuth_fov_deg / fan_deg)) > math.log(OTHER_FAN):
+            found.append(f"a fan of {has.azimuth_fov_deg:.3g} deg (but {fan_deg:.3g})")
+        return {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(found)}"} if found else {}
 
     def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
         """Estimate the motion from a start of the network's iterations; None: no motion."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ pytestmark = [pytest.mark.learn, pytest.mark.filterwarnings("ignore::mitsonar.er
 HEIGHT_M, PITCH_RAD = 2.5, np.radians(35)
 SONAR = Sonar(range_bins=256)
 MOTION = Motion(0.02, -0.012, np.radians(0.4))
+COHERENT = {"model": "coherent", "frequency_hz": 1.8e6}
 
 
 def test_other_heights_explain_the_same_shifts_by_other_motions() -> None:
@@ -56,3 +58,22 @@ def test_heights_less_certain_than_in_training_join_the_covariance(monkeypatch: 
     assert np.linalg.matrix_rank(twice - as_trained, tol=1e-6 * np.abs(twice - as_trained).max()) == 1
     by_forward = abs(found[0].motion.forward) * 0.2 * STD_MEASURED
     assert twice[1, 1] - as_trained[1, 1] > 3 * by_forward**2
+
+
+@pytest.mark.parametrize(
+    ("changes", "method", "told"),
+    [
+        ({}, "corrnet", ""),
+        (COHERENT, "corrnet", "corrnet was not trained for speckle"),
+        (COHERENT, "corrnet-coherent", ""),
+        ({"azimuth_fov_deg": 60.0}, "corrnet-coherent", "corrnet was not trained for a fan of 60 deg (but 29)"),
+        ({**COHERENT, "azimuth_fov_deg": 60.0}, "corrnet", "for speckle or a fan of 60 deg (but 29)"),
+    ],
+)
+def test_what_a_network_was_not_trained_for_is_told(changes: dict[str, Any], method: str, told: str) -> None:
+    """By texture and fan."""
+    frames, _, _ = lit_plane(Sonar(range_bins=256, model="physical"), HEIGHT_M, PITCH_RAD)
+    sonar = frames.sonar.replace(**changes)
+    frames = replace(frames, sonar=sonar, bearing_rad=sonar.bearing_rad, time_s=np.array([0.0, 0.1]))
+    assert told in create_estimator(method).estimate(frames).about.get("untrained", "")
+    assert ("untrained" in create_estimator(method).estimate(frames).about) == bool(told)
