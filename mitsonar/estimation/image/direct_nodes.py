@@ -117,8 +117,8 @@ class GroundNodes:
         """Return the derivative of :meth:`shift` by what the second frame's height, pitch and roll exceed the first's.
 
         Returns:
-            Ranges [m] and bearings [rad] a metre of height, a radian of pitch, of roll ``(3, 2, nodes, nodes)``; 0 where all of
-            them are known.
+            Ranges [m] and bearings [rad] a metre of height, a radian of pitch and of roll ``(3, 2, nodes, nodes)``; 0 where
+            nothing is unknown.
         """
         if not any(self.attitude.unsure):
             return np.zeros((3, *self.derivative.shape[1:]))

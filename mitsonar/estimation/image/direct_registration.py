@@ -14,10 +14,7 @@ from mitsonar.estimation.image.direct_blocks import by_block, products_by_block
 from mitsonar.estimation.image.direct_cells import Cells, DirectLevel
 from mitsonar.estimation.image.image_slopes import FAINTEST, blurred, central_differences, sampled, slopes_of
 
-__all__ = [
-    *("FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"),
-    "without_illumination",
-]
+__all__ = ["FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved", "noise_of", "register", "smoothed"]
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -307,17 +304,13 @@ def is_resolved(bins: int, level: DirectLevel) -> bool:
 
 
 def smoothed(image: Floats, level: DirectLevel) -> Floats:
-    """Every so many bins of the smoothed image."""
+    """Every so many bins of the smoothed image; of a level of detail, less what is as coarse as the illumination."""
     bins, beams = level.smoothing
     if level.step == 1:
-        return blurred(image, bins, beams)
-    return blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
-
-
-def without_illumination(image: Floats, level: DirectLevel) -> Floats:
-    """Every so many bins of the smoothed image, less what is as coarse as the illumination."""
-    fine, (bins, beams) = smoothed(image, level), ILLUMINATION
-    return fine - blurred(fine, bins / level.step, beams)
+        found = blurred(image, bins, beams)
+    else:
+        found = blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
+    return found - blurred(found, ILLUMINATION[0] / level.step, ILLUMINATION[1]) if level.detail else found
 
 
 @lru_cache(maxsize=16)

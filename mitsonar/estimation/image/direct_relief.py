@@ -25,7 +25,7 @@ from mitsonar.estimation.image.direct_registration import (
     cauchy,
     is_resolved,
     noise_of,
-    without_illumination,
+    smoothed,
 )
 from mitsonar.estimation.image.image_slopes import sampled, slopes_of
 from mitsonar.geometry.attitude import Attitude
@@ -37,9 +37,9 @@ Floats = NDArray[np.float32]
 Pair = tuple[Floats, Floats]
 
 RELIEF_LEVELS = (
-    DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 6),
-    DirectLevel(2, (2.0, 0.8), (0.0, 0.0), 6),
-    DirectLevel(1, (0.4, 0.3), (0.5, 0.4), 12),
+    DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 6, detail=True),
+    DirectLevel(2, (2.0, 0.8), (0.0, 0.0), 6, detail=True),
+    DirectLevel(1, (0.4, 0.3), (0.5, 0.4), 12, detail=True),
 )
 """Coarse to fine: the first reaches 50 mm and 1 deg from the start; the last is finer than that of near motions."""
 
@@ -114,7 +114,7 @@ class _ReliefLevel:
     def __init__(self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel) -> None:
         self.level = level
         self.nodes, self.cells = nodes, Cells(nodes, level)
-        self.images = tuple(without_illumination(image, level) for image in images)
+        self.images = tuple(smoothed(image, level) for image in images)
         self.shape = self.images[0].shape
         self.block = max(1, RELIEF_BLOCK[0] // level.step), RELIEF_BLOCK[1]
         self.blocks = cell_blocks(self.shape, self.block)
