@@ -78,13 +78,14 @@ def reproduce(
 
 def _list() -> None:
     """List all tables with their rows."""
-    from mitsonar.training.document_tables import NOISES, load_tables
+    from mitsonar.training.document_tables import LOUD, NOISES, load_tables
 
-    say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(NOISES.values())}")
+    printed = [said for noise, said in NOISES.items() if noise != LOUD]
+    say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(printed)}")
     for table in load_tables().values():
         say(f"\n{table.name}  {table.title}")
         for row in table.rows:
-            errors = [row.said(row.printed.get(noise)) for noise in table.noises] if row.printed else []
+            errors = [row.said(row.printed.get(noise)) for noise in table.noises if noise != LOUD] if row.printed else []
             say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")
 
 

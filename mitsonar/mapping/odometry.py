@@ -158,7 +158,7 @@ class Odometry:
                 f"counts all the same: {_usual(doubts)}; check height and pitch (faint ground near the sonar looks so, too)"
             )
         untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
-        told.extend(f"{one}: its errors may be larger than its covariances tell" for one in untrained)
+        told.extend(f"{one}: its covariances have not been learnt there" for one in untrained)
         return told
 
 
