@@ -262,19 +262,19 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
 
     These hold whatever errs together within a block: noise, speckle, relief, in both ways of drawing at once.
     """
-    true = np.sum([_by_motion(cells.derivative, _cross(side, cells, level)) for side in at.sides], axis=0)
+    informed = _information(cells.derivative, np.sum([_cross(side, cells, level) for side in at.sides], axis=0))
+    true = _flat(informed) @ _flat(cells.derivative).T
     # symmetric to the bit: sums of float32 are not, and a path refuses such covariances
     sound = true if np.linalg.eigvalsh(true)[0] > 0 else (at.normal + at.normal.T) / 2
     undone = np.linalg.inv(sound + np.diag(held))
-    pulls = np.sum([(cells.derivative * side.pull).sum(axis=1) for side in at.sides], axis=0)
-    each = undone @ _together(pulls, cells)
+    each = _without_each(sound + np.diag(held), informed, at, cells)
     # what is known before errs, too: where the frames tell nothing it is all that is known
     known = undone * (alike_cells(level) * at.scale**2 * held) @ undone.T
     side = at.sides[0]
-    informed = [_information(cells.derivative, one.slopes) for one in at.sides]
-    shares = _together((np.tensordot(undone, informed[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
+    both = [_information(cells.derivative, one.slopes) for one in at.sides]
+    shares = _together((np.tensordot(undone, both[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
     by_height, by_lean = (
-        undone @ np.sum([_flat(one) @ _flat(shift).T for one in informed], axis=0)
+        undone @ np.sum([_flat(one) @ _flat(shift).T for one in both], axis=0)
         for shift in (cells.lifted_shift(v)[None], cells.leaning_shift(v))
     )
     before, after = side.before[side.inner], side.after[side.inner]
@@ -289,6 +289,18 @@ def _fit(at: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, held:
         blocks=spread_of(shares),
         excess=excess,
     )
+
+
+def _without_each(whole: Doubles, informed: Doubles, at: _Linearisation, cells: Cells) -> Doubles:
+    """Return by how much the motion would change without each of the blocks ``(n, blocks)``: the jackknife.
+
+    Blocks that hold much of the information pull little, since the motion follows them.
+    """
+    pulls = np.sum([(cells.derivative * side.pull).sum(axis=1) for side in at.sides], axis=0)
+    parts = np.einsum("ikp,jkp->ijp", informed, cells.derivative)
+    left = whole - np.moveaxis(_together((parts + np.swapaxes(parts, 0, 1)) / 2, cells), -1, 0)
+    change = np.linalg.solve(left, np.moveaxis(_together(pulls, cells), -1, 0)[..., None])
+    return np.asarray(change[..., 0].T)
 
 
 def _excess(side: _Side, cells: Cells) -> Excess:
