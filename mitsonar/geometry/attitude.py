@@ -44,6 +44,10 @@ STD_RISING = 0.29
 """Standard deviation of the height over rising ground besides, as part of that difference: it may be any between both."""
 
 
+STEEPEST = 2.0
+"""How many times higher or lower than at the ends of the light a sonar may be over rising ground straight below it."""
+
+
 class Apart(NamedTuple):
     """Height [m], pitch and roll [rad] of a frame, less those of the mean of the frames."""
 
@@ -79,7 +83,7 @@ class Attitude:
         even: whether first echoes show ground without relief.
         given_m: height over the ground as given [m]; None: it was not.
         first: height by first echoes; None where they do not show it, or contradict the height as given.
-        doubt: how first echoes contradict the height as given, which counts nevertheless; empty where they do not.
+        doubt: how echoes contradict the height as given, which counts unless the ground rises; empty where they do not.
         apart: height, pitch and roll of each frame, less their mean; empty where they are not known, or all the same.
         unsure: standard deviation of their change from one frame to the other; 0 where it is known.
     """
@@ -202,7 +206,12 @@ def _over_rising(found: EchoHeights, given_m: float | None, pitch: float, roll: 
     first_m = first.height_m + first.tops_m if first is not None else given_m
     assert first_m is not None
     std = float(np.hypot(STD_MEASURED * found.ends_m, STD_RISING * (first_m - found.last_m)))
-    return Attitude(found.ends_m, std, pitch, roll, even=first is not None and first.even, given_m=given_m, first=first)
+    doubt = ""
+    if given_m is not None and not found.last_m / STEEPEST < given_m < STEEPEST * first_m:
+        ends = f"{first_m:.2f} and {found.last_m:.2f} m"
+        doubt = f"the ground rises, and its ends give heights of {ends}, not {given_m:.2f} m"
+    even = first is not None and first.even
+    return Attitude(found.ends_m, std, pitch, roll, doubt=doubt, even=even, given_m=given_m, first=first)
 
 
 def _over_level(first: FirstEchoes | None, given_m: float | None, pitch: float, roll: float) -> Attitude:

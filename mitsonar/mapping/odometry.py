@@ -155,7 +155,8 @@ class Odometry:
         if doubts:
             told.append(
                 f"{len(doubts)} of {len(self.estimates)} pairs of frames contradict the height that they are given, which "
-                f"counts all the same: {_usual(doubts)}; check height and pitch (faint ground near the sonar looks so, too)"
+                f"counts unless the ground rises: {_usual(doubts)}; check height and pitch (faint ground near the sonar "
+                "looks so, too)"
             )
         untrained = dict.fromkeys(str(one.about["untrained"]) for one in self.estimates if "untrained" in one.about)
         told.extend(f"{one}: its covariances have not been learnt there" for one in untrained)

@@ -121,6 +121,15 @@ def test_each_frame_has_its_own_height_pitch_and_roll() -> None:
     assert found.ground(frames).pitch_rad == pytest.approx(0.61)
 
 
+@pytest.mark.parametrize(("given_m", "told"), [(2500.0, True), (0.5, True), (HEIGHT_M, False), (None, False)])
+def test_a_height_beyond_both_ends_of_rising_ground_is_told(given_m: float | None, told: bool) -> None:
+    """A height in millimetres, say: the ends of the light count, and the contradiction is reported."""
+    frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD, 10.0)
+    found = attitude_of(frames, "a test", given_m, PITCH_RAD)
+    assert ("the ground rises" in found.doubt) == told
+    assert found.height_m == pytest.approx(attitude_of(frames, "a test", None, PITCH_RAD).height_m)
+
+
 @pytest.mark.parametrize(("axis", "change"), [(2, 0.006), (3, np.radians(0.4)), (4, np.radians(0.4))])
 def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, change: float) -> None:
     """Frames that heave, pitch or roll, registered as if they did not: the error is the one that the covariance expects.

@@ -27,14 +27,12 @@ class DirectLevel(NamedTuple):
         smoothing: of the frames, in bins and beams.
         slopes: further smoothing of their mean, before its slopes are taken.
         iterations: at most.
-        detail: whether only what is finer than the illumination of the ground counts.
     """
 
     step: int
     smoothing: tuple[float, float]
     slopes: tuple[float, float]
     iterations: int
-    detail: bool = False
 
 
 PATCH = (8, 4)

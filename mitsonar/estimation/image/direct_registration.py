@@ -19,9 +19,6 @@ __all__ = ["FEWEST_CELLS", "Fit", "Held", "alike_cells", "cauchy", "is_resolved"
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
-ILLUMINATION = (12.0, 4.0)
-"""Bins and beams beyond which brightness belongs to the sonar, which moves, and not to the ground."""
-
 STILL = np.array([3e-5, 3e-5, 6e-6])
 """Steps below which an iteration ends [m, m, rad]."""
 
@@ -316,13 +313,11 @@ def is_resolved(bins: int, level: DirectLevel) -> bool:
 
 
 def smoothed(image: Floats, level: DirectLevel) -> Floats:
-    """Every so many bins of the smoothed image; of a level of detail, less what is as coarse as the illumination."""
+    """Every so many bins of the smoothed image."""
     bins, beams = level.smoothing
     if level.step == 1:
-        found = blurred(image, bins, beams)
-    else:
-        found = blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
-    return found - blurred(found, ILLUMINATION[0] / level.step, ILLUMINATION[1]) if level.detail else found
+        return blurred(image, bins, beams)
+    return blurred(_smoothed_rows(len(image), bins, level.step) @ image, 0, beams)
 
 
 @lru_cache(maxsize=16)

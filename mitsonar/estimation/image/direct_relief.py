@@ -27,7 +27,7 @@ from mitsonar.estimation.image.direct_registration import (
     noise_of,
     smoothed,
 )
-from mitsonar.estimation.image.image_slopes import sampled, slopes_of
+from mitsonar.estimation.image.image_slopes import blurred, sampled, slopes_of
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.records.sonar_frames import SonarFrames
 
@@ -37,9 +37,9 @@ Floats = NDArray[np.float32]
 Pair = tuple[Floats, Floats]
 
 RELIEF_LEVELS = (
-    DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 6, detail=True),
-    DirectLevel(2, (2.0, 0.8), (0.0, 0.0), 6, detail=True),
-    DirectLevel(1, (0.4, 0.3), (0.5, 0.4), 12, detail=True),
+    DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 6),
+    DirectLevel(2, (2.0, 0.8), (0.0, 0.0), 6),
+    DirectLevel(1, (0.4, 0.3), (0.5, 0.4), 12),
 )
 """Coarse to fine: the first reaches 50 mm and 1 deg from the start; the last is finer than that of near motions."""
 
@@ -48,6 +48,9 @@ RELIEF_BLOCK = (32, 12)
 
 RELIEF_STD = 0.048
 """Standard deviation of a block's height, as part of the sonar's: 0.12 m at 2.5 m."""
+
+ILLUMINATION = (12.0, 4.0)
+"""Bins and beams beyond which brightness belongs to the sonar, which moves, and not to the ground."""
 
 ALIKE = 20.0
 """Residuals that count as one: those of a block err together where its ground is not as the model has it."""
@@ -114,7 +117,8 @@ class _ReliefLevel:
     def __init__(self, images: Pair, nodes: GroundNodes, v: NDArray[np.float64], level: DirectLevel) -> None:
         self.level = level
         self.nodes, self.cells = nodes, Cells(nodes, level)
-        self.images = tuple(smoothed(image, level) for image in images)
+        slow = ILLUMINATION[0] / level.step, ILLUMINATION[1]
+        self.images = tuple(one - blurred(one, *slow) for one in (smoothed(image, level) for image in images))
         self.shape = self.images[0].shape
         self.block = max(1, RELIEF_BLOCK[0] // level.step), RELIEF_BLOCK[1]
         self.blocks = cell_blocks(self.shape, self.block)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, cast
 
 import cv2
@@ -207,15 +208,20 @@ class ImageNetwork(Trained):
             about={**found.about, **attitude.about, **self._untrained(frames), "start": named},
         )
 
+    @cached_property
+    def _fan_deg(self) -> float:
+        """Return the field of view in azimuth of the data that trained the network [deg]."""
+        trained = sonar_from(dict(self._checkpoint.data_recipe["sonar"]))
+        return TrainedInstrument.of(trained).azimuth_fov_deg
+
     def _untrained(self, frames: SonarFrames) -> dict[str, str]:
         """Return what an estimate must report of frames unlike those of training, of a network that takes any sonar."""
-        found, trained = [], sonar_from(dict(self._checkpoint.data_recipe["sonar"]))
+        found = []
         if frames.sonar.model == "coherent" and "coherent" not in self._checkpoint.model:
             found.append("speckle")
         has = TrainedInstrument.in_frames(frames.sonar, frames.range_m, frames.bearing_rad)
-        fan_deg = TrainedInstrument.of(trained).azimuth_fov_deg
-        if abs(math.log(has.azimuth_fov_deg / fan_deg)) > math.log(OTHER_FAN):
-            found.append(f"a fan of {has.azimuth_fov_deg:.3g} deg (but {fan_deg:.3g})")
+        if abs(math.log(has.azimuth_fov_deg / self._fan_deg)) > math.log(OTHER_FAN):
+            found.append(f"a fan of {has.azimuth_fov_deg:.3g} deg (but {self._fan_deg:.3g})")
         return {"untrained": f"{self._checkpoint.network} was not trained for {' or '.join(found)}"} if found else {}
 
     def _from(self, frames: SonarFrames, images: Pair, ground: Ground, start: Motion | None) -> Estimate:
