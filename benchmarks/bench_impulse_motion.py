@@ -3,15 +3,18 @@
     python benchmarks/bench_impulse_motion.py rows --out bench/impulse [--samples 100] [--only NAME] [--model rays]
     python benchmarks/bench_impulse_motion.py noise --out bench/impulse
     python benchmarks/bench_impulse_motion.py courses --out bench/impulse
+    python benchmarks/bench_impulse_motion.py regressors [--rays 12500 50000]
     python benchmarks/bench_impulse_motion.py figure --out bench/impulse
     python benchmarks/bench_impulse_motion.py places [--samples 100]
-    python benchmarks/bench_impulse_motion.py --quick      # all four, five samples of a small field, kept nowhere
+    python benchmarks/bench_impulse_motion.py --quick      # all, five samples of a small field, kept nowhere
 
 Samples are made like those of the data sets `impulse-*`, over 5 scenes that no network has seen (seed 4201). OUT keeps them,
 so that a stopped run is resumed. `rows`: every row of table 5.2 by each estimator, with the figure of Almanza-Medina and the
 bound. `noise`: the standard row at signal-to-noise ratios, two pings of different scenes, one ping twice, and a wrong height
 or sound speed. `courses`: trajectories 1 to 6 over flat objects, with positions 50 ms apart and each motion from ten pings
 (--pings 2: from the pings at both positions; neighbours then resolve ambiguous motions).
+Networks go by name or folder in --estimators; they read --model rays and --pings 2. `regressors`: table 5.5, ten regressors
+on the standard row of so many rays, split one by one, and the same from one ping twice, which holds no motion.
 `places`: two pings 1/180 s apart at 1 m/s to starboard and 0.5 m/s forward, as in the guide, at places and headings drawn at
 random over the scene `hydrophones` (stones on a seabed) and over its seabed alone.
 `figure`: figure 5.11, the sinusoid by impulse responses, and by images of a DIDSON 2.5 m above the same field (`direct`).
@@ -24,6 +27,7 @@ import itertools
 import json
 import multiprocessing
 import os
+import re
 import tempfile
 import time
 from collections.abc import Iterator
@@ -48,9 +52,12 @@ from mitsonar import (
     load_sonar,
 )
 from mitsonar.config.data_recipe import Recipe
+from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.response_packing import with_noise
+from mitsonar.datasets.response_pairs import ImpulsePairs
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb
+from mitsonar.estimation.learned.regressors import REGRESSORS, flattened, score_all
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import odometry
@@ -104,6 +111,7 @@ def main() -> None:
     parser.add_argument("--model", choices=["scatterers", "rays"], default="scatterers")
     parser.add_argument("--estimators", default="zero,correlation,likelihood")
     parser.add_argument("--pings", type=int, default=10, help="of each motion of a course")
+    parser.add_argument("--rays", type=int, nargs="+", default=[12_500, 50_000], help="of regressors: in each field of view")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--quick", action="store_true", help="all four, small, kept nowhere: within a minute")
     asked = parser.parse_args()
@@ -121,6 +129,7 @@ def main() -> None:
             asked.only = [only]
             asked.estimators = "zero,correlation,likelihood" if part == "rows" else "correlation"
             PARTS[part](asked)
+        regressors(asked)
         figure(asked)
 
 
@@ -131,7 +140,8 @@ def workers(processes: int) -> AbstractContextManager[Pool]:
 
 def recipe_of(asked: argparse.Namespace, name: str) -> Recipe:
     """Return a recipe of scenes that no network has seen."""
-    return load_recipe(name, {"seed": SEED, "channel.model": asked.model, **(SMALL if asked.quick else {})})
+    rays = {"channel.rays": asked.rays[0]} if asked.model == "rays" else {}
+    return load_recipe(name, {"seed": SEED, "channel.model": asked.model, **rays, **(SMALL if asked.quick else {})})
 
 
 # ---------------------------------------------------------------- samples
@@ -203,12 +213,17 @@ def estimates(
     asked: argparse.Namespace, label: str, name: str, samples: list[ImpulseResponses], **options: bool
 ) -> NDArray[np.float64]:
     """Answers ``(samples, 8)``, from OUT or new."""
-    path = asked.out / f"{label}-{name}.json"
+    path = asked.out / f"{label}-{file_name(name)}.json"
     if not path.exists():
         work = [(name, options, one) for one in samples]
         answers = asked.pool.map(estimate_of, work, chunksize=max(1, len(work) // (4 * asked.processes)))
         path.write_text(json.dumps(answers))
     return np.array(json.loads(path.read_text()))
+
+
+def file_name(estimator: str) -> str:
+    """Return the name of an estimator, or of the file of a network, as part of a file's name."""
+    return re.sub(r"[^A-Za-z0-9]+", "-", estimator).strip("-")
 
 
 def truth(samples: list[ImpulseResponses]) -> NDArray[np.float64]:
@@ -362,7 +377,7 @@ def courses(asked: argparse.Namespace) -> None:
 def driven(asked: argparse.Namespace, label: str, name: str, responses: ImpulseResponses) -> NDArray[np.float64]:
     """Estimate motions ``(n, 7)`` from ping to ping as odometry does. Neighbours resolve ambiguous motions, and invalid ones
     are bridged. The last column is the validity."""
-    path = asked.out / f"{label}-{name}.json"
+    path = asked.out / f"{label}-{file_name(name)}.json"
     if not path.exists():
         found = odometry(ResponseSource(label, responses), create_estimator(name), workers=asked.processes)
         rows = np.column_stack([found.series.motions, np.zeros((len(found.series), 3)), found.believed])
@@ -446,7 +461,26 @@ def place_cells(name: str, simulator: ChannelSimulator, samples: int) -> str:
     return f"{rmse} | {distance:.3f} | {known} | {sum(valid)} of {samples} | {np.median(ms):.0f}"
 
 
-PARTS = {"rows": rows, "noise": noise, "courses": courses, "figure": figure, "places": places}
+def regressors(asked: argparse.Namespace) -> None:
+    """Table 5.5: forward RMSE of ten regressors on pairs, and on one ping twice."""
+    print("| regressor | rays | pairs, RMSE mm | one ping twice | no motion | learnt in s |\n" + 6 * "|---" + "|")
+    small = {**SMALL, "scenes": [{"count": 2, "sequences": 20}]} if asked.quick else {}
+    for rays in asked.rays[: 1 if asked.quick else None]:
+        path = asked.out / f"impulse-standard-{rays}.zarr"
+        make_dataset(load_recipe("impulse-standard", {"channel.rays": rays, **small}), str(path), workers=asked.processes)
+        names = list(REGRESSORS)[1:3] if asked.quick else list(REGRESSORS)
+        for name in names:
+            both = []
+            for leak in ("none", "one_ping"):
+                words = {"leak": leak, "split": {"by": "sample", "train": 0.8, "validation": 0.2}}
+                train, test = (flattened(ImpulsePairs(path, part=part, **words)) for part in ("train", "validation"))
+                both += score_all(train, test, names=[name])
+            pairs, alone = both
+            errors = " | ".join(f"{value:.2f}" for value in (pairs.rmse_mm, alone.rmse_mm, pairs.zero_mm))
+            print(f"| {name} | {rays:,} | {errors} | {pairs.fit_s:.0f} |", flush=True)
+
+
+PARTS = {"rows": rows, "noise": noise, "courses": courses, "regressors": regressors, "figure": figure, "places": places}
 
 if __name__ == "__main__":
     main()

@@ -1,6 +1,6 @@
 """Table 2.1 and the synthetic trajectories of Almanza-Medina (2.3, 3.5.1), with estimators that need no training.
 
-    python benchmarks/bench_trajectories.py [--only table21,trajectories] [--frames N] [--every N] [--out DIR]
+    python benchmarks/bench_trajectories.py [--only table21,trajectories] [--methods direct,posenet] [--frames N] [--every N]
     python benchmarks/bench_trajectories.py --quick       # eight frames of each run, one seabed, kept nowhere
 
 `table21`: three runs over six seabeds (recipe pattern-runs), every consecutive pair, or one of N. `trajectories`: 904 frames
@@ -57,8 +57,9 @@ from trajectory_jobs import (
     Setting,
     Table,
     jobs,
+    trajectory_job,
 )
-from trajectory_pictures import draw
+from trajectory_pictures import draw, draw_errors, draw_network
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data_recipe import load_recipe, shipped_recipes
@@ -99,6 +100,7 @@ def main() -> None:
     parser.add_argument(
         "--models", default=",".join(RECIPES), help=f"of the trajectories, with commas between; {SPECKLE} too"
     )
+    parser.add_argument("--methods", default="direct", help="of the trajectories, with commas between; networks too")
     parser.add_argument("--frames", type=int, default=0, help="so many frames of each run at most, to try")
     parser.add_argument("--out", type=Path, default=Path("out/trajectories"), help="data sets, results, estimates")
     parser.add_argument("--pictures", type=Path, help="where pictures go (default: OUT)")
@@ -111,7 +113,7 @@ def main() -> None:
     if not args.quick:
         return benchmark(args, parts, Table(TEXTURES, SETTINGS))
     with tempfile.TemporaryDirectory(prefix="bench-trajectories-") as folder:
-        few = {"frames": 8, "every": 1, "out": Path(folder), "pictures": None}
+        few = {"frames": 8, "every": 1, "out": Path(folder), "pictures": None, "methods": "direct,posenet"}
         benchmark(argparse.Namespace(**{**vars(args), **few}), parts, Table(TEXTURES[:1], SETTINGS[:2]))
 
 
@@ -122,12 +124,18 @@ def benchmark(args: argparse.Namespace, parts: list[str], table: Table) -> None:
         for model in RECIPES:
             make_pattern_runs(args.out, model, args.quick)
     models = args.models.split(",")
-    listed = jobs(parts, args.frames, args.every, table, args.quick)
+    methods = args.methods.split(",")
+    listed = jobs(parts, args.frames, args.every, table, args.quick, methods)
     wanted = [job for job in listed if job.part == "table21" or job.model in models]
     results = run_all(wanted, args.out)
     pictures = args.pictures or args.out
     if "trajectories" in parts and set(models) == set(RECIPES):
         draw(args.out, pictures, args.frames)
+    for method in methods if "trajectories" in parts else []:
+        if method != "direct" and "thesis" in models:
+            draw_network(args.out, pictures, args.frames, method)
+    if "table21" in parts:
+        draw_errors(args.out, pictures, next(job for job in wanted if job.part == "table21" and job.run == "diagonal"))
     print(machine(args.frames, args.every))
     if "table21" in parts:
         print("\n" + "\n".join(table21([row for row in results if row["part"] == "table21"], args.every, table)))
@@ -342,9 +350,10 @@ def run_trajectory(job: Job, out: Path) -> Result:
         path = path_of(series.motions, start, series.time_s)
         path.save_tum(out / f"{job.name}-{name}.tum")
         row["paths"][name] = path_errors(path, true, None if series.covariances is None else pose_covariances(series, start))
-    row["paths"] |= mapped_paths(job, frames, found)
     if job.method == "direct":
-        frames.save(out / f"{job.name}-frames.npz")
+        row["paths"] |= mapped_paths(job, frames, found)
+    if job.method == "direct" or not (out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz").exists():
+        frames.save(out / f"{trajectory_job(job.run, job.model, job.frames).name}-frames.npz")
     return row
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -82,7 +83,8 @@ class Job:
     @property
     def name(self) -> str:
         """Return the name of its files."""
-        words = (self.part, self.run, self.texture, self.method.replace(", ", "-").replace(" ", "-"), self.model, self.noise)
+        method = re.sub(r"[^A-Za-z0-9]+", "-", self.method).strip("-")
+        words = (self.part, self.run, self.texture, method, self.model, self.noise)
         return "-".join([*words, *([str(self.frames)] if self.frames else [])])
 
 
@@ -93,18 +95,25 @@ class Table(NamedTuple):
     settings: tuple[Setting, ...]
 
 
-def jobs(parts: Iterable[str], frames: int, every: int, table: Table, coarse: bool) -> Iterator[Job]:
-    """List all jobs, the most important first."""
+def jobs(
+    parts: Iterable[str], frames: int, every: int, table: Table, coarse: bool, methods: Sequence[str] = ("direct",)
+) -> Iterator[Job]:
+    """List all jobs, the most important first. Networks fly the runs over the rocky field of the model `thesis` only."""
     if "trajectories" in parts:
-        yield from (trajectory_job(run, model, frames, coarse) for model in RECIPES for run in NOISE_OF)
-        yield from (trajectory_job(run, SPECKLE, frames, coarse) for run, noise in NOISE_OF.items() if noise == "none")
+        for method in methods:
+            quiet = [run for run, noise in NOISE_OF.items() if noise == "none"]
+            if method != "direct":
+                yield from (trajectory_job(run, "thesis", frames, coarse, method) for run in quiet)
+                continue
+            yield from (trajectory_job(run, model, frames, coarse) for model in RECIPES for run in NOISE_OF)
+            yield from (trajectory_job(run, SPECKLE, frames, coarse) for run in quiet)
     if "table21" in parts:
         for setting in table.settings:
             own = setting._replace(every=setting.every * every)
             yield from (Job("table21", run, texture, *own, frames, coarse) for texture in table.textures for run in RUNS)
 
 
-def trajectory_job(run: str, model: str, frames: int, coarse: bool = False) -> Job:
+def trajectory_job(run: str, model: str, frames: int, coarse: bool = False, method: str = "direct") -> Job:
     """Return the job of a trajectory."""
     texture = "gaussian" if run in RUNS else "rocky-field"
-    return Job("trajectories", run, texture, "direct", model, NOISE_OF[run], 1, frames, coarse)
+    return Job("trajectories", run, texture, method, model, NOISE_OF[run], 1, frames, coarse)

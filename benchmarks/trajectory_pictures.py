@@ -11,7 +11,8 @@ from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 
 from mitsonar.io.whole_files import write_whole
 from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
-from mitsonar.mapping.mosaic import Mosaic, build_mosaic
+from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
+from mitsonar.motion.motion_errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import GAMMA
 from mitsonar.records.sonar_frames import SonarFrames
@@ -50,10 +51,47 @@ def paths_of(out: Path, job: Job, name: str) -> tuple[SonarFrames, dict[str, Tra
     return frames, {"true": Trajectory(frames.poses, frames.time_s), "estimated": path}
 
 
-def mosaic_along(frames: SonarFrames, path: Trajectory) -> Mosaic:
+def mosaic_along(frames: SonarFrames, path: Trajectory, blend: Blend = "weighted") -> Mosaic:
     """Build the mosaic of all frames along a path, with the illumination compensated."""
     some = frames.select(np.unique(np.linspace(0, len(frames) - 1, ILLUMINATION_FRAMES).astype(int)))
-    return build_mosaic(frames, path.poses, frames.height_m, cell_m=0.015, illumination=illumination(some))
+    return build_mosaic(frames, path.poses, frames.height_m, cell_m=0.015, blend=blend, illumination=illumination(some))
+
+
+def draw_network(out: Path, pictures: Path, frames: int, method: str) -> None:
+    """Draw figures 3.7 and 3.8: paths of a network over the rocky field, and the mosaic along the first."""
+    from matplotlib.figure import Figure
+
+    pictures.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(17.0, 6.5), layout="constrained")
+    axes = figure.subplots(1, 3, width_ratios=(12.8, 4, 4))
+    name = ""
+    for panel, run in zip(axes, ("sideways", "forward", "braking"), strict=True):
+        job = trajectory_job(run, "thesis", frames, method=method)
+        made, paths = paths_of(out, job, "raw")
+        show(panel, mosaic_along(made, paths["estimated"], "centre"), paths)  # of 24 beams, as in figure 3.7
+        end = np.linalg.norm(paths["estimated"].poses[-1, :2] - paths["true"].poses[-1, :2])
+        length = np.linalg.norm(np.diff(paths["true"].poses[:, :2], axis=0), axis=1).sum()
+        panel.set_title(f"{run}, {length:.1f} m:\nends {end:.2f} m off, {100 * end / length:.1f} %")
+        name = job.name.split("-rocky-field-")[1].split("-thesis")[0]
+    figure.suptitle(f"{method} from frame to frame, rocky field, model `thesis`, no noise; mosaics along estimated paths")
+    save_small(pictures / f"paths_{name}.png", figure)
+
+
+def draw_errors(out: Path, pictures: Path, job: Job) -> None:
+    """Draw figure 2.7: absolute errors of the pairs along trajectory 2."""
+    from matplotlib.figure import Figure
+
+    pictures.mkdir(parents=True, exist_ok=True)
+    with np.load(out / f"{job.name}.npz") as table:
+        error = np.abs(in_units(table["motion"] - table["true"]))
+    figure = Figure(figsize=(9.0, 5.0), layout="constrained")
+    for panel, axis, values in zip(figure.subplots(3, 1, sharex=True), AXES, error.T, strict=True):
+        panel.plot(job.every * np.arange(len(values)), values, linewidth=0.8)
+        panel.set(ylabel=f"{axis.name} ({axis.unit})")
+        panel.grid(alpha=0.3)
+    panel.set_xlabel("pair")
+    figure.suptitle(f"absolute errors, {job.method}, {job.run}, {job.texture} seabed, noise {job.noise}")
+    save_small(pictures / "pair_errors.png", figure)
 
 
 def pattern_figure(out: Path, model: str, frames: int) -> Figure:

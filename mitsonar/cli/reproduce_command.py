@@ -38,6 +38,13 @@ def reproduce(
         list[str] | None,
         typer.Option("--set", help="Change a key of all recipes, KEY=VALUE, unless a row sets it: precision=bf16-mixed."),
     ] = None,
+    data: Annotated[
+        list[str] | None,
+        typer.Option("--data", help="Change a key of all data sets, KEY=VALUE: sonar.range_bins=128, channel.rays=12500."),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Train each row for two steps on a few coarse frames, to see that it runs.")
+    ] = False,
     workers: Annotated[int | None, typer.Option(help="Number of processes that render (default: number of cores).")] = None,
     accelerator: Annotated[str, typer.Option(help="Lightning's accelerator: auto, cpu, gpu ...")] = "auto",
     devices: Annotated[str, typer.Option(help="Lightning's devices: auto, a number, or a list (0,1).")] = "auto",
@@ -49,18 +56,18 @@ def reproduce(
     if table is None:
         _list()
         return
-    if out is None:
-        raise MitsonarError(f"table {table} needs a folder: give -o")
     if workers is not None and workers < 1:
         raise MitsonarError(f"--workers must be at least 1: got {workers}")
     from mitsonar.training.document_tables import rows_named, table_named
 
     wanted = [name.strip() for name in rows.split(",") if name.strip()] if rows is not None else None
     rows_named(table_named(table), wanted)
+    if out is None:
+        raise MitsonarError(f"table {table} needs a folder: give -o")
     from mitsonar.training.reproduce import Effort
     from mitsonar.training.reproduce import reproduce as reproduced
 
-    effort = Effort(scale, minutes or None, batch, changes_of(change or [], None))
+    effort = Effort(scale, minutes or None, batch, changes_of(change or [], None), changes_of(data or [], None), quick)
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     try:
         with ExitStack() as stack:
@@ -77,13 +84,18 @@ def reproduce(
 
 
 def _list() -> None:
-    """List all tables with their rows."""
-    from mitsonar.training.document_tables import LOUD, NOISES, load_tables
+    """List all tables and figures with their rows, or with the command that makes them."""
+    from mitsonar.training.document_tables import LOUD, NOISES, ScriptedTable, contents
 
     printed = [said for noise, said in NOISES.items() if noise != LOUD]
     say(f"RMSE in Almanza-Medina, sideways mm / forward mm / yaw deg: {', '.join(printed)}")
-    for table in load_tables().values():
+    for table in contents():
         say(f"\n{table.name}  {table.title}")
+        if isinstance(table, ScriptedTable):
+            for approach, errors in table.printed.items():
+                say(f"    {approach:32} {errors}")
+            say(f"    {table.command}")
+            continue
         for row in table.rows:
             errors = [row.said(row.printed.get(noise)) for noise in table.noises if noise != LOUD] if row.printed else []
             say(f"    {row.name:32} {'   '.join(errors) or '-'}   {row.approach}")

@@ -175,8 +175,11 @@ def _trained(path: str | Path) -> Callable[..., AnyEstimator]:
     """
     checkpoint = load_checkpoint(path)
     from mitsonar.estimation.learned.image_network import ImageNetwork
+    from mitsonar.estimation.learned.response_network import ResponseNetwork
     from mitsonar.estimation.learned.view_network import ViewNetwork, reads_views
 
+    if checkpoint.channel is not None:
+        return partial(ResponseNetwork, checkpoint)
     return partial(ViewNetwork if reads_views(checkpoint) else ImageNetwork, checkpoint)
 
 

@@ -19,11 +19,15 @@ __all__ = [
     "NOISES",
     "DocumentTable",
     "Errors",
+    "ScriptedTable",
     "Strict",
     "TableRow",
+    "contents",
     "errors_said",
+    "load_scripted",
     "load_tables",
     "rows_named",
+    "split_name",
     "table_named",
     "tables_with",
 ]
@@ -148,6 +152,26 @@ class DocumentTable(Strict):
         return tuple(end / np.sqrt(3) for end in self.largest)
 
 
+class ScriptedTable(Strict):
+    """A table or figure of Almanza-Medina that a script of ``benchmarks/`` makes: of methods, paths, times.
+
+    Attributes:
+        name: its number, of a figure with ``figure-`` before it.
+        title: what it shows.
+        section: of Almanza-Medina that describes it.
+        command: that makes it, from the root of the sources.
+        printed: what Almanza-Medina prints, row by row, as text.
+        results: page and heading with ours.
+    """
+
+    name: str
+    title: str
+    section: str
+    command: str
+    printed: dict[str, str] = Field(default_factory=dict)
+    results: str
+
+
 @cache
 def load_tables() -> dict[str, DocumentTable]:
     """Load all tables, by number."""
@@ -156,15 +180,30 @@ def load_tables() -> dict[str, DocumentTable]:
     return {name: DocumentTable(name=name, **fields) for text in texts for name, fields in yaml.safe_load(text).items()}
 
 
+@cache
+def load_scripted() -> dict[str, ScriptedTable]:
+    """Load the tables and figures that scripts make, by number."""
+    text = (files("mitsonar.recipes") / "tables" / "scripted.yaml").read_text(encoding="utf-8")
+    return {name: ScriptedTable(name=name, **fields) for name, fields in yaml.safe_load(text).items()}
+
+
+def contents() -> list[DocumentTable | ScriptedTable]:
+    """List all tables and figures that can be reproduced, in the order of their chapters and numbers."""
+    both: list[DocumentTable | ScriptedTable] = [*load_tables().values(), *load_scripted().values()]
+    return sorted(both, key=lambda one: [int(number) for number in one.name.removeprefix("figure-").split(".")])
+
+
 def table_named(name: str) -> DocumentTable:
     """Return the table of that number.
 
     Raises:
-        MitsonarError: no such table.
+        MitsonarError: no such table, or one that a script makes.
     """
-    tables = load_tables()
+    tables, scripted = load_tables(), load_scripted()
+    if name in scripted:
+        raise MitsonarError(f"{name} is made by a script of mitsonar's sources: run there  {scripted[name].command}")
     if name not in tables:
-        raise MitsonarError(f"no table {name!r}: {nearest_names(name, tables)}")
+        raise MitsonarError(f"no table {name!r}: {nearest_names(name, [one.name for one in contents()])}")
     return tables[name]
 
 
@@ -190,3 +229,8 @@ def errors_said(errors: tuple[float, ...]) -> str:
     """Format the RMSE of each axis for people."""
     named = zip(errors, AXES, strict=False)
     return " / ".join(f"{value:.3f}" if axis.unit == "deg" else f"{value:.2f}" for value, axis in named)
+
+
+def split_name(split: str | JsonObject) -> str:
+    """Return what a split deals out: ``sample``, ``sequence`` or ``scene``."""
+    return split if isinstance(split, str) else str(split["by"])

@@ -267,9 +267,11 @@ def _table(checkpoint: Checkpoint, subject: _Subject, ms: float, estimates: Arra
 
 
 def _correlations(error: Array, axes: int) -> dict[str, float | None]:
-    """Return the correlations of the errors of any two axes ``(n, axes)``; None where an axis has no error."""
-    with np.errstate(invalid="ignore"):
-        table = np.atleast_2d(np.corrcoef(error[:, :axes], rowvar=False))
+    """Return the correlations of the errors of any two axes ``(n, axes)``; None of one sample, or of no error."""
+    table = np.full((axes, axes), np.nan)
+    if len(error) > 1:
+        with np.errstate(invalid="ignore"):
+            table = np.atleast_2d(np.corrcoef(error[:, :axes], rowvar=False))
     return {
         f"{AXES[one].name}-{AXES[other].name}": float(table[one, other]) if np.isfinite(table[one, other]) else None
         for one, other in combinations(range(axes), 2)

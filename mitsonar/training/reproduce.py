@@ -26,7 +26,7 @@ from mitsonar.io.run_directory import RunDirectory, RunKind
 from mitsonar.io.storage import Storage
 from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.training.document_tables import load_tables, rows_named, table_named, tables_with
+from mitsonar.training.document_tables import load_tables, rows_named, split_name, table_named, tables_with
 from mitsonar.training.evaluation import evaluate
 from mitsonar.training.reproduced_tables import plain_table, table_figure, table_lines
 from mitsonar.training.row_results import Found, Reached, RowScore
@@ -52,6 +52,23 @@ UNSEEN_SEQUENCES = (100, 1000)
 """Fewest (ten scenes) and most sequences of unseen scenes; between, a twentieth of the training sequences."""
 
 
+QUICK_TRAINING: JsonObject = {
+    "network.width": 1 / 32,
+    "steps": 2,
+    "epochs": None,
+    "batch": 2,
+    "validate": {"noise": ["none"], "pairs": 2, "every_steps": 2},
+}
+"""Changes of training recipes by a quick effort."""
+
+QUICK_WORLDS: dict[str, JsonObject] = {
+    "rocky-field": {"family": "rocky-field", "size_m": 30, "a_side": [5, 8]},
+    "ship-hull": {"family": "ship-hull", "groups_a_side": [3, 3], "anodes_a_side": [3, 3]},
+    "flat-objects": {"family": "flat-objects", "size_m": 30, "seabed_cells": 300, "rectangles": 20, "ellipses": 20},
+}
+"""Worlds of a quick effort, by family."""
+
+
 @dataclass(frozen=True)
 class Effort:
     """What is spent on each row. All rows in one folder have the same effort.
@@ -63,6 +80,8 @@ class Effort:
             recipe's.
         changes: keys of the training recipes to change, with dots between the levels. Keys that a table or a row sets are
             not changed.
+        data: keys of the data set recipes to change, beside those that a training recipe changes.
+        quick: a few coarse frames of small worlds and two steps of narrow networks, to see that a row can be trained.
 
     Raises:
         MitsonarError: a value is outside these limits.
@@ -72,6 +91,8 @@ class Effort:
     minutes: float | None = 30.0
     batch: int | None = None
     changes: JsonObject = field(default_factory=dict)
+    data: JsonObject = field(default_factory=dict)
+    quick: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.scale <= 1:
@@ -87,7 +108,10 @@ class Effort:
         Raises:
             MitsonarError: an unknown key, or a value outside its limits.
         """
-        recipe = load_training_recipe(name, {**self.changes, **(own or {})})
+        recipe = load_training_recipe(name, {**self.changes, **(own or {}), **(QUICK_TRAINING if self.quick else {})})
+        few = quick_data(load_recipe(recipe.data)) if self.quick else {}
+        if few or self.data:
+            recipe = recipe.replace(data_changes={**recipe.data_changes, **self.data, **few})
         if self.batch is None or self.batch == recipe.batch:
             return recipe
         rate = recipe.optimiser.rate * math.sqrt(self.batch / recipe.batch)
@@ -95,6 +119,8 @@ class Effort:
 
     def sentence(self) -> str:
         """Describe the effort for people."""
+        if self.quick:
+            return "two steps on a few coarse frames: these errors say nothing"
         parts = [f"scale {self.scale:g} of the recipes' data"]
         parts.append("all epochs" if self.minutes is None else f"at most {self.minutes:g} minutes of training a row")
         if self.batch is not None:
@@ -102,6 +128,9 @@ class Effort:
         if self.changes:
             keys = ", ".join(f"{key} {json.dumps(value)}" for key, value in self.changes.items())
             parts.append(f"recipes changed, where a row has no value of its own: {keys}")
+        if self.data:
+            keys = ", ".join(f"{key} {json.dumps(value)}" for key, value in self.data.items())
+            parts.append(f"data changed: {keys}")
         return "; ".join(parts)
 
 
@@ -179,8 +208,8 @@ def reproduce(
         for name, recipe in recipes.items():
             if name not in bench.found():
                 bench.work(name, recipe, data[name], crew)
-                report = bench.report()
-    return report
+                report = report if effort.quick else bench.report()
+        return bench.report() if effort.quick else report
 
 
 @dataclass(frozen=True)
@@ -235,16 +264,18 @@ class TableBuilder:
 
     def work(self, name: str, recipe: TrainingRecipe, data: Recipe, crew: Crew) -> None:
         """Make the data of one row, train and evaluate it. What is on disk already is not repeated."""
-        sequences = max(1, round(self.effort.scale * data.sequences))
         table = table_named(tables_with(name)[0])
-        other, fresh = unseen_recipe(data, sequences, table.unseen, recipe.input.frames)
-        if table.unseen is not None:
+        scale = 1.0 if self.effort.quick else self.effort.scale
+        sequences = max(1, round(scale * data.sequences))
+        wanted = None if self.effort.quick else table.unseen
+        other, fresh = unseen_recipe(data, sequences, wanted, recipe.input.frames)
+        if wanted is not None:
             fresh = max(min(fresh, UNSEEN_SEQUENCES[0]), round(self.effort.scale * fresh))
         seen = self._made(data, sequences, crew)
         gain = DataStore.open(seen).about.get("gain")  # both data sets are of one sonar
         unseen = self._made(other if gain is None else other.model_copy(update={"gain": gain}), fresh, crew)
         checkpoint = self._trained(name, recipe, seen, crew)
-        noises = list(table.noises)
+        noises = list(table.noises)[: 1 if self.effort.quick else None]
         parts = {"validation": (seen, "validation"), "unseen": (unseen, "all")}
         if split_for(recipe.split_of, data).test:
             parts["test"] = seen, "test"
@@ -322,6 +353,13 @@ class TableBuilder:
         return report
 
 
+def quick_data(data: Recipe) -> JsonObject:
+    """Return the changes of a data set recipe by a quick effort: few sequences over two small worlds, few rays."""
+    coarse: JsonObject = {"channel.rays": 500} if data.channel else {"sonar.rays_per_beam": 60}
+    sequences = 10 if data.flight.pings > 2 else 20
+    return {**coarse, "world": QUICK_WORLDS[data.world["family"]], "scenes": [{"count": 2, "sequences": sequences}]}
+
+
 def unseen_recipe(data: Recipe, learnt: int, wanted: int | None, frames: int) -> tuple[Recipe, int]:
     """Return the recipe of unseen scenes, and how many of its sequences are made.
 
@@ -389,7 +427,7 @@ def _scale(checkpoint: Checkpoint, recipe: TrainingRecipe, run: JsonObject) -> R
         batch=recipe.batch,
         rate=recipe.optimiser.rate,
         precision=recipe.precision,
-        split=recipe.split if isinstance(recipe.split, str) else str(recipe.split["by"]),
+        split=split_name(recipe.split),
         date=date.today().isoformat(),
     )
 

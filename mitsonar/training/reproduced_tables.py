@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mitsonar.training.document_tables import HEIGHT, LOUD, NOISES, DocumentTable, TableRow, errors_said, tables_with
+from mitsonar.training.document_tables import (
+    HEIGHT,
+    LOUD,
+    NOISES,
+    DocumentTable,
+    TableRow,
+    errors_said,
+    split_name,
+    tables_with,
+)
 from mitsonar.training.row_results import Found, Part
 from mitsonar.training.training_types import JsonObject
 
@@ -63,7 +72,7 @@ REACHED: dict[str, Callable[[Found], str]] = {
 def table_lines(table: DocumentTable, found: Mapping[str, Found]) -> list[str]:
     """Format a table as Markdown. Rows that are not in ``found`` are shown as not trained yet."""
     first = next((found[row.name] for row in table.rows if row.name in found), None)
-    split = first.reached.split if first else str(table.set.get("split", "sequence"))
+    split = first.reached.split if first else split_name(table.set.get("split", "sequence"))
     return [
         f"## {table.kind} {table.name}: {table.title} (Almanza-Medina, {table.section})",
         "",

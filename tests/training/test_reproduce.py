@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,7 +21,16 @@ from mitsonar.config.data_recipe import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.motion_errors import in_units
-from mitsonar.training.document_tables import LOUD, NOISES, load_tables, rows_named, table_named, tables_with
+from mitsonar.training.document_tables import (
+    LOUD,
+    NOISES,
+    contents,
+    load_scripted,
+    load_tables,
+    rows_named,
+    table_named,
+    tables_with,
+)
 from mitsonar.training.reproduced_tables import table_figure, table_lines
 from mitsonar.training.row_results import Found, Reached, RowScore
 
@@ -74,6 +84,42 @@ def test_every_row_has_a_recipe_and_every_network_of_the_document_its_rows() -> 
             assert all(other.printed == row.printed for _, other in others)
             assert len(keys) == 1, row.name  # trained once and judged once for all of them
             load_training_recipe(row.recipe, {**table.set, **row.set})
+
+
+def test_contents_hold_every_table_and_figure_of_results() -> None:
+    """Chapters 2 to 5 of the document; its other tables and figures hold parameters and drawings."""
+    names = [table.name for table in contents()]
+    assert len(names) == len(set(names))
+    chapters = [
+        ["2.1", "figure-2.7"],
+        ["3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "figure-3.7", "3.8", "figure-3.8", "3.9", "3.10", "3.11"],
+        ["4.5", "4.12", "4.14", "4.15", "figure-4.16", "figure-4.17"],
+        ["5.2", "5.3", "5.5", "5.6", "figure-5.10", "figure-5.11"],
+    ]
+    assert names == [name for chapter in chapters for name in chapter]
+    scripted = load_scripted()
+    assert scripted["3.8"].printed["Non-DL"] == "8.39 / 1.29 / 0.175, high noise 8.16 / 1.31 / 0.178"
+    assert scripted["5.5"].printed["Ensemble (Bagged trees)"] == "17.77 mm"
+    root = Path(__file__).parents[2]
+    for table in scripted.values():
+        script = root / table.command.split()[1]
+        words = [word for word in table.command.split()[2:] if word.startswith("--")]
+        text = script.read_text(encoding="utf-8")
+        assert all(f'"{word}"' in text for word in words), table.name
+        page, heading = table.results.split("#")
+        heads = re.findall(r"^#+ (.*)", (root / page).read_text(encoding="utf-8"), re.MULTILINE)
+        anchors = {re.sub(r"[^a-z0-9 -]", "", head.lower()).replace(" ", "-") for head in heads}
+        assert heading in anchors, table.results
+        with pytest.raises(MitsonarError, match="is made by a script of mitsonar's sources: run there  python benchmarks/"):
+            table_named(table.name)
+
+
+def test_an_effort_changes_data_beside_what_a_recipe_changes() -> None:
+    row = load_training_recipe("portion-quadrants-vector")
+    changed = Effort(data={"sonar.range_bins": 128}).recipe("portion-quadrants-vector")
+    assert changed.data_changes == {**row.data_changes, "sonar.range_bins": 128}
+    assert load_recipe(changed.data, changed.data_changes).store == "vectors"
+    assert "data changed: sonar.range_bins 128" in Effort(data={"sonar.range_bins": 128}).sentence()
 
 
 def test_the_numbers_are_those_of_the_reference() -> None:
@@ -438,7 +484,7 @@ def test_what_is_done_is_not_done_again(whole: Path) -> None:
 
 
 def test_names_and_numbers_that_are_wrong() -> None:
-    with pytest.raises(MitsonarError, match=r"no table '3\.8': .*3\.10"):
+    with pytest.raises(MitsonarError, match=r"no table '3\.22': .*3\.2"):
         reproduce("3.8", "nowhere", Effort())
     with pytest.raises(MitsonarError, match=r"table 3\.1 has no row 'posnet-quantised': did you mean posenet-quantised"):
         reproduce("3.1", "nowhere", Effort(), rows=["posnet-quantised"])

@@ -19,9 +19,12 @@ pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves
 from mitsonar.config.training_recipe import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.config.training_recipe import training_recipe_from as recipe_of  # noqa: E402
 from mitsonar.datasets.response_pairs import ImpulsePairs  # noqa: E402
+from mitsonar.estimation.learned.response_network import ResponseNetwork  # noqa: E402
+from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.networks.blocks import SameAverage  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
+from mitsonar.records.impulse_responses import ImpulseResponses  # noqa: E402
 from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
 from mitsonar.training.training_run import train  # noqa: E402
 
@@ -151,7 +154,7 @@ def test_the_rate_falls_by_a_fifth_every_20_epochs() -> None:
 
 def test_training_recipes_are_the_rows_of_the_table() -> None:
     layers = {"160khz": 8, "wideband-9600": 8, "wideband-19200": 9, "circular-19200": 9, "ten-80khz": 6, "ten-160khz": 6}
-    names = [name for name in shipped_training_recipes() if name.startswith("impulse-")]
+    names = [name for name in shipped_training_recipes() if name.startswith("impulse-") and name != "impulse-posenet"]
     assert len(names) == 16
     for name in names:
         recipe = load_training_recipe(name)
@@ -227,3 +230,45 @@ def test_what_does_not_go_together_is_answered(made: Path, tmp_path: Path) -> No
         train(recipe_of(FIELDS), None, tmp_path / "run", render=True)
     with pytest.raises(MitsonarError, match="of impulse responses, this needs one of images"):
         train(recipe_of({**FIELDS, "input": {}, "noise": "none", "network": "posenet"}), made, tmp_path / "run")
+
+
+# ---------------------------------------------------------------- estimates
+
+
+def records(pairs: ImpulsePairs, index: int, **fields: Any) -> ImpulseResponses:
+    """One sample as an estimator reads it."""
+    response = pairs.response(index)
+    words = {"time_s": 0.05 * np.arange(len(response)), "sonar": pairs.sonar, "height_m": np.full(len(response), 10.0)}
+    return ImpulseResponses(response, **{**words, **fields})
+
+
+def test_a_checkpoint_estimates_what_evaluation_scores(made: Path, run: Path) -> None:
+    pairs = ImpulsePairs(made, part="validation")
+    expected, _ = predictions(Checkpoint.load(run), pairs)
+    estimator = create_estimator(str(run))
+    assert isinstance(estimator, ResponseNetwork)
+    assert estimator.consumes is ImpulseResponses
+    for index in range(3):
+        found = estimator.estimate(records(pairs, index))
+        np.testing.assert_allclose(found.motion[:2], expected[index], rtol=1e-4, atol=1e-7)
+        assert found.motion.yaw == 0
+        assert found.covariance is not None
+        np.testing.assert_allclose(1e3 * np.sqrt(np.diag(found.covariance))[:2], Checkpoint.load(run).rmse)
+
+
+def test_it_refuses_what_it_was_not_trained_for(made: Path, run: Path) -> None:
+    pairs = ImpulsePairs(made, part="validation")
+    estimator = create_estimator(str(run))
+    with pytest.raises(MitsonarError, match=r"given 3 pings: got 2"):
+        estimator.estimate(records(pairs, 0).select(slice(2)))
+    with pytest.raises(MitsonarError, match=r"sound_speed 1480.0, not 1500.0; train on that one, use likelihood"):
+        estimator.estimate(records(pairs, 0, sonar=pairs.sonar.replace(sound_speed=1480.0)))
+    slow = records(pairs, 0, sonar=pairs.sonar.replace(sound_speed=1480.0))
+    forced = create_estimator(str(run), force=True).estimate(slow)
+    assert forced.covariance is not None
+    elsewhere = estimator.estimate(records(pairs, 0, height_m=np.full(3, 14.0)))
+    assert not elsewhere.valid
+    assert "stood at 14.00 m" in elsewhere.reason
+    loud = records(pairs, 0)
+    silent = estimator.estimate(ImpulseResponses(0 * loud.response, loud.time_s, loud.sonar, height_m=loud.height_m))
+    assert (silent.valid, silent.reason) == (False, "no receiver heard anything")

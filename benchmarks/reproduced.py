@@ -1,0 +1,224 @@
+"""All tables and figures of Almanza-Medina: what was reached for each row, at which scale, by which command.
+
+    python benchmarks/reproduced.py                      # write benchmarks/REPRODUCED.md from benchmarks/results/reproduced
+    python benchmarks/reproduced.py add RUN              # take the rows of a folder of `mitsonar reproduce` first
+    python benchmarks/reproduced.py curve RUN [RUN ...]  # where the whole schedule would end, from the log of a training
+    python benchmarks/reproduced.py --quick              # train two steps of each row, and check that the page is up to date
+
+A row is one file of `results/reproduced`: what `mitsonar reproduce` found, and its command.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import shlex
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError
+from mitsonar.io.whole_files import write_whole
+from mitsonar.training.document_tables import DocumentTable, ScriptedTable, TableRow, contents, load_tables, tables_with
+from mitsonar.training.row_results import Found
+
+HERE = Path(__file__).resolve().parent
+RESULTS, PAGE = HERE / "results" / "reproduced", HERE / "REPRODUCED.md"
+HEAD = """# Tables and figures of Almanza-Medina, reproduced
+
+Written by `python benchmarks/reproduced.py` from `benchmarks/results/reproduced`; change the script, not this page. RMSE,
+sideways mm / forward mm / yaw deg, without noise; heights in cm. *By pair*: pairs dealt out one by one, as in the document,
+whose training has seen pairs of the same sequences. *Other sequences*: of the same scenes. *Unseen*: scenes that no network
+has seen. What comes out of it: [What these networks learn](../docs/guides/what-networks-learn.md),
+[Benchmarks](README.md#networks).
+"""
+
+Array = NDArray[np.float64]
+Texts = dict[str, str]
+"""Cells of a row on the page, and its command."""
+
+EARLIER = "earlier.json"
+"""Cells of rows that were trained before rows were kept, from the tables of README.md."""
+
+
+def main() -> None:
+    """Write the page, after adding rows if asked to."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["write", "add", "curve"], nargs="?", default="write")
+    parser.add_argument("runs", type=Path, nargs="*", help="folders of `mitsonar reproduce`; of curve: of trainings")
+    parser.add_argument("--quick", action="store_true", help="train two steps of each row, and check the page")
+    asked = parser.parse_args()
+    if asked.quick:
+        return quick()
+    if asked.what == "curve":
+        for run in asked.runs:
+            print(curve(run))
+        return None
+    for run in asked.runs if asked.what == "add" else []:
+        add(run)
+    write_whole(PAGE, page(results()).encode())
+    print(PAGE)
+
+
+def quick() -> None:
+    """Train two steps of each row, and check that the page is what the results say.
+
+    Raises:
+        SystemExit: it is not.
+    """
+    from mitsonar.training.reproduce import Effort, reproduce
+
+    with tempfile.TemporaryDirectory(prefix="reproduced-") as folder:
+        for table in load_tables():
+            done = reproduce(table, Path(folder) / "tables", Effort(quick=True), workers=1)["tables"][table]["rows"]
+            states = {row["name"]: row["status"] for row in done}
+            print(f"{table}: {len(done)} rows", flush=True)
+            if set(states.values()) != {"done"}:
+                raise SystemExit(f"rows of table {table} were not trained: {states}")
+    if PAGE.read_text(encoding="utf-8") != page(results()):
+        raise SystemExit(f"{PAGE.name} is not what the results say: run  python benchmarks/reproduced.py")
+
+
+def add(run: Path) -> None:
+    """Take the rows of a folder of `mitsonar reproduce`, with the command that makes them.
+
+    Raises:
+        MitsonarError: no such folder, or one without rows.
+    """
+    rows = sorted((run / "rows").glob("*.json"))
+    if not rows:
+        raise MitsonarError(f"{run} holds no rows: give the folder of `mitsonar reproduce`")
+    effort = json.loads((run / "run.json").read_text(encoding="utf-8"))["asked"]
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    for path in rows:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        table = {"command": command(path.stem, effort), **Found(**found).model_dump(mode="json")}
+        write_whole(RESULTS / path.name, (json.dumps(table, indent=1) + "\n").encode())
+
+
+def command(row: str, effort: dict[str, object]) -> str:
+    """Return the command that makes a row with an effort."""
+    words = ["mitsonar", "reproduce", tables_with(row)[0], "--rows", row, "--scale", f"{effort['scale']:g}"]
+    words += ["--minutes", f"{effort['minutes'] or 0:g}"]
+    words += ["--batch", str(effort["batch"])] if effort["batch"] else []
+    for option, key in (("--set", "changes"), ("--data", "data")):
+        changes = effort.get(key) or {}
+        assert isinstance(changes, dict)
+        for name, value in changes.items():
+            words += [option, f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    return shlex.join(words)
+
+
+def results() -> dict[str, Texts]:
+    """Load what was reached for each row, as the cells of the page and its command."""
+    rows = {row.name: row for table in load_tables().values() for row in table.rows}
+    found: dict[str, Texts] = json.loads((RESULTS / EARLIER).read_text(encoding="utf-8"))
+    for path in sorted(RESULTS.glob("*.json")):
+        if path.name != EARLIER:
+            fields = json.loads(path.read_text(encoding="utf-8"))
+            found[path.stem] = texts_of(rows[path.stem], fields.pop("command"), Found(**fields))
+    return found
+
+
+def texts_of(row: TableRow, words: str, ours: Found) -> Texts:
+    """Format what was reached for a row."""
+    parts = {"by_pair": "validation", "other": "test", "unseen": "unseen"}
+    scores = {name: ours.score(part, "none") for name, part in parts.items()}  # type: ignore[arg-type]
+    texts = {name: "-" if score is None else row.said(score.rmse) for name, score in scores.items()}
+    if ours.reached.split != "sample":
+        texts |= {"by_pair": "-", "other": texts["by_pair"]}
+    noisy, reached = ours.score("validation", "high"), ours.reached
+    planned = reached.training_pairs * reached.epochs_asked
+    parts_of_command = shlex.split(words)
+    given = [word.partition("=")[2] for word in parts_of_command if word.startswith("network.width=")]
+    data = [parts_of_command[place + 1] for place, word in enumerate(parts_of_command) if word == "--data"]
+    return texts | {
+        "high": "-" if noisy is None else row.said(noisy.rmse),
+        "seen": f"{reached.pairs_seen:,} of {planned:,.0f} ({reached.training_pairs:,} different)",
+        "width": "; ".join([given[-1] if given else "1", *data]),
+        "reached": f"{reached.minutes:.0f}, {reached.machine}, {reached.date}",
+        "command": words,
+    }
+
+
+def page(found: dict[str, Texts]) -> str:
+    """Format the page: every table and figure, and what was reached of each row."""
+    lines = [HEAD]
+    for table in contents():
+        lines += [f"## {title(table)}", ""]
+        lines += scripted(table) if isinstance(table, ScriptedTable) else trained(table, found)
+        lines.append("")
+    commands = [f"- {name}: `{texts['command']}`" for name, texts in sorted(found.items())]
+    return "\n".join([*lines, "## Commands", "", *commands, ""])
+
+
+def title(table: DocumentTable | ScriptedTable) -> str:
+    """Return the heading of a table or figure."""
+    figure = table.name.startswith("figure-") or (isinstance(table, DocumentTable) and table.figure)
+    return f"{'Figure' if figure else 'Table'} {table.name.removeprefix('figure-')}: {table.title}"
+
+
+def scripted(table: ScriptedTable) -> list[str]:
+    """Format what a script makes: its command, where its results are, and what the document prints."""
+    there = table.results.removeprefix("benchmarks/")
+    lines = [f"`{table.command}`: [results]({there})"]
+    if table.printed:
+        lines += ["", "| row | Almanza-Medina |", "|---|---|"]
+        lines += [f"| {row} | {text} |" for row, text in table.printed.items()]
+    return lines
+
+
+COLUMNS = {
+    "by_pair": "by pair",
+    "other": "other sequences",
+    "unseen": "unseen",
+    "high": "high noise, by pair",
+    "seen": "pairs seen",
+    "width": "width; data",
+    "reached": "minutes, processor, date",
+}
+"""What is shown of a row that was reached, and the heads of these columns."""
+
+
+def trained(table: DocumentTable, found: dict[str, Texts]) -> list[str]:
+    """Format the rows of a table of networks."""
+    heads = ["row", "Almanza-Medina", "its high noise", *COLUMNS.values()]
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for row in table.rows:
+        printed = [row.said(row.printed.get(noise)) for noise in ("none", "high")]
+        texts = found.get(row.name, {"by_pair": "not trained yet"})
+        lines.append(f"| {' | '.join([row.approach, *printed, *(texts.get(key, '-') for key in COLUMNS)])} |")
+    return lines
+
+
+def curve(run: Path) -> str:
+    """Fit error = a pairs^-b to the validations of a training, and say where its schedule would end.
+
+    The first third of the pairs is left out, where a network learns that there is a motion at all.
+    """
+    with (run / "log.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file)]
+    about = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    names = [name for name in list(rows[0])[6:] if not name.startswith("training ")]
+    whole = about["steps"] * about["asked"]["recipe"]["batch"]
+    lines = [f"{run.name}: {rows[-1]['pairs']} of {whole:,} pairs"]
+    for name in names:
+        both = np.array([(float(row["pairs"]), float(row[name])) for row in rows if row[name]])
+        lines.append(f"  {name}: {fitted(both, whole)}")
+    return "\n".join(lines)
+
+
+def fitted(both: Array, whole: int) -> str:
+    """Fit a power law to pairs seen and errors ``(n, 2)``, and extrapolate it."""
+    late = both[both[:, 0] > both[-1, 0] / 3]
+    if len(late) < 3:
+        return "too few validations"
+    slope, start = np.polyfit(*np.log(late).T, 1)
+    return f"{both[-1, 1]:.3g} now, falls as pairs^{slope:.2f}, {np.exp(start) * whole**slope:.3g} after {whole:,}"
+
+
+if __name__ == "__main__":
+    main()
