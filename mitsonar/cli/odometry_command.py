@@ -44,7 +44,7 @@ def odometry(
         typer.Option(
             help="zero, ecc, flow, phase, direct, corrnet, a checkpoint, or a class of your own as my_module:MyEstimator; "
             "NAME:key=value:key=value. Of several checkpoints, separated by commas, the one trained nearest to the height "
-            "is used. For impulse responses: zero, correlation, likelihood. Default: direct, or likelihood."
+            "is used. For impulse responses: zero, correlation, likelihood, impulse-posenet. Default: direct, or likelihood."
         ),
     ] = None,
     smooth: Annotated[str, typer.Option(help="none, spline or kalman. Invalid motions are bridged in any case.")] = "none",

@@ -62,7 +62,7 @@ QUICK_TRAINING: JsonObject = {
 """Changes of training recipes by a quick effort."""
 
 QUICK_WORLDS: dict[str, JsonObject] = {
-    "rocky-field": {"family": "rocky-field", "size_m": 30, "a_side": [5, 8]},
+    "rocky-field": {"family": "rocky-field", "size_m": 60, "a_side": [8, 12]},
     "ship-hull": {"family": "ship-hull", "groups_a_side": [3, 3], "anodes_a_side": [3, 3]},
     "flat-objects": {"family": "flat-objects", "size_m": 30, "seabed_cells": 300, "rectangles": 20, "ellipses": 20},
 }
@@ -356,7 +356,7 @@ class TableBuilder:
 def quick_data(data: Recipe) -> JsonObject:
     """Return the changes of a data set recipe by a quick effort: few sequences over two small worlds, few rays."""
     coarse: JsonObject = {"channel.rays": 500} if data.channel else {"sonar.rays_per_beam": 60}
-    sequences = 10 if data.flight.pings > 2 else 20
+    sequences = 6 if data.flight.pings > 2 else 12
     return {**coarse, "world": QUICK_WORLDS[data.world["family"]], "scenes": [{"count": 2, "sequences": sequences}]}
 
 

@@ -238,7 +238,12 @@ def test_what_does_not_go_together_is_answered(made: Path, tmp_path: Path) -> No
 def records(pairs: ImpulsePairs, index: int, **fields: Any) -> ImpulseResponses:
     """One sample as an estimator reads it."""
     response = pairs.response(index)
-    words = {"time_s": 0.05 * np.arange(len(response)), "sonar": pairs.sonar, "height_m": np.full(len(response), 10.0)}
+    low, high = pairs.recipe.flight.heights
+    words = {
+        "time_s": 0.05 * np.arange(len(response)),
+        "sonar": pairs.sonar,
+        "height_m": np.full(len(response), (low + high) / 2),
+    }
     return ImpulseResponses(response, **{**words, **fields})
 
 
@@ -252,6 +257,7 @@ def test_a_checkpoint_estimates_what_evaluation_scores(made: Path, run: Path) ->
         found = estimator.estimate(records(pairs, index))
         np.testing.assert_allclose(found.motion[:2], expected[index], rtol=1e-4, atol=1e-7)
         assert found.motion.yaw == 0
+        assert found.valid, found.reason
         assert found.covariance is not None
         np.testing.assert_allclose(1e3 * np.sqrt(np.diag(found.covariance))[:2], Checkpoint.load(run).rmse)
 
@@ -266,9 +272,9 @@ def test_it_refuses_what_it_was_not_trained_for(made: Path, run: Path) -> None:
     slow = records(pairs, 0, sonar=pairs.sonar.replace(sound_speed=1480.0))
     forced = create_estimator(str(run), force=True).estimate(slow)
     assert forced.covariance is not None
-    elsewhere = estimator.estimate(records(pairs, 0, height_m=np.full(3, 14.0)))
+    elsewhere = estimator.estimate(records(pairs, 0, height_m=np.full(3, 44.0)))
     assert not elsewhere.valid
-    assert "stood at 14.00 m" in elsewhere.reason
+    assert "stood at 44.00 m" in elsewhere.reason
     loud = records(pairs, 0)
     silent = estimator.estimate(ImpulseResponses(0 * loud.response, loud.time_s, loud.sonar, height_m=loud.height_m))
     assert (silent.valid, silent.reason) == (False, "no receiver heard anything")

@@ -20,7 +20,7 @@ from mitsonar.estimation.estimator import INPUTS
 from mitsonar.geometry.scan_conversion import cartesian_map
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_errors import AXES, in_units
+from mitsonar.motion.motion_errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
 from mitsonar.networks.gaussian_head import GaussianHead
@@ -222,13 +222,13 @@ class Trained:
         """Whether the answer, counted from the start of the iterations, is of the size that training had."""
         coder = self._checkpoint.coder
         middle, half = (coder.low + coder.high) / 2, (coder.high - coder.low) / 2
-        off = np.array(motion) - (np.zeros(3) if start is None else np.array(start))
+        off = (np.array(motion) - (np.zeros(3) if start is None else np.array(start)))[: len(half)]
         beyond = np.abs(off - middle) > BEYOND * half
         if not beyond.any():
             return ""
         axis = int(beyond.argmax())
-        value, low, high = in_units(np.array([off, coder.low, coder.high]))[:, axis]
-        name, unit, _ = AXES[axis]
+        name, unit, scale = AXES[axis]
+        value, low, high = scale * np.array([off, coder.low, coder.high])[:, axis]
         since = "" if start is None else ", counted from the start,"
         return f"{name} {value:.3g} {unit}{since} is beyond the motions of training, {low:.3g}..{high:.3g} {unit}"
 
