@@ -35,7 +35,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from multiprocessing.pool import Pool
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from bench_impulse import cpu
@@ -52,6 +52,7 @@ from mitsonar import (
     load_sonar,
 )
 from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.recipe_parts import Split
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.response_packing import with_noise
@@ -461,6 +462,11 @@ def place_cells(name: str, simulator: ChannelSimulator, samples: int) -> str:
     return f"{rmse} | {distance:.3f} | {known} | {sum(valid)} of {samples} | {np.median(ms):.0f}"
 
 
+LEAKS: tuple[Literal["none", "one_ping"], ...] = ("none", "one_ping")
+ONE_BY_ONE = Split(by="sample", train=0.8, validation=0.2)
+"""How Almanza-Medina deals out samples (5.4.1)."""
+
+
 def regressors(asked: argparse.Namespace) -> None:
     """Table 5.5: forward RMSE of ten regressors on pairs, and on one ping twice."""
     print("| regressor | rays | pairs, RMSE mm | one ping twice | no motion | learnt in s |\n" + 6 * "|---" + "|")
@@ -471,10 +477,9 @@ def regressors(asked: argparse.Namespace) -> None:
         names = list(REGRESSORS)[1:3] if asked.quick else list(REGRESSORS)
         for name in names:
             both = []
-            for leak in ("none", "one_ping"):
-                words = {"leak": leak, "split": {"by": "sample", "train": 0.8, "validation": 0.2}}
-                train, test = (flattened(ImpulsePairs(path, part=part, **words)) for part in ("train", "validation"))
-                both += score_all(train, test, names=[name])
+            for leak in LEAKS:
+                parts = [ImpulsePairs(path, part=part, leak=leak, split=ONE_BY_ONE) for part in ("train", "validation")]
+                both += score_all(flattened(parts[0]), flattened(parts[1]), names=[name])
             pairs, alone = both
             errors = " | ".join(f"{value:.2f}" for value in (pairs.rmse_mm, alone.rmse_mm, pairs.zero_mm))
             print(f"| {name} | {rays:,} | {errors} | {pairs.fit_s:.0f} |", flush=True)

@@ -2,8 +2,8 @@
 
     python benchmarks/reproduced.py                      # write benchmarks/REPRODUCED.md from benchmarks/results/reproduced
     python benchmarks/reproduced.py add RUN              # take the rows of a folder of `mitsonar reproduce` first
-    python benchmarks/reproduced.py curve RUN [RUN ...]  # where the whole schedule would end, from the log of a training
-    python benchmarks/reproduced.py --quick              # train two steps of each row, and check that the page is up to date
+    python benchmarks/reproduced.py curve RUN [RUN ...]  # where the schedule would end, from the log of a training
+    python benchmarks/reproduced.py --quick              # train two steps of each recipe, and check the page
 
 A row is one file of `results/reproduced`: what `mitsonar reproduce` found, and its command.
 """
@@ -49,7 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["write", "add", "curve"], nargs="?", default="write")
     parser.add_argument("runs", type=Path, nargs="*", help="folders of `mitsonar reproduce`; of curve: of trainings")
-    parser.add_argument("--quick", action="store_true", help="train two steps of each row, and check the page")
+    parser.add_argument("--quick", action="store_true", help="train two steps of each recipe, and check the page")
     asked = parser.parse_args()
     if asked.quick:
         return quick()
@@ -64,20 +64,28 @@ def main() -> None:
 
 
 def quick() -> None:
-    """Train two steps of each row, and check that the page is what the results say.
+    """Train two steps of a row of each recipe, and check that the page is what the results say.
 
     Raises:
         SystemExit: it is not.
     """
     from mitsonar.training.reproduce import Effort, reproduce
 
+    done: set[str] = set()
     with tempfile.TemporaryDirectory(prefix="reproduced-") as folder:
-        for table in load_tables():
-            done = reproduce(table, Path(folder) / "tables", Effort(quick=True), workers=1)["tables"][table]["rows"]
-            states = {row["name"]: row["status"] for row in done}
-            print(f"{table}: {len(done)} rows", flush=True)
-            if set(states.values()) != {"done"}:
-                raise SystemExit(f"rows of table {table} were not trained: {states}")
+        for number, table in load_tables().items():
+            rows = {row.recipe: row.name for row in table.rows if row.recipe not in done}
+            if not rows:
+                continue
+            names = list(rows.values())
+            found = reproduce(number, Path(folder) / "tables", Effort(quick=True), rows=names, workers=1)
+            left = [
+                row["name"] for row in found["tables"][number]["rows"] if row["name"] in names and row["status"] != "done"
+            ]
+            if left:
+                raise SystemExit(f"rows of table {number} were not trained: {', '.join(left)}")
+            done |= set(rows)
+            print(f"{number}: {', '.join(names)}", flush=True)
     if PAGE.read_text(encoding="utf-8") != page(results()):
         raise SystemExit(f"{PAGE.name} is not what the results say: run  python benchmarks/reproduced.py")
 
@@ -216,7 +224,8 @@ def fitted(both: Array, whole: int) -> str:
     late = both[both[:, 0] > both[-1, 0] / 3]
     if len(late) < 3:
         return "too few validations"
-    slope, start = np.polyfit(*np.log(late).T, 1)
+    seen, error = np.log(late).T
+    slope, start = np.polyfit(seen, error, 1)
     return f"{both[-1, 1]:.3g} now, falls as pairs^{slope:.2f}, {np.exp(start) * whole**slope:.3g} after {whole:,}"
 
 

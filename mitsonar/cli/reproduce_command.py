@@ -92,8 +92,8 @@ def _list() -> None:
     for table in contents():
         say(f"\n{table.name}  {table.title}")
         if isinstance(table, ScriptedTable):
-            for approach, errors in table.printed.items():
-                say(f"    {approach:32} {errors}")
+            for approach, text in table.printed.items():
+                say(f"    {approach:32} {text}")
             say(f"    {table.command}")
             continue
         for row in table.rows:

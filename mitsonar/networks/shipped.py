@@ -7,7 +7,7 @@ from pathlib import Path
 
 __all__ = ["SHIPPED", "shipped_path"]
 
-SHIPPED = ("corrnet", "corrnet-coherent", "impulse-posenet", "posenet", "profilenet-quadrants-coherent")
+SHIPPED = ("corrnet", "corrnet-coherent", "impulse-posenet", "posenet", "posenet-noise", "profilenet-quadrants-coherent")
 """Their names. The recipe of the same name defines how each was trained."""
 
 

@@ -485,7 +485,7 @@ def test_what_is_done_is_not_done_again(whole: Path) -> None:
 
 def test_names_and_numbers_that_are_wrong() -> None:
     with pytest.raises(MitsonarError, match=r"no table '3\.22': .*3\.2"):
-        reproduce("3.8", "nowhere", Effort())
+        reproduce("3.22", "nowhere", Effort())
     with pytest.raises(MitsonarError, match=r"table 3\.1 has no row 'posnet-quantised': did you mean posenet-quantised"):
         reproduce("3.1", "nowhere", Effort(), rows=["posnet-quantised"])
     for scale in (0, -0.5, 1.5, float("nan")):
