@@ -26,6 +26,7 @@ NOTEBOOKS = ("01_render", "02_dataset", "03_odometry", "04_networks")
 
 PAGES = {
     "benchmarks/README.md": "benchmarks.md",
+    "benchmarks/REPRODUCED.md": "reproduced.md",
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",
     **{f"benchmarks/notebooks/{name}.ipynb": f"tutorials/{name}.md" for name in NOTEBOOKS},

@@ -80,7 +80,7 @@ def test_the_nearest_name_is_asked_for(mitsonar: Command, tmp_path: Path, typed:
 @pytest.mark.parametrize(
     ("typed", "words"),
     [
-        ("evaluate corrent none.zarr", "or posenet or profilenet-quadrants-coherent; did you mean corrnet?"),
+        ("evaluate corrent none.zarr", "or posenet-noise or profilenet-quadrants-coherent; did you mean corrnet?"),
         ("train posenet-hul -o x", "did you mean posenet-hull"),
         ("reproduce 3.22 -o x", "did you mean 3.2"),
     ],

@@ -553,7 +553,8 @@ def test_the_command_lists_its_tables_and_answers_to_mistakes(mitsonar: Command,
     assert "impulse-standard                 5.10 / 4.20   standard" in listed.stdout
     out = tmp_path / "none"
     refused(mitsonar("reproduce", "3.2"), "table 3.2 needs a folder: give -o")
-    refused(mitsonar("reproduce", "3.9", "-o", out), "no table '3.9'", "3.10")
+    refused(mitsonar("reproduce", "3.12", "-o", out), "no table '3.12'", "3.10")
+    refused(mitsonar("reproduce", "3.9"), "3.9 is made by a script", "python benchmarks/bench_compare.py")
     refused(
         mitsonar("reproduce", "3.1", "--rows", "posenet", "-o", out), "no row 'posenet'", "did you mean posenet-quantised"
     )
