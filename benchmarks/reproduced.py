@@ -15,6 +15,7 @@ import argparse
 import csv
 import json
 import shlex
+import sys
 import tempfile
 from pathlib import Path
 
@@ -212,6 +213,8 @@ def curve(run: Path) -> str:
 
     The first third of the pairs is left out, where a network learns that there is a motion at all.
     """
+    if not (run / "log.csv").is_file():
+        raise MitsonarError(f"{run} holds no log.csv: give the folder of a training")
     with (run / "log.csv").open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file)]
     about = json.loads((run / "run.json").read_text(encoding="utf-8"))
@@ -235,4 +238,8 @@ def fitted(both: Array, whole: int) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except MitsonarError as fault:
+        print(f"error: {fault}", file=sys.stderr)
+        raise SystemExit(2) from None
