@@ -62,6 +62,7 @@ TEXTS = {
 
 @pytest.mark.parametrize("name", TEXTS)
 def test_texts_are_checked_in_linear_time(name: str, tmp_path: Path) -> None:
+    """Quadratic time would be hours; seconds on a quiet machine are a minute on a busy one."""
     text, words = TEXTS[name]
     (tmp_path / "bad.xml").write_text(text)
     before = os.times()
@@ -69,7 +70,7 @@ def test_texts_are_checked_in_linear_time(name: str, tmp_path: Path) -> None:
         check_text(tmp_path / "bad.xml", {}, [tmp_path])
     after = os.times()
     assert len(str(caught.value)) < 1000
-    assert after.user + after.system - before.user - before.system < 10
+    assert after.user + after.system - before.user - before.system < 120
 
 
 GOOD = {

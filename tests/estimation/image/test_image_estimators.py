@@ -185,11 +185,12 @@ def test_a_wrong_height_of_a_sonar_that_rolls_is_within_the_covariance() -> None
 
 
 def test_swapped_frames_tell_the_opposite_motion(pair: Pair) -> None:
-    """The way back: direct treats both frames alike, so that the middle frame's motion only changes its sign."""
+    """The way back: direct treats both frames alike, so that the middle frame's motion only changes its sign, up to
+    the step at which its iteration ends, which differs between processors."""
     frames = pair(Motion(0.015, -0.012, np.radians(0.4)))
     there = Direct().estimate(frames)
     back = Direct().estimate(frames.select(np.array([1, 0])))
-    assert back.motion.yaw == pytest.approx(-there.motion.yaw, abs=2e-6)
+    assert back.motion.yaw == pytest.approx(-there.motion.yaw, abs=1e-5)
     home = compose(compose(Pose(0, 0, 0), there.motion), back.motion)
     assert np.allclose(home[:2], 0, atol=1e-4)
 
