@@ -16,9 +16,9 @@ from mitsonar.mapping.graph_solver import GraphSolution, solved
 from mitsonar.mapping.loop_appearance import Canvas
 from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, LoopSearch, canvas_of, search_loops
 from mitsonar.mapping.motion_series import MotionSeries, path_of
-from mitsonar.mapping.pose_graph import CorrelatedErrors, Headings, PoseEdges, PoseGraph, relative_motions, wrapped
+from mitsonar.mapping.pose_graph import CorrelatedErrors, PoseEdges, PoseGraph, relative_motions
 from mitsonar.mapping.trajectory_smoothing import fit_noise
-from mitsonar.mapping.vehicle_sensors import UNKNOWN_STD, VehicleSensors
+from mitsonar.mapping.vehicle_sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
+from mitsonar.mapping.vehicle_sensors import Headings, wrapped
 
-__all__ = ["CorrelatedErrors", "Headings", "PoseEdges", "PoseGraph", "relative_motions", "wrapped"]
+__all__ = ["CorrelatedErrors", "PoseEdges", "PoseGraph", "relative_motions"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -61,19 +62,6 @@ class PoseEdges(NamedTuple):
             return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariances)))
         except np.linalg.LinAlgError:
             raise MitsonarError("a pose graph needs covariances of motions that are positive: got one that is not") from None
-
-
-class Headings(NamedTuple):
-    """Absolute headings of poses: their numbers ``(n,)``, the headings [rad] and the standard deviations [rad]."""
-
-    pose: Index
-    heading: Array
-    std: Array
-
-    @classmethod
-    def none(cls) -> Self:
-        """Return no headings."""
-        return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
 
 
 class CorrelatedErrors(NamedTuple):
@@ -157,8 +145,3 @@ def relative_motions(poses: Array, first: ArrayLike, second: ArrayLike) -> Array
     x, y, yaw = (there - poses[np.asarray(first)]).T
     sin, cos = np.sin(there[:, 2]), np.cos(there[:, 2])
     return np.column_stack([x * cos - y * sin, x * sin + y * cos, wrapped(yaw)])
-
-
-def wrapped(angle: Array) -> Array:
-    """Return angles within -pi..pi [rad]."""
-    return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))

@@ -171,16 +171,16 @@ def _draw(folder: Path, echogram: Echogram, soundings: Soundings) -> None:
     """Write the pictures of an echogram, and a side-scan's XTF file."""
     if echogram.sounder.kind == "sidescan":
         write_xtf(folder / "sidescan.xtf", echogram)
-        sounding_figures.save_figure(sounding_figures.waterfall_figure_of(echogram), folder / "waterfall.png")
+        sounding_figures.save_sounding_figure(sounding_figures.waterfall_figure_of(echogram), folder / "waterfall.png")
     else:
-        sounding_figures.save_figure(sounding_figures.echogram_figure(echogram, soundings), folder / "echogram.png")
+        sounding_figures.save_sounding_figure(sounding_figures.echogram_figure(echogram, soundings), folder / "echogram.png")
 
 
 def _write_dvl(folder: Path, soundings: Soundings) -> list[str]:
     """Write the readings of a DVL, and the file that odometry takes."""
     readings = dvl_readings(soundings, soundings.sounder.fan.seed)
     readings.save(folder / "dvl.csv")
-    sounding_figures.save_figure(sounding_figures.dvl_figure(readings), folder / "dvl.png")
+    sounding_figures.save_sounding_figure(sounding_figures.dvl_figure(readings), folder / "dvl.png")
     lost = int((~readings.locked).sum())
     if lost == len(readings.locked):
         return ["the DVL has no bottom lock in any ping: there is no sensors.csv"]
@@ -194,9 +194,9 @@ def _write_points(folder: Path, soundings: Soundings) -> list[str]:
     if soundings.sounder.kind == "altimeter":
         return []
     drawn = sounding_figures.soundings_figure(soundings)
-    sounding_figures.save_figure(drawn, folder / "soundings.png")
+    sounding_figures.save_sounding_figure(drawn, folder / "soundings.png")
     if soundings.sounder.kind == "range-image":
-        sounding_figures.save_figure(sounding_figures.range_figure(soundings), folder / "range.png")
+        sounding_figures.save_sounding_figure(sounding_figures.range_figure(soundings), folder / "range.png")
     if find_spec("trimesh") is None:
         return ["there is no soundings.ply without trimesh: pip install 'mitsonar[meshes]'"]
     soundings.save(folder / "soundings.ply")

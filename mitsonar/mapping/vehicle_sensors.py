@@ -8,20 +8,20 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.pose_graph import Headings, wrapped
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.motion_prior import MotionPrior
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["DeadReckoning", "Readings", "SensorMotions", "VehicleSensors", "straight_poses"]
+__all__ = ["DeadReckoning", "Headings", "Readings", "SensorMotions", "VehicleSensors", "straight_poses", "wrapped"]
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
 UNKNOWN_STD = np.array([10.0, 10.0, np.pi])
 """Standard deviations of what a sensor does not tell of a motion [m, m, rad]."""
@@ -34,6 +34,19 @@ LONGEST_GAP_S = 1.0
 
 SLOWER = 3.0
 """Gaps of so many usual steps count as gaps."""
+
+
+class Headings(NamedTuple):
+    """Absolute headings of poses: their numbers ``(n,)``, the headings [rad] and the standard deviations [rad]."""
+
+    pose: Index
+    heading: Array
+    std: Array
+
+    @classmethod
+    def none(cls) -> Self:
+        """Return no headings."""
+        return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -371,3 +384,8 @@ def _reckoned(dead: DeadReckoning, time_s: Array) -> SensorMotions:
     pair = np.flatnonzero(covered)
     walk = np.diag([dead.walk_m**2, dead.walk_m**2, dead.walk_rad**2])
     return SensorMotions(pair, table[pair], step[pair, None, None] * walk, np.zeros((len(pair), 3)))
+
+
+def wrapped(angle: Array) -> Array:
+    """Return angles within -pi..pi [rad]."""
+    return np.asarray(angle - 2 * np.pi * np.rint(angle / (2 * np.pi)))

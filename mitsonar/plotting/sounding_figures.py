@@ -16,7 +16,14 @@ from mitsonar.records.soundings import Soundings
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["dvl_figure", "echogram_figure", "range_figure", "save_figure", "soundings_figure", "waterfall_figure_of"]
+__all__ = [
+    "dvl_figure",
+    "echogram_figure",
+    "range_figure",
+    "save_sounding_figure",
+    "soundings_figure",
+    "waterfall_figure_of",
+]
 
 SPAN_DB = 50.0
 """Span of pictures of levels below full scale [dB]."""
@@ -25,7 +32,7 @@ MOST_POINTS = 200_000
 """Points that are drawn of a cloud, at most."""
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_sounding_figure(figure: Figure, path: Path) -> None:
     """Write a figure as a PNG, whole or absent."""
     part = path.with_name(f".{path.name}.part")
     figure.savefig(part, dpi=110, format="png", metadata={"Software": None})
