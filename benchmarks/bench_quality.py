@@ -30,7 +30,7 @@ import mitsonar
 from mitsonar.instruments.named_sonars import named_sonars, preset
 from mitsonar.instruments.ping_groups import one_beam, scans
 from mitsonar.instruments.quality import FAR_GRAZING_RAD, QUALITIES
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.simulation.variant import ensure_variant
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.training.document_tables import DocumentTable, ScriptedTable, TableRow, contents, load_tables, tables_with
 from mitsonar.training.row_results import Found
 

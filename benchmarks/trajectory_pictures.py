@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
 from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
 from mitsonar.motion.motion_errors import AXES, in_units

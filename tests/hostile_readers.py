@@ -21,7 +21,7 @@ from mutations import Rng, changed_arrays, changed_bytes, changed_json, changed_
 
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
 from mitsonar.mapping.sensor_files import load_sensors, save_sensors
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
@@ -159,7 +159,7 @@ def resume_frames(folder: Path) -> None:
 def make_store(folder: Path) -> None:
     from mitsonar.datasets.plan import Plan
     from mitsonar.datasets.store import PACKAGES, DataStore
-    from mitsonar.io.provenance import versions
+    from mitsonar.io.runs import versions
     from mitsonar.io.storage import Storage
 
     recipe = tiny_recipe(sonar__beams=4, sonar__range_bins=6)

@@ -33,8 +33,7 @@ from mitsonar.acoustics.rough_fluid import Sediment, rough_fluid_sigma
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.io.checked_model import CheckedModel
-from mitsonar.io.plain_data import PlainValue
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import PlainValue, read_yaml
 
 __all__ = [
     "GRAZING_DEG",

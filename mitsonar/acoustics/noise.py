@@ -19,7 +19,7 @@ from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, complaint, meant, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.checked_model import CheckedModel
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import read_yaml
 
 __all__ = [
     "NOISE_MODELS",

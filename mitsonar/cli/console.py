@@ -228,7 +228,7 @@ def changes_of(pairs: list[str], seed: int | None) -> dict[str, object]:
     Raises:
         MitsonarError: a pair has no key or no ``=``, or its value is not YAML.
     """
-    from mitsonar.io.plain_data import parse_yaml
+    from mitsonar.io.files import parse_yaml
 
     changes: dict[str, object] = {}
     for pair in pairs:

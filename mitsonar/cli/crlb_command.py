@@ -112,7 +112,7 @@ def crlb(
             rows.append((value, bounds_of_subject(subject, added, changes, pings, progress)))
     report = report_of(source, subject.sonar, "of the receiver" if speckle else noise, name, rows)
     if plot is not None:
-        from mitsonar.io.whole_files import write_whole
+        from mitsonar.io.files import write_whole
         from mitsonar.plotting.crlb_figure import crlb_png
 
         write_whole(plot, crlb_png(report))

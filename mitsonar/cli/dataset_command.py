@@ -218,8 +218,8 @@ def show(
     import io
 
     from mitsonar.datasets.store import DataStore
-    from mitsonar.io.run_directory import refuse_to_replace
-    from mitsonar.io.whole_files import write_whole
+    from mitsonar.io.files import write_whole
+    from mitsonar.io.runs import refuse_to_replace
     from mitsonar.plotting.data_sheet import sheet_figure
 
     store = DataStore.open(data)

@@ -25,7 +25,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a network as ONNX, whose metadata define inputs and outputs, or as a checkpoint of half the size."""
-    from mitsonar.io.whole_files import write_whole
+    from mitsonar.io.files import write_whole
 
     if batch != "dynamic" and not (batch.isdecimal() and int(batch) > 0):
         raise MitsonarError(f"--batch is a number of samples, or dynamic: got {batch!r}{meant(batch, ['dynamic'])}")
@@ -54,7 +54,7 @@ def _refuse_place(option: str, path: Path, suffix: str, *, overwrite: bool) -> N
     Raises:
         MitsonarError: it does.
     """
-    from mitsonar.io.run_directory import refuse_to_replace
+    from mitsonar.io.runs import refuse_to_replace
 
     if path.suffix.lower() != suffix or not path.parent.is_dir():
         raise MitsonarError(f"{option} must name an {suffix} file in an existing folder: got {path}")

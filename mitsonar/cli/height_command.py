@@ -13,8 +13,8 @@ from mitsonar.cli.console import answered, progress_bar, say, warn
 from mitsonar.cli.odometry_command import Frames
 from mitsonar.cli.render_command import NOISE
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.io.run_directory import refuse_to_replace
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
+from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.estimation.height.direct_height import HeightEstimate

@@ -15,7 +15,7 @@ from mitsonar.cli.flown_path import Frame
 from mitsonar.cli.odometry_command import Frames, Geometry
 from mitsonar.cli.render_command import NOISE
 from mitsonar.errors import MitsonarError, counted, meant
-from mitsonar.io.run_directory import kind_of_run, refuse_to_replace
+from mitsonar.io.runs import kind_of_run, refuse_to_replace
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -14,7 +14,7 @@ import typer
 from mitsonar.cli.console import answered, progress_bar, say, say_json, warn
 from mitsonar.cli.odometry_command import Geometry
 from mitsonar.errors import MitsonarError, counted, nearest_names
-from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.recordings.recording import Part, Recording

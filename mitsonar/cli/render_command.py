@@ -81,7 +81,7 @@ def render(
     from mitsonar.acoustics.sonar_losses import absorption_line
     from mitsonar.cli.vehicle_rendering import VehicleOptions, first_pose, render_vehicle, vehicle_file
     from mitsonar.instruments.imaging_sonar import Sonar
-    from mitsonar.io.provenance import file_digest
+    from mitsonar.io.runs import file_digest
     from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.moving_bodies import MovingBodies
     from mitsonar.simulation.imaging import Simulator

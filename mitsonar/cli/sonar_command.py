@@ -10,8 +10,8 @@ import typer
 
 from mitsonar.cli.console import answered, changes_of, command_line, say, warn
 from mitsonar.cli.odometry_command import Geometry
-from mitsonar.io.run_directory import refuse_to_replace
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
+from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.instruments.imaging_sonar import Sonar

@@ -49,7 +49,7 @@ def sound(
 ) -> None:
     """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
     from mitsonar.instruments.named_sounders import load_sounder
-    from mitsonar.io.provenance import file_digest
+    from mitsonar.io.runs import file_digest
     from mitsonar.mapping.sounding_run import run_sounder
     from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.moving_bodies import MovingBodies

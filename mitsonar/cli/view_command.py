@@ -44,7 +44,7 @@ def view(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file or page.")] = False,
 ) -> None:
     """Show fan, polar image and levels of each frame; scene, wedge of the beams, true and estimated path."""
-    from mitsonar.io.run_directory import refuse_to_replace
+    from mitsonar.io.runs import refuse_to_replace
     from mitsonar.live.rerun_recording import write_recording
     from mitsonar.live.viewer_page import RECORDING, VIEWER, write_page
 
@@ -118,7 +118,7 @@ def _loaded(scene: str, parameters: dict[str, str]) -> tuple[Any, Any, Any]:
 
 def _scene_of(run: Path) -> tuple[str | None, dict[str, str]]:
     """Return the scene that a run was made of, where it says it and it is there, and its parameters."""
-    from mitsonar.io.whole_files import read_json
+    from mitsonar.io.files import read_json
     from mitsonar.simulation.scene import find_scene
 
     folder = run if run.is_dir() else run.parent

@@ -8,7 +8,7 @@ from typing import Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mitsonar.errors import MitsonarError, complaint
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import read_yaml
 
 __all__ = ["BodyMotion", "files_of", "motions_from", "read_motions"]
 

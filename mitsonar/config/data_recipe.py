@@ -22,7 +22,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.mirror_rules import check_channel_mirrors, check_image_mirrors
 from mitsonar.instruments.named_sonars import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
-from mitsonar.io.provenance import digest
+from mitsonar.io.runs import digest
 from mitsonar.worlds.families import create_family
 from mitsonar.worlds.world import BuiltFamily, Family
 

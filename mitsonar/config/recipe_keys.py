@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from pydantic import BaseModel
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import read_yaml
 
 __all__ = ["Keys", "recipe_fields", "set_key"]
 

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from mitsonar.config.body_motion import BodyMotion, motions_from
 from mitsonar.errors import MitsonarError, complaint
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import read_yaml
 
 __all__ = ["CameraKeys", "SensorKeys", "VehicleRecipe", "check_sensor_name", "load_vehicle_recipe"]
 

@@ -16,7 +16,7 @@ from mitsonar.datasets.split import PARTS, deal, world_of
 from mitsonar.datasets.store import PACKAGES, DataStore
 from mitsonar.datasets.workers import made_by
 from mitsonar.errors import MitsonarError
-from mitsonar.io.provenance import refuse_other, versions
+from mitsonar.io.runs import refuse_other, versions
 from mitsonar.io.storage import Storage
 from mitsonar.simulation.variant import ensure_variant
 

@@ -20,8 +20,8 @@ from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.datasets.store_arrays import SEAL, ShardLayout, create_arrays, planned_arrays, write_planned
 from mitsonar.datasets.store_attributes import check_attributes
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.plain_data import check_plain
-from mitsonar.io.provenance import other_versions
+from mitsonar.io.files import check_plain
+from mitsonar.io.runs import other_versions
 from mitsonar.io.storage import Storage, refuse_codecs
 from mitsonar.records.columns import FEW_ROWS, rows_that_fit
 

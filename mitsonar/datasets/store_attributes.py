@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.modality import Fields, Modality
-from mitsonar.io.plain_data import finite_number, whole_number
+from mitsonar.io.files import finite_number, whole_number
 
 __all__ = ["check_attributes"]
 

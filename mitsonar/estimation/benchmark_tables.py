@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mitsonar.errors import counted
 from mitsonar.estimation.estimator import PlainTable
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.motion.motion_errors import AXES
 
 __all__ = ["FEWEST_SCENES", "Cells", "Comparison", "markdown", "table_lines"]

@@ -37,7 +37,7 @@ from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.external.own_estimator import OwnEstimator
 from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
 from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
-from mitsonar.io.provenance import digest, versions
+from mitsonar.io.runs import digest, versions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import cluster_resamples, in_units
 

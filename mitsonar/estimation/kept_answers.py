@@ -14,8 +14,8 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark import Answers
 from mitsonar.estimation.benchmark_tables import table_lines
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
-from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import read_json, read_npz, write_json, write_whole
+from mitsonar.io.files import read_json, read_npz, write_json, write_whole
+from mitsonar.io.runs import RunDirectory, RunKind
 
 __all__ = ["COMPARISON", "AnswerFolder", "kept_answers"]
 

@@ -17,7 +17,7 @@ from mitsonar.exports.export_source import ExportSource
 from mitsonar.exports.labelled_pictures import LabelledPictures, Region
 from mitsonar.exports.run_length import compressed, runs_of
 from mitsonar.exports.shots import Shot, refuse_unlabelled, shots
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 
 __all__ = ["export_coco", "export_yolo"]
 

@@ -13,8 +13,7 @@ from mitsonar.exports.export_folder import digest_of, json_line, png
 from mitsonar.exports.export_source import ExportSource
 from mitsonar.exports.labelled_pictures import LabelledPictures
 from mitsonar.exports.shots import as_json, pose_of, regions_of, shots
-from mitsonar.io.plain_data import PlainValue
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import PlainValue, write_whole
 
 __all__ = ["export_hugging_face"]
 

@@ -16,7 +16,7 @@ from mitsonar.datasets.store import PACKAGES, DataStore
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.exports.export_folder import new_folder
 from mitsonar.exports.recorded_frames import FramesWithPoses, Stretch, as_pixels
-from mitsonar.io.provenance import versions
+from mitsonar.io.runs import versions
 from mitsonar.io.storage import Storage
 from mitsonar.motion.composition import motions
 from mitsonar.motion.trajectory import Trajectory, velocities

@@ -18,7 +18,7 @@ import yaml
 
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import read_yaml
 
 __all__ = ["NamedSonar", "fields_in", "load_sonar", "named_sonars", "preset", "presets_in", "sonar_from"]
 

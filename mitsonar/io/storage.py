@@ -20,7 +20,7 @@ from fsspec.implementations.local import LocalFileSystem
 from zarr.abc.store import Store
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import finite_number, parse_json
+from mitsonar.io.files import finite_number, parse_json
 
 __all__ = ["Storage", "refuse_codecs"]
 

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import PlainValue
+from mitsonar.io.files import PlainValue
 
 __all__ = ["LiveClient", "LiveMessage", "image_of"]
 

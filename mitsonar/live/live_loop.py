@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import PlainValue
+from mitsonar.io.files import PlainValue
 from mitsonar.live.pose_mailbox import Delivered, PoseMailbox
 from mitsonar.live.pose_messages import AskedPose
 from mitsonar.motion.pose import Pose

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, meant, shortened
-from mitsonar.io.plain_data import PlainValue, parse_json
+from mitsonar.io.files import PlainValue, parse_json
 from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
 

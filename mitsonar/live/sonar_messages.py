@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.sparse import csr_array
 
-from mitsonar.io.plain_data import PlainValue
+from mitsonar.io.files import PlainValue
 from mitsonar.live.live_loop import LivePing
 from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8

@@ -11,7 +11,7 @@ import urllib.request
 from pathlib import Path
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 
 __all__ = ["RECORDING", "VIEWER", "write_page"]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark import Answers
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
-from mitsonar.io.run_directory import RunDirectory
+from mitsonar.io.runs import RunDirectory
 from mitsonar.mapping.benchmark_sets import PRESET
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import Odometry

@@ -21,7 +21,7 @@ from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at, laws_of
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
-from mitsonar.io.run_directory import RunDirectory
+from mitsonar.io.runs import RunDirectory
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_frames import open_frames
 from mitsonar.motion.pose import Pose, mounted

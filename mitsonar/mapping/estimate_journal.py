@@ -10,8 +10,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, PlainTable
-from mitsonar.io.plain_data import finite_number, parse_json, whole_number
-from mitsonar.io.whole_files import whole_lines
+from mitsonar.io.files import finite_number, parse_json, whole_lines, whole_number
 from mitsonar.motion.composition import Motion
 
 __all__ = ["add_to_journal", "read_journal"]

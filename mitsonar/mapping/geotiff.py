@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.mapping.mosaic import Mosaic
 
 __all__ = ["save_geotiff"]

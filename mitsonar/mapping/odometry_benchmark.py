@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable
 from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
-from mitsonar.io.plain_data import parse_json
-from mitsonar.io.provenance import digest, versions
-from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import read_json, whole_lines, write_json, write_whole
+from mitsonar.io.files import parse_json, read_json, whole_lines, write_json, write_whole
+from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
 from mitsonar.mapping.benchmark_row import LENGTHS_M, Case, measured_row
 from mitsonar.mapping.benchmark_sets import DIVE, NOISES, PRESET, SEED, SETS, TEXTURES, Begin, RenderedSet
 from mitsonar.mapping.benchmark_table import benchmark_lines

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, PlainTable
-from mitsonar.io.plain_data import finite_number
-from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.io.files import finite_number, write_json, write_whole
+from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.mapping.estimate_journal import add_to_journal, read_journal
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source

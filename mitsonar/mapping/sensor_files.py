@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.csv_table import CsvTable
+from mitsonar.io.files import write_whole
 from mitsonar.mapping.vehicle_sensors import DeadReckoning, Readings, VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.motion.trajectory_files import ALIASES
-from mitsonar.recordings.csv_table import CsvTable
 
 __all__ = ["COLUMNS", "ROOT_HOUR", "load_sensors", "save_sensors"]
 

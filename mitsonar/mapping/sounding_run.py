@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.io.provenance import digest
-from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import read_npz
+from mitsonar.io.files import read_npz
+from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.mapping.dvl_sensors import dvl_sensors
 from mitsonar.mapping.sensor_files import save_sensors
 from mitsonar.motion.trajectory import Trajectory

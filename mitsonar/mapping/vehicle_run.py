@@ -10,8 +10,7 @@ from typing import Any
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
-from mitsonar.io.provenance import digest
-from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.mapping.sounding_run import run_sounder
 from mitsonar.motion.moving_bodies import MovingBodies
 from mitsonar.motion.trajectory import Trajectory, velocities

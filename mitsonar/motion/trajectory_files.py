@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.io.whole_files import at_most, write_whole
+from mitsonar.io.files import at_most, write_whole
 from mitsonar.motion.conventions import Convention
 
 __all__ = ["read_csv", "read_tum", "write_csv", "write_tum"]

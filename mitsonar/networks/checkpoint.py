@@ -23,7 +23,7 @@ from mitsonar.datasets.sample_index import Part, split_for
 from mitsonar.errors import MitsonarError, meant, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import read_bytes, write_whole
+from mitsonar.io.files import read_bytes, write_whole
 from mitsonar.motion.motion_errors import AXES
 from mitsonar.networks.checkpoint_faults import FILE, LARGEST, WORDS, are_numbers, faults_of, first_line, unpacked
 from mitsonar.networks.create import NETWORKS, create_network

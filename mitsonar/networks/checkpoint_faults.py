@@ -16,7 +16,7 @@ from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.plain_data import check_plain
+from mitsonar.io.files import check_plain
 
 __all__ = ["FILE", "LARGEST", "WORDS", "are_numbers", "faults_of", "first_line", "unpacked"]
 

@@ -49,7 +49,7 @@ def save_fan(path: str | Path, frames: SonarFrames, index: int = 0, *, title: st
     """Write :func:`fan_figure` as PNG; whole or not at all."""
     import io
 
-    from mitsonar.io.whole_files import write_whole
+    from mitsonar.io.files import write_whole
 
     buffer = io.BytesIO()
     fan_figure(frames, index, title=title).savefig(buffer, format="png", dpi=110)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map, nearest_cells
-from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.io.files import write_json, write_whole
 from mitsonar.records.sonar_frames import SonarFrames, to_float32, to_uint8
 
 __all__ = ["FanPictures"]

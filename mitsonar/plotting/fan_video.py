@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.geometry.scan_conversion import cartesian_map
-from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.io.runs import refuse_to_replace
 from mitsonar.plotting.decibel_frames import coded_in_decibels
 from mitsonar.records.sonar_frames import SonarFrames
 

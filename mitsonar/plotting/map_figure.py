@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.motion.composition import motions
 from mitsonar.motion.motion_errors import AXES
 from mitsonar.motion.trajectory import Trajectory

@@ -28,8 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.io.csv_table import CsvTable
 from mitsonar.motion.pose import poses_from
-from mitsonar.recordings.csv_table import CsvTable
 from mitsonar.recordings.picture_file import Grey, is_whole, picture_size, read_picture
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
 from mitsonar.records.sonar_frames import SonarFrames

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.recordings.recording import Part, Recording
 from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from mitsonar.errors import MitsonarError, complaint
 from mitsonar.instruments.imaging_sonar import Bearing, Coding
-from mitsonar.io.whole_files import read_yaml
+from mitsonar.io.files import read_yaml
 
 __all__ = ["PictureGeometry", "geometry_beside", "load_geometry"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsonar.errors import MitsonarError, explain_missing
-from mitsonar.io.plain_data import finite_number, parse_json
+from mitsonar.io.files import finite_number, parse_json
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["RECORD", "WRITTEN", "frames_like", "metadata_of"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsonar.errors import MitsonarError, explain_missing
-from mitsonar.io.run_directory import refuse_to_replace
+from mitsonar.io.runs import refuse_to_replace
 from mitsonar.recordings.mcap_metadata import RECORD, WRITTEN, metadata_of
 from mitsonar.recordings.ros_encoding import TOPICS, Encoded, FrameEncoder
 from mitsonar.records.sonar_frames import LABELS, PER_FRAME, SonarFrames, to_uint8

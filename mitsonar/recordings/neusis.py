@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.plain_data import PlainValue, finite_number
-from mitsonar.io.whole_files import FileArray, read_json
+from mitsonar.io.files import FileArray, PlainValue, finite_number, read_json
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.picture_folder import naturally
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import INFLATION
+from mitsonar.io.files import INFLATION
 from mitsonar.recordings.ping_file import Bytes
 
 __all__ = ["DUMP", "HEADER", "LOG", "PING", "Messages", "find_messages", "is_oculus"]

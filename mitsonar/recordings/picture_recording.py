@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import read_bytes
+from mitsonar.io.files import read_bytes
 from mitsonar.recordings.fan_outline import doubts
 from mitsonar.recordings.fan_sampler import FanSampler
 from mitsonar.recordings.geometry_file import (

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import FileArray, read_npz
+from mitsonar.io.files import FileArray, read_npz
 from mitsonar.recordings.geometry_file import PictureGeometry
 from mitsonar.recordings.picture_file import Grey, refuse_size
 from mitsonar.recordings.picture_recording import Pictures, geometry_for, recording_of

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import FileArray, read_bytes
+from mitsonar.io.files import FileArray, read_bytes
 
 __all__ = ["read_pickled_arrays"]
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, counted
+from mitsonar.io.csv_table import CsvTable
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.aris import BEAMS, FRAME, KINDS, facts_of, like_of, notes_of, windows_of
-from mitsonar.recordings.csv_table import CsvTable
 from mitsonar.recordings.header_motion import attitude_of, height_of
 from mitsonar.recordings.picture_file import is_whole, read_picture
 from mitsonar.recordings.ping_file import Header

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.recordings.ping_file import Header, layout
 from mitsonar.records.echogram import Echogram

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import PlainValue, finite_number, parse_json, whole_number
-from mitsonar.io.whole_files import FileArray, read_json, refuse_beyond_memory
+from mitsonar.io.files import FileArray, PlainValue, finite_number, parse_json, read_json, refuse_beyond_memory, whole_number
 
 if TYPE_CHECKING:
     import zarr

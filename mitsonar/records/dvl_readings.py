@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.instruments.sounder import FEWEST_BEAMS
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.records.soundings import Soundings
 

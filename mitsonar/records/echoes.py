@@ -13,7 +13,7 @@ from mitsonar.acoustics.effective_mu import FLATTEST
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.plain_data import PlainValue
+from mitsonar.io.files import PlainValue
 
 __all__ = ["CHANNELS", "Echoes", "load_exr", "save_exr"]
 

@@ -14,8 +14,7 @@ import zarr
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.plain_data import whole_number
-from mitsonar.io.whole_files import FileArray
+from mitsonar.io.files import FileArray, whole_number
 from mitsonar.records.columns import StoredArray, arrays_in, check_column
 from mitsonar.records.sonar_frames import COLUMNS, PER_FRAME, SonarFrames
 

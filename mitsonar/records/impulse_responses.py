@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.io.plain_data import PlainValue
-from mitsonar.io.whole_files import FileArray, read_npz, refuse_beyond_memory, write_whole
+from mitsonar.io.files import FileArray, PlainValue, read_npz, refuse_beyond_memory, write_whole
 from mitsonar.records.columns import Column, StoredArray, check_column, open_group, table_in
 
 __all__ = ["ImpulseResponses"]

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder
-from mitsonar.io.plain_data import parse_json
-from mitsonar.io.whole_files import read_npz, write_whole
+from mitsonar.io.files import parse_json, read_npz, write_whole
 
 __all__ = ["load_pings", "save_pings"]
 

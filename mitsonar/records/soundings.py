@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.records.sounder_files import load_pings, save_pings
 

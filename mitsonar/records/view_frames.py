@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.whole_files import FileArray
+from mitsonar.io.files import FileArray
 
 __all__ = ["ViewFrames"]
 

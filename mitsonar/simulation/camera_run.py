@@ -8,9 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from mitsonar.io.provenance import digest
-from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
+from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.camera import CameraSimulator, told_of
 from mitsonar.simulation.render_run import SIMULATORS

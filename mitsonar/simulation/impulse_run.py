@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.io.provenance import digest
-from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.files import write_whole
+from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.io.storage import refuse_codecs
-from mitsonar.io.whole_files import write_whole
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.response_figure import response_png, waterfall_png
 from mitsonar.records.columns import check_column

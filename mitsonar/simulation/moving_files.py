@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mitsonar.config.body_motion import BodyMotion, files_of, read_motions
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.io.provenance import digest, file_digest
-from mitsonar.io.whole_files import refuse_beyond_memory
+from mitsonar.io.files import refuse_beyond_memory
+from mitsonar.io.runs import digest, file_digest
 from mitsonar.motion.deforming import Deforming, MeshSequence
 from mitsonar.motion.moving_bodies import VEHICLE
 from mitsonar.motion.trajectory import Trajectory

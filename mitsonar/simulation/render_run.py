@@ -17,9 +17,8 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
-from mitsonar.io.provenance import digest
-from mitsonar.io.run_directory import RunDirectory, RunKind
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
+from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.motion.moving_bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import save_fan

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.io.plain_data import finite_number, whole_number
+from mitsonar.io.files import finite_number, whole_number
 from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames, percent
 from mitsonar.simulation.rendered_pings import RenderedPings
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.benchmark_tables import markdown
-from mitsonar.io.run_directory import refuse_to_replace
-from mitsonar.io.whole_files import write_json, write_whole
+from mitsonar.io.files import write_json, write_whole
+from mitsonar.io.runs import refuse_to_replace
 from mitsonar.training.training_types import JsonObject
 
 __all__ = ["refuse_tables", "report_lines", "save_tables"]

@@ -21,10 +21,9 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, argument, complaint
-from mitsonar.io.provenance import plain_json, refuse_other, versions
-from mitsonar.io.run_directory import RunDirectory, RunKind
+from mitsonar.io.files import read_json, write_json, write_whole
+from mitsonar.io.runs import RunDirectory, RunKind, plain_json, refuse_other, versions
 from mitsonar.io.storage import Storage
-from mitsonar.io.whole_files import read_json, write_json, write_whole
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.document_tables import load_tables, rows_named, split_name, table_named, tables_with
 from mitsonar.training.evaluation import evaluate

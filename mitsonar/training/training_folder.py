@@ -18,9 +18,8 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from mitsonar.config.training_recipe import TrainingRecipe
 from mitsonar.errors import MitsonarError
-from mitsonar.io.plain_data import whole_number
-from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import whole_number, write_whole
+from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind
 from mitsonar.motion.motion_errors import Axis
 from mitsonar.training.training_types import JsonObject
 

@@ -22,8 +22,7 @@ from torch.utils import deterministic
 
 from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.io.provenance import other_versions
-from mitsonar.io.run_directory import RunDirectory
+from mitsonar.io.runs import RunDirectory, other_versions
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_data import Material, material_of
 from mitsonar.training.training_folder import EVENTS, RunFolder, StateFile

@@ -8,7 +8,7 @@ import struct
 from pathlib import Path
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import refuse_irregular
+from mitsonar.io.files import refuse_irregular
 
 __all__ = ["check_grid", "check_tensors", "pixels_of"]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import refuse_irregular
+from mitsonar.io.files import refuse_irregular
 
 __all__ = ["CHECKS", "LARGEST_COORDINATE", "check_counts", "check_mesh", "refuse_foreign_format"]
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from mitsonar.errors import MitsonarError, argument, meant
-from mitsonar.io.plain_data import parse_json, whole_number
+from mitsonar.io.files import parse_json, whole_number
 from mitsonar.worlds.mesh_check import check_counts
 from mitsonar.worlds.world import Mesh
 

@@ -8,7 +8,7 @@ from typing import NoReturn
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.whole_files import read_bytes
+from mitsonar.io.files import read_bytes
 
 __all__ = ["attribute_of", "number_of", "numbers_of", "read_xml", "refused"]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.whole_files import refuse_beyond_memory, refuse_irregular
+from mitsonar.io.files import refuse_beyond_memory, refuse_irregular
 from mitsonar.plugins.native_plugins import file_resolver, foreign_names
 from mitsonar.worlds.grid_check import check_grid, check_tensors, pixels_of
 from mitsonar.worlds.mesh_check import CHECKS, LARGEST_COORDINATE, check_counts, check_mesh, refuse_foreign_format

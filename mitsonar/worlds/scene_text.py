@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.whole_files import read_bytes, refuse_irregular
+from mitsonar.io.files import read_bytes, refuse_irregular
 
 __all__ = ["check_text"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.whole_files import write_whole
+from mitsonar.io.files import write_whole
 from mitsonar.worlds.shapes import GRID_M
 from mitsonar.worlds.wave_field import SHORTEST, Sea, wave_heights
 from mitsonar.worlds.wave_spectrum import WaveSpectrum, jonswap, pierson_moskowitz

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, explain_missing
-from mitsonar.io.plain_data import PlainValue
+from mitsonar.io.files import PlainValue
 from mitsonar.worlds.model_pieces import LUMINANCE, UNCOLOURED, UP, Piece
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.scene_parts import Body, Matrix, ReadScene, Shapes, placed, primitive

@@ -29,7 +29,7 @@ from mitsonar.datasets.shards import forget, make_shard
 from mitsonar.datasets.store import PACKAGES, DataStore
 from mitsonar.datasets.workers import Queue
 from mitsonar.errors import MitsonarError
-from mitsonar.io.provenance import versions
+from mitsonar.io.runs import versions
 from mitsonar.io.storage import Storage
 from mitsonar.motion.pose import mounted
 from mitsonar.plotting.data_sheet import info, sheet_figure

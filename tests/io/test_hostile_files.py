@@ -191,7 +191,7 @@ def test_any_value_of_a_channel(key: str, value: Any) -> None:
 @quick
 @given(content=some.text(max_size=60))
 def test_any_text_as_yaml_and_json(content: str) -> None:
-    from mitsonar.io.plain_data import parse_json, parse_yaml
+    from mitsonar.io.files import parse_json, parse_yaml
 
     outcome(lambda: parse_yaml(content, "it"))
     outcome(lambda: parse_json(content, "it"))
@@ -200,7 +200,7 @@ def test_any_text_as_yaml_and_json(content: str) -> None:
 @quick
 @given(content=some.binary(max_size=200))
 def test_any_bytes_as_files(content: bytes, tmp_path: Path) -> None:
-    from mitsonar.io.whole_files import read_json
+    from mitsonar.io.files import read_json
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.worlds.mesh_check import check_mesh
 
@@ -845,21 +845,21 @@ def test_aliases_that_help_are_read(tmp_path: Path) -> None:
     "text", ["[" * 100_000, '{"a":' * 5000, '{"a": ' + "9" * 5000 + "}", '{"a": 1' + "0" * 400 + "}", "[]", "\0"]
 )
 def test_json_made_to_harm(text: str, tmp_path: Path) -> None:
-    from mitsonar.io.whole_files import read_json
+    from mitsonar.io.files import read_json
 
     (tmp_path / "a.json").write_text(text)
     assert "a.json" in refusal(lambda: read_json(tmp_path / "a.json"))
 
 
 def test_a_device_that_never_ends() -> None:
-    from mitsonar.io.whole_files import read_yaml
+    from mitsonar.io.files import read_yaml
 
     assert "larger than" in refusal(lambda: read_yaml("/dev/zero", "recipe"))
 
 
 @pytest.mark.parametrize("value", ["3", 3.0, True, None, [3], 2**63, 10**5000, float("nan"), -1], ids=shortened)
 def test_what_is_no_count_is_refused(value: Any) -> None:
-    from mitsonar.io.plain_data import whole_number
+    from mitsonar.io.files import whole_number
 
     assert refusal(lambda: whole_number(value, "beams")).startswith("beams must be a whole number in 0..2^63: got ")
     assert whole_number(2**63 - 1, "beams") == 2**63 - 1
@@ -870,7 +870,7 @@ NO_NUMBERS: list[Any] = ["3", True, None, [3.0], float("nan"), float("inf"), -fl
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=shortened)
 def test_what_is_no_finite_number_is_refused(value: Any) -> None:
-    from mitsonar.io.plain_data import finite_number
+    from mitsonar.io.files import finite_number
 
     assert refusal(lambda: finite_number(value, "gain")).startswith("gain must be a finite number: got ")
     for number in (0, 2.0):

@@ -16,9 +16,20 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.io.provenance import differences, digest, file_digest, json_digest, other_versions, refuse_other, versions
-from mitsonar.io.run_directory import RUN_FILE, RunDirectory, RunKind, refuse_to_replace
-from mitsonar.io.whole_files import whole_lines
+from mitsonar.io.files import whole_lines
+from mitsonar.io.runs import (
+    RUN_FILE,
+    RunDirectory,
+    RunKind,
+    differences,
+    digest,
+    file_digest,
+    json_digest,
+    other_versions,
+    refuse_other,
+    refuse_to_replace,
+    versions,
+)
 
 KIND = RunKind(
     "experiment",
@@ -102,7 +113,7 @@ def test_what_was_killed_while_it_replaced_a_run_begins_anew_when_resumed(tmp_pa
         from pathlib import Path
         sys.path.insert(0, {str(Path(__file__).parent)!r})
         from test_run_directory import KIND
-        from mitsonar.io.run_directory import RunDirectory
+        from mitsonar.io.runs import RunDirectory
         Path.unlink = lambda *_, **__: os.kill(os.getpid(), 9)
         RunDirectory.begin({str(run.path)!r}, KIND, {{"other": 1}}, overwrite=True).start(done=0)
     """

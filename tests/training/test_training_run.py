@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
-from mitsonar.io.provenance import differences
+from mitsonar.io.runs import differences
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]

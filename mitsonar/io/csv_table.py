@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.io.whole_files import read_bytes
+from mitsonar.io.files import read_bytes
 
 __all__ = ["CsvTable"]
 
