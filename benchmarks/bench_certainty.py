@@ -33,7 +33,7 @@ from mitsonar.mapping.benchmark_sets import RenderedSet
 from mitsonar.mapping.closure import closure_of
 from mitsonar.mapping.open_source import LOOP
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import cluster_resamples, in_units, motion_errors
+from mitsonar.motion.errors import cluster_resamples, in_units, motion_errors
 from mitsonar.records.sonar_frames import SonarFrames
 
 Array = NDArray[np.float64]

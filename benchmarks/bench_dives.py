@@ -25,7 +25,7 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.mapping.benchmark_sets import DIVE_HZ, DIVE_SONARS, FLIGHTS, SETS, TEXTURES, SimulatedSet, dive_course
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import MotionErrors, motion_errors
+from mitsonar.motion.errors import MotionErrors, motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

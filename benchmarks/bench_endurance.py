@@ -35,8 +35,8 @@ from bench_trajectories import GYRO, machine, rendered
 from numpy.typing import NDArray
 from trajectory_jobs import trajectory_job
 
-from mitsonar.mapping.sensor_files import save_sensors
 from mitsonar.mapping.simulated_sensors import simulated_sensors
+from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frame_store import FrameStore
 from mitsonar.records.sonar_frames import SonarFrames

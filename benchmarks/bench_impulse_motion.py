@@ -65,7 +65,7 @@ from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.response_source import ResponseSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.courses import COURSES, course
-from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.errors import in_units
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
 

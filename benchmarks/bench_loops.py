@@ -37,8 +37,8 @@ from mitsonar.mapping.graph_odometry import normalised_errors
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import Odometry, odometry
 from mitsonar.mapping.simulated_sensors import simulated_sensors
-from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.pose import Pose, mounted
+from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 

@@ -19,7 +19,7 @@ from bench_impulse import cpu
 from numpy.typing import NDArray
 
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.deforming import Deforming
+from mitsonar.motion.bodies import Deforming
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator

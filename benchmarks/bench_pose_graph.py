@@ -24,8 +24,8 @@ import numpy as np
 from mitsonar.mapping.graph_odometry import graph_path
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import VehicleSensors
 
 LENGTHS = (1000, 3000, 10_000, 20_000)
 STEP_S = 0.1

@@ -40,7 +40,7 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.view_source import open_views
-from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.errors import in_units
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.training.evaluation import evaluate

@@ -74,10 +74,9 @@ from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import motion_errors
+from mitsonar.motion.errors import assess, motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.motion.trajectory_errors import assess
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8
 
 Array = NDArray[np.float64]

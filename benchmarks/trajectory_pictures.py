@@ -12,7 +12,7 @@ from trajectory_jobs import NOISE_OF, RECIPES, Job, trajectory_job
 from mitsonar.io.files import write_whole
 from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
 from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
-from mitsonar.motion.motion_errors import AXES, in_units
+from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import GAMMA
 from mitsonar.records.sonar_frames import SonarFrames

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mitsonar.motion.conventions import CONVENTIONS, Convention
 from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS, Convention
 
 POSE = Pose.from_degrees([2.2, 1.4, 1.5, 25, 0, 40])
 """Where the sonar of the picture is: 25 deg below the horizon, 40 deg clockwise from north."""

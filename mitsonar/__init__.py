@@ -44,12 +44,11 @@ if TYPE_CHECKING:
     from mitsonar.mapping.motion_series import path_of
     from mitsonar.mapping.odometry import odometry
     from mitsonar.mapping.open_frames import load_frames
-    from mitsonar.mapping.sensor_files import load_sensors, save_sensors
     from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-    from mitsonar.mapping.vehicle_sensors import VehicleSensors
+    from mitsonar.motion.bodies import Deforming
     from mitsonar.motion.composition import Motion
-    from mitsonar.motion.deforming import Deforming
     from mitsonar.motion.pose import Pose
+    from mitsonar.motion.sensors import VehicleSensors, load_sensors, save_sensors
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.plotting.data_sheet import sheet_figure
     from mitsonar.plotting.map_figure import mosaic_figure, path_figure
@@ -143,7 +142,7 @@ _MODULES = {
     "ChannelSonar": "instruments.channel_sonar",
     "Comparison": "estimation.benchmark_tables",
     "DataStore": "datasets.store",
-    "Deforming": "motion.deforming",
+    "Deforming": "motion.bodies",
     "Echogram": "records.echogram",
     "Effort": "training.reproduce",
     "Estimate": "estimation.estimator",
@@ -167,7 +166,7 @@ _MODULES = {
     "SounderSimulator": "simulation.sounding",
     "Soundings": "records.soundings",
     "Trajectory": "motion.trajectory",
-    "VehicleSensors": "mapping.vehicle_sensors",
+    "VehicleSensors": "motion.sensors",
     "VehicleSimulator": "simulation.vehicle",
     "build_mosaic": "mapping.mosaic",
     "compare": "estimation.comparison_run",
@@ -182,7 +181,7 @@ _MODULES = {
     "load_noise": "acoustics.noise",
     "load_recipe": "config.data_recipe",
     "load_scene": "simulation.scene",
-    "load_sensors": "mapping.sensor_files",
+    "load_sensors": "motion.sensors",
     "load_sonar": "instruments.named_sonars",
     "load_sounder": "instruments.named_sounders",
     "load_tables": "training.document_tables",
@@ -196,7 +195,7 @@ _MODULES = {
     "path_of": "mapping.motion_series",
     "range_rates": "records.range_rates",
     "reproduce": "training.reproduce",
-    "save_sensors": "mapping.sensor_files",
+    "save_sensors": "motion.sensors",
     "sheet_figure": "plotting.data_sheet",
     "shipped_trajectory": "simulation.scene",
     "simulated_sensors": "mapping.simulated_sensors",

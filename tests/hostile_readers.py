@@ -23,8 +23,8 @@ from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
-from mitsonar.mapping.sensor_files import load_sensors, save_sensors
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
+from mitsonar.motion.sensors import load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames

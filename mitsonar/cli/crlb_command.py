@@ -84,7 +84,7 @@ def crlb(
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.estimation.crlb.crlb_report import bounds_of_subject, report_lines, report_of
     from mitsonar.estimation.crlb.crlb_subject import subject_of_data
-    from mitsonar.motion.conventions import convention_named
+    from mitsonar.motion.trajectory import convention_named
 
     given, (name, values) = None if noise is None else load_noise(noise), _variable(vary)
     if height is not None and not height > 0:

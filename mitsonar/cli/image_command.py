@@ -29,7 +29,7 @@ def image(
 ) -> None:
     """Bin the stored echoes of a run into new frames, with other bins, another window or other noise."""
     from mitsonar.acoustics.noise import load_noise
-    from mitsonar.motion.conventions import convention_named
+    from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
 
     outputs = Outputs(load_noise(noise), cartesian=cartesian, frame=convention_named(frame).name)

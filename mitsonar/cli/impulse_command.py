@@ -167,10 +167,9 @@ def _path(
     import numpy as np
 
     from mitsonar.motion.composition import steady
-    from mitsonar.motion.conventions import convention_named
     from mitsonar.motion.courses import COURSES, course
     from mitsonar.motion.pose import Pose
-    from mitsonar.motion.trajectory import Trajectory, velocities
+    from mitsonar.motion.trajectory import Trajectory, convention_named, velocities
 
     convention_named(frame)
     if frames is not None and frames < 1:

@@ -145,8 +145,7 @@ def _checked_out(out: Path, true: Path | None, overwrite: bool) -> Path | None:
 def _paths(trajectory: str, true: Path | None, frame: str) -> tuple[dict[str, Trajectory], float | None]:
     """Load the paths by name, first the one of the map, and the height that an odometry was given."""
     from mitsonar.mapping.odometry_run import OdometryFolder
-    from mitsonar.motion.conventions import convention_named
-    from mitsonar.motion.trajectory import Trajectory
+    from mitsonar.motion.trajectory import Trajectory, convention_named
 
     convention_named(frame)
     height = None

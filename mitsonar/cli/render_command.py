@@ -82,8 +82,8 @@ def render(
     from mitsonar.cli.vehicle_rendering import VehicleOptions, first_pose, render_vehicle, vehicle_file
     from mitsonar.instruments.imaging_sonar import Sonar
     from mitsonar.io.runs import file_digest
-    from mitsonar.motion.conventions import convention_named
-    from mitsonar.motion.moving_bodies import MovingBodies
+    from mitsonar.motion.bodies import MovingBodies
+    from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.render_run import Outputs, run
@@ -165,7 +165,7 @@ def check_above_ground(scene: Any, path: Trajectory, moving: bool, simulator: Si
 
 def moving_said(scene: Any, options: list[str], frame: str, also: Sequence[Said] = ()) -> list[Said]:
     """Return what the scene says of its bodies' motion, and in its place what --moving and a vehicle's file say."""
-    from mitsonar.config.body_motion import BodyMotion
+    from mitsonar.motion.bodies import BodyMotion
     from mitsonar.simulation.moving_files import Said, said_by, said_in
 
     given: list[Said] = []

@@ -51,9 +51,9 @@ def sound(
     from mitsonar.instruments.named_sounders import load_sounder
     from mitsonar.io.runs import file_digest
     from mitsonar.mapping.sounding_run import run_sounder
-    from mitsonar.motion.conventions import convention_named
-    from mitsonar.motion.moving_bodies import MovingBodies
+    from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
+    from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.moving_files import digests_of, read_said
     from mitsonar.simulation.scene import find_scene, load_scene
     from mitsonar.simulation.sounding import SounderSimulator

@@ -7,9 +7,9 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mitsonar.config.body_motion import BodyMotion, motions_from
 from mitsonar.errors import MitsonarError, complaint
 from mitsonar.io.files import read_yaml
+from mitsonar.motion.bodies import BodyMotion, motions_from
 
 __all__ = ["CameraKeys", "SensorKeys", "VehicleRecipe", "check_sensor_name", "load_vehicle_recipe"]
 

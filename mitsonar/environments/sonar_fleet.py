@@ -15,8 +15,8 @@ from mitsonar.environments.sonar_task import SonarTask, Table, Transition
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.named_sonars import load_sonar
-from mitsonar.motion.moving_bodies import Moving
-from mitsonar.motion.steering import steered
+from mitsonar.motion.bodies import Moving
+from mitsonar.motion.composition import steered
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import constant_gain, to_image
 from mitsonar.simulation.scene import load_scene, sonar_in

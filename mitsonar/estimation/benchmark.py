@@ -21,7 +21,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
-from mitsonar.motion.motion_errors import MotionErrors, in_units, motion_errors
+from mitsonar.motion.errors import MotionErrors, in_units, motion_errors
 from mitsonar.records.impulse_responses import ImpulseResponses
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
@@ -269,7 +269,7 @@ class BenchmarkRow:
     Attributes:
         method: its name.
         inputs: that it needs.
-        errors: see :class:`mitsonar.motion.motion_errors.MotionErrors`.
+        errors: see :class:`mitsonar.motion.errors.MotionErrors`.
         ms: median processor time of the valid pairs, all threads [ms].
         over_limit: RMSE over the bound ``(3,)``; nan where there is none.
         over_reference: RMSE less that of the reference method ``(3,)`` [mm, mm, deg].
@@ -315,7 +315,7 @@ def rows_of(
         answers: by method.
         inputs: by method.
         truth: motions ``(n, 3)`` [m, m, rad].
-        resamples: of :func:`mitsonar.motion.motion_errors.cluster_resamples`; the same for all, so that
+        resamples: of :func:`mitsonar.motion.errors.cluster_resamples`; the same for all, so that
             differences are paired.
         limit: standard deviations ``(3,)`` [m, m, rad].
         reference: the method that others are compared with; default: the last.

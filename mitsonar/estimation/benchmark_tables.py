@@ -11,7 +11,7 @@ from pathlib import Path
 from mitsonar.errors import counted
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.io.files import write_whole
-from mitsonar.motion.motion_errors import AXES
+from mitsonar.motion.errors import AXES
 
 __all__ = ["FEWEST_SCENES", "Cells", "Comparison", "markdown", "table_lines"]
 

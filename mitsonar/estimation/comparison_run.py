@@ -39,7 +39,7 @@ from mitsonar.estimation.kept_answers import AnswerFolder, kept_answers
 from mitsonar.estimation.named_estimators import EstimatorLike, create_estimator
 from mitsonar.io.runs import digest, versions
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import cluster_resamples, in_units
+from mitsonar.motion.errors import cluster_resamples, in_units
 
 if TYPE_CHECKING:
     from mitsonar.networks.checkpoint import Checkpoint

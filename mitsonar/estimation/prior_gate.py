@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_errors import in_units
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
+from mitsonar.motion.errors import in_units
 
 __all__ = ["prior_rejection"]
 

@@ -16,8 +16,8 @@ from mitsonar.exports.export_source import ExportSource
 from mitsonar.exports.labelled_pictures import LabelledPictures
 from mitsonar.exports.shots import as_json, refuse_unposed, shots
 from mitsonar.io.files import write_whole
-from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.records.sonar_frames import to_float32
 
 __all__ = ["export_kitti", "export_neusis"]

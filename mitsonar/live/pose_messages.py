@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, meant, shortened
 from mitsonar.io.files import PlainValue, parse_json
-from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS
 
 __all__ = ["AskedPose", "asked_pose", "pose_from_ros", "pose_in_ros"]
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.sensor_files import load_sensors
-from mitsonar.mapping.vehicle_sensors import Readings, VehicleSensors
+from mitsonar.motion.sensors import Readings, VehicleSensors, load_sensors
 from mitsonar.recordings.bag_file import BagFile, Message, Topic, is_ros_bag
 
 __all__ = ["open_sensors", "sensors_in_bag"]
@@ -35,7 +34,7 @@ LARGEST = 1e6
 
 
 def open_sensors(path: str | Path) -> VehicleSensors:
-    """Open the sensors of a CSV file (:func:`mitsonar.mapping.sensor_files.load_sensors`) or of a ROS bag.
+    """Open the sensors of a CSV file (:func:`mitsonar.motion.sensors.load_sensors`) or of a ROS bag.
 
     Args:
         path: of either, or a folder that holds ``trajectory.csv``, with columns of sensors.

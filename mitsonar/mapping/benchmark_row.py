@@ -20,10 +20,16 @@ from mitsonar.mapping.odometry import Odometry
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder, run_odometry
 from mitsonar.mapping.open_source import LOOP
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import cluster_resamples, in_units, motion_errors
-from mitsonar.motion.segment_drift import segment_drift
+from mitsonar.motion.errors import (
+    assess,
+    cluster_resamples,
+    distance_driven,
+    in_units,
+    motion_errors,
+    path_length,
+    segment_drift,
+)
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.motion.trajectory_errors import assess, distance_driven, path_length
 
 __all__ = ["LENGTHS_M", "Case", "measured_row"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from mitsonar.estimation.benchmark_tables import Cells, markdown
 from mitsonar.estimation.estimator import PlainTable
 from mitsonar.mapping.benchmark_sets import DIVE
-from mitsonar.motion.motion_errors import AXES
+from mitsonar.motion.errors import AXES
 
 __all__ = ["benchmark_lines"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.vehicle_sensors import Readings, VehicleSensors
+from mitsonar.motion.sensors import Readings, VehicleSensors
 from mitsonar.records.dvl_readings import DvlReadings
 
 __all__ = ["dvl_sensors"]

@@ -14,9 +14,9 @@ from mitsonar.acoustics.local_contrast import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.measured_heights import measured
-from mitsonar.motion.moving_bodies import BodyStates
+from mitsonar.motion.bodies import BodyStates
+from mitsonar.motion.errors import associated
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.motion.trajectory_errors import associated
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels
 from mitsonar.records.sonar_frames import LABELS, SonarFrames, to_float32
 

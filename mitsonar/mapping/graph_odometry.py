@@ -18,8 +18,8 @@ from mitsonar.mapping.loop_closures import KeepLoop, KnownLoops, LoopSearch, can
 from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.pose_graph import CorrelatedErrors, PoseEdges, PoseGraph, relative_motions
 from mitsonar.mapping.trajectory_smoothing import fit_noise
-from mitsonar.mapping.vehicle_sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["GraphPath", "LoopTask", "graph_path", "normalised_errors"]

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from mitsonar.mapping.graph_marginals import marginals_by_nodes
 from mitsonar.mapping.normal_factor import NormalFactor
 from mitsonar.mapping.pose_graph import CorrelatedErrors, PoseEdges, PoseGraph, relative_motions
-from mitsonar.mapping.vehicle_sensors import wrapped
+from mitsonar.motion.sensors import wrapped
 
 __all__ = ["OUTLIER", "GraphSolution", "motion_derivatives", "solved"]
 

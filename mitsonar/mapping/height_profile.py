@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_source import Source
-from mitsonar.mapping.vehicle_sensors import VehicleSensors
+from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["ALTIMETER", "FIRST_ECHOES", "HeightProfile", "height_profile"]

@@ -23,8 +23,7 @@ from mitsonar.mapping.graph_solver import GraphSolution, motion_derivatives
 from mitsonar.mapping.loop_appearance import Canvas, CoarseView, Likeness, likenesses
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.pose_graph import PoseEdges, relative_motions
-from mitsonar.motion.composition import Motion, compose
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, compose
 from mitsonar.motion.pose import Pose
 
 __all__ = ["KeepLoop", "KnownLoops", "LoopSearch", "canvas_of", "search_loops"]

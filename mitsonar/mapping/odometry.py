@@ -33,12 +33,11 @@ from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.mapping.pose_graph import CorrelatedErrors
 from mitsonar.mapping.trajectory_smoothing import kalman_smoothed, spline_smoothed
-from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import AXES, in_units, motion_errors
+from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_length
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.motion.trajectory_errors import assess, path_length
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Odometry", "Row", "Smoothing", "bridged", "odometry", "series_of"]

@@ -23,12 +23,11 @@ from mitsonar.mapping.estimate_journal import add_to_journal, read_journal
 from mitsonar.mapping.odometry import Odometry, Row, Smoothing, odometry
 from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.pose_graph import PoseEdges
-from mitsonar.mapping.vehicle_sensors import VehicleSensors
 from mitsonar.motion.composition import Motion
-from mitsonar.motion.conventions import convention_named
-from mitsonar.motion.motion_errors import AXES, in_units
+from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.pose import Pose
-from mitsonar.motion.trajectory import Trajectory
+from mitsonar.motion.sensors import VehicleSensors
+from mitsonar.motion.trajectory import Trajectory, convention_named
 from mitsonar.plotting.map_figure import path_figure, save_figure
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record, rejected
 from mitsonar.mapping.measured_heights import without_height
 from mitsonar.mapping.open_source import Source
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import MotionPrior
 
 __all__ = ["estimate_motions"]
 

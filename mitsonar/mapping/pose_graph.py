@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.vehicle_sensors import Headings, wrapped
+from mitsonar.motion.sensors import Headings, wrapped
 
 __all__ = ["CorrelatedErrors", "PoseEdges", "PoseGraph", "relative_motions"]
 

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.motion_series import path_of
-from mitsonar.mapping.sensor_files import ROOT_HOUR
-from mitsonar.mapping.vehicle_sensors import DeadReckoning, Readings, VehicleSensors, straight_poses
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import ROOT_HOUR, DeadReckoning, Readings, VehicleSensors, straight_poses
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = ["SensorNoise", "simulated_sensors"]

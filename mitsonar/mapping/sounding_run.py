@@ -16,7 +16,7 @@ from mitsonar.errors import MitsonarError, counted
 from mitsonar.io.files import read_npz
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.mapping.dvl_sensors import dvl_sensors
-from mitsonar.mapping.sensor_files import save_sensors
+from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting import sounding_figures
 from mitsonar.recordings.xtf_writer import write_xtf

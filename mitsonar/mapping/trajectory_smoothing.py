@@ -15,7 +15,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.motion_series import MotionSeries
-from mitsonar.motion.motion_errors import AXES
+from mitsonar.motion.errors import AXES
 
 __all__ = ["fit_noise", "fit_wander", "kalman_smoothed", "spline_period", "spline_smoothed"]
 

@@ -12,7 +12,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.mapping.sounding_run import run_sounder
-from mitsonar.motion.moving_bodies import MovingBodies
+from mitsonar.motion.bodies import MovingBodies
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.imaging import Simulator

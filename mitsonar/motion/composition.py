@@ -12,7 +12,7 @@ from mitsonar.arrays import AnyArray
 from mitsonar.motion.pose import Pose, plain_number
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["Motion", "compose", "inverse", "motions", "steady"]
+__all__ = ["Motion", "MotionPrior", "compose", "inverse", "motions", "steady", "steered"]
 
 
 class Motion(NamedTuple):
@@ -86,3 +86,49 @@ def steady(
     poses[:, 1] += ahead * cos - right * sin
     poses[:, 5] += angle
     return Trajectory(poses, time), np.tile([sideways, forward, 0.0, turn], (frames, 1))
+
+
+# ---------------- Steering: level vehicles that move with a constant velocity in their own axes for a while
+
+
+def steered(poses: ArrayLike, velocity: ArrayLike, step_s: float) -> NDArray[np.float64]:
+    """Return the poses after a step: the inverse of :func:`mitsonar.motion.trajectory.velocities`.
+
+    A constant velocity and turn lead along an arc, whose chord is shorter by the sinc of half the turn. Pitch and roll stay.
+
+    Args:
+        poses: before ``(n, 6)`` [m, rad].
+        velocity: to starboard, forward, up [m/s], and turn to starboard [rad/s] ``(n, 4)``.
+        step_s: duration [s].
+    """
+    poses, velocity = np.asarray(poses, dtype=float), np.asarray(velocity, dtype=float)
+    starboard, forward, up, turn = (velocity * step_s).T
+    middle = poses[:, 5] + turn / 2
+    shorter = np.sinc(turn / (2 * np.pi))
+    sin, cos = np.sin(middle) * shorter, np.cos(middle) * shorter
+    after = poses.copy()
+    after[:, 0] += starboard * cos + forward * sin
+    after[:, 1] += forward * cos - starboard * sin
+    after[:, 2] += up
+    after[:, 5] += turn
+    return after
+
+
+# ---------------- What other sensors, or the last motions, tell of a motion before the frames are looked at
+
+
+class MotionPrior(NamedTuple):
+    """A motion between two frames as it is expected, with its covariance.
+
+    Attributes:
+        motion: sideways, forward [m], yaw [rad] (Almanza-Medina, eq. 3.4).
+        covariance: of the motion ``(3, 3)`` [m, m, rad]; a component that nothing tells has a large variance.
+    """
+
+    motion: Motion
+    covariance: NDArray[np.float64]
+
+    @property
+    def std(self) -> NDArray[np.float64]:
+        """Return the standard deviations of sideways, forward [m] and yaw [rad] ``(3,)``."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=np.float64)

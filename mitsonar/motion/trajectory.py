@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import math
+import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -11,12 +16,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, counted
-from mitsonar.motion.conventions import CONVENTIONS, Convention, convention_named, sideways_or_up
+from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
+from mitsonar.io.files import at_most, write_whole
 from mitsonar.motion.pose import Pose, poses_from, refuse_beyond_reach, vehicle_rotation
-from mitsonar.motion.trajectory_files import read_csv, read_tum, write_csv, write_tum
 
-__all__ = ["Trajectory", "velocities"]
+__all__ = [
+    "CONVENTIONS",
+    "Convention",
+    "Trajectory",
+    "convention_named",
+    "read_csv",
+    "read_tum",
+    "sideways_or_up",
+    "velocities",
+    "write_csv",
+    "write_tum",
+]
 
 
 def velocities(flown: Trajectory) -> NDArray[np.float64]:
@@ -135,7 +150,7 @@ class Trajectory:
 
         Args:
             path: of the file.
-            frame: its convention: ``mitsonar``, ``ros-enu`` or ``ned`` (:mod:`mitsonar.motion.conventions`).
+            frame: its convention: ``mitsonar``, ``ros-enu`` or ``ned`` (:mod:`mitsonar.motion.trajectory`).
             looks_ahead: False where the sonar points down from a level vehicle; decides only on the warning.
 
         Raises:
@@ -222,3 +237,365 @@ def _warn_of_attitude(path: str | Path, read: dict[str, NDArray[np.float64]], fr
         MitsonarWarning,
         stacklevel=3,
     )
+
+
+# ---------------- Files of poses: TUM (``time x y z qx qy qz qw`` a line) and CSV (columns by name), in any
+# convention by name
+
+
+Table = NDArray[np.float64]
+
+OURS = "(starboard, forward, up to world)"
+"""End of the first line of a TUM file in mitsonar's own convention."""
+
+ALIASES = {
+    "time": ("time_s", "time", "timestamp"),
+    **{axis: (f"{axis}_m", axis) for axis in "xyz"},
+    **{f"q{axis}": (f"q{axis}",) for axis in "xyzw"},
+}
+"""Names of columns; the first is written."""
+
+COLUMNS = (
+    "time_s (or time, timestamp), x, y, z (or x_m, y_m, z_m), and either qx, qy, qz, qw or roll, pitch and heading (or yaw) "
+    "with _deg or _rad"
+)
+
+
+def read_tum(path: str | Path, convention: Convention) -> Table:
+    """Read the numbers of a TUM file ``(poses, 8)``: time [s], position [m], quaternion (x, y, z, w).
+
+    Raises:
+        MitsonarError: unreadable file, a broken line, with its number, or a file that names another convention.
+    """
+    rows: list[list[float]] = []
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        if line.lstrip().startswith("#"):
+            _refuse_another(path, line, convention)
+        elif line.strip():
+            rows.append(_tum_row(path, number, line))
+            _refuse_disorder(path, number, rows)
+    if not rows:
+        raise MitsonarError(f"trajectory {path} holds no pose: give lines of `time x y z qx qy qz qw`")
+    return np.array(rows)
+
+
+def write_tum(path: str | Path, table: Table, convention: Convention) -> None:
+    """Write a TUM file.
+
+    Args:
+        path: of the file, which is replaced.
+        table: time, position, quaternion ``(poses, 8)``, in the convention.
+        convention: named in the first line.
+    """
+    axes = OURS if convention.name == "mitsonar" else f"(frame {convention.name}: {convention.axes})"
+    np.savetxt(path, table, fmt="%.9f", header=f"time_s x y z qx qy qz qw {axes}")
+
+
+LARGEST = 2**30
+"""Bytes of a trajectory, at most."""
+
+FARTHEST = 1e12
+"""Largest position [m], time [s] and number of a quaternion in a file."""
+
+
+def read_csv(path: str | Path, convention: Convention) -> tuple[Table, Table, Table | None]:
+    """Read the numbers of a CSV file. Other columns are not read, nor lines that hold a time and other columns only.
+
+    Returns:
+        Times [s] and positions [m] ``(poses, 4)``; then quaternions ``(poses, 4)`` and None, or twice the angles pitch, roll
+        and turn about the vertical ``(poses, 3)`` [rad].
+
+    Raises:
+        MitsonarError: unreadable file, columns that are missing or double, a broken line, with its number.
+    """
+    try:
+        lines = list(csv.reader(io.StringIO(_text(path))))
+    except csv.Error as error:
+        raise MitsonarError(f"cannot read trajectory {path}: it is no table of CSV ({error}); write it again") from None
+    if not lines or not any(word.strip() for word in lines[0]):
+        raise MitsonarError(f"trajectory {path} holds no pose: its first line must name the columns, {COLUMNS}")
+    names = [word.strip().lower() for word in lines[0]]
+    columns = [_column(path, names, key) for key in ("time", "x", "y", "z")]
+    attitude, units = _attitude(path, names, convention)
+    rows: list[list[float]] = []
+    for number, words in enumerate(lines[1:], start=2):
+        if any(word.strip() for word in words) and not _readings_only(words, [*columns, *attitude]):
+            rows.append(_csv_row(path, number, words, [*columns, *attitude]))
+            _refuse_disorder(path, number, rows)
+    if not rows:
+        raise MitsonarError(f"trajectory {path} holds no pose: there is no line below the names of its columns")
+    table = np.array(rows)
+    if units is None:
+        return table[:, :4], table[:, 4:], None
+    angles = table[:, 4:] * units
+    return table[:, :4], angles, angles
+
+
+def write_csv(path: str | Path, table: Table, convention: Convention) -> None:
+    """Write a CSV file: ``time_s,x_m,y_m,z_m,roll_deg,pitch_deg,heading_deg`` (``yaw_deg`` in ros-enu), whole or absent.
+
+    Args:
+        path: of the file, which is replaced.
+        table: time, position [m], pitch, roll, turn about the vertical [rad] ``(poses, 7)``, in the convention.
+        convention: has the name of that turn.
+    """
+    names = ["time_s", "x_m", "y_m", "z_m", "roll_deg", "pitch_deg", f"{convention.turn[0]}_deg"]
+    shown = np.column_stack([table[:, :4], np.degrees(table[:, [5, 4, 6]])])
+    text = io.StringIO()
+    np.savetxt(text, shown, fmt="%.9f", delimiter=",", header=",".join(names), comments="")
+    write_whole(Path(path), text.getvalue().encode())
+
+
+def _text(path: str | Path) -> str:
+    try:
+        content = at_most(path, LARGEST)
+        text = content.decode("utf-8-sig")
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not text"
+        raise MitsonarError(f"cannot read trajectory {path}: {reason}; give a TUM or CSV file") from None
+    if len(content) > LARGEST:
+        raise MitsonarError(f"trajectory {path} is larger than {LARGEST:,} bytes: it is no TUM or CSV file, or cut it")
+    return text
+
+
+def _refuse_another(path: str | Path, line: str, convention: Convention) -> None:
+    """Refuse a file of mitsonar that names another convention."""
+    named = re.search(r"\(frame ([\w-]+):", line)
+    name = named.group(1) if named else "mitsonar" if OURS in line else convention.name
+    if name != convention.name:
+        raise MitsonarError(f"trajectory {path} says that it is {name}, and --frame {convention.name} is asked: give {name}")
+
+
+def _refuse_disorder(path: str | Path, number: int, rows: list[list[float]]) -> None:
+    if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+        raise MitsonarError(
+            f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:g} s after {rows[-2][0]:g} s; sort the "
+            "lines"
+        )
+
+
+def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
+    words = line.split()
+    try:
+        row = [float(word) for word in words] if len(words) == 8 and "_" not in line else []
+    except ValueError:
+        row = []
+    if len(row) != 8 or not (np.abs(row) <= FARTHEST).all() or not np.linalg.norm(row[4:]) >= 1e-6:
+        raise MitsonarError(
+            f"trajectory {path}, line {number}: expected `time x y z qx qy qz qw` as finite numbers with a "
+            f"quaternion other than zero, got {line.strip()[:60]!r}"
+        )
+    return row
+
+
+def _column(path: str | Path, names: list[str], key: str) -> int:
+    """Return the column of a key."""
+    found = [number for number, name in enumerate(names) if name in ALIASES[key]]
+    if len(found) > 1:
+        raise MitsonarError(f"trajectory {path} has {key} in {len(found)} columns: leave all but one out")
+    if not found:
+        raise MitsonarError(
+            f"trajectory {path} has no column {key} ({', '.join(names)[:80]}): its columns must be {COLUMNS}"
+        )
+    return found[0]
+
+
+def _attitude(path: str | Path, names: list[str], convention: Convention) -> tuple[list[int], Table | None]:
+    """Return the columns of the attitude: a quaternion and None, or pitch, roll, turn and the factors to radians."""
+    quaternion = [name for name in names if name in ("qx", "qy", "qz", "qw")]
+    angles = [name for name in names if name.rsplit("_", 1)[0] in ("roll", "pitch", "heading", "yaw")]
+    if quaternion and angles:
+        raise MitsonarError(f"trajectory {path} has the attitude twice, {quaternion[0]} and {angles[0]}: leave one out")
+    if quaternion:
+        return [_column(path, names, f"q{axis}") for axis in "xyzw"], None
+    found = [_angle(path, names, wanted, convention) for wanted in (("pitch",), ("roll",), convention.turn)]
+    return [column for column, _ in found], np.array([unit for _, unit in found])
+
+
+def _angle(path: str | Path, names: list[str], wanted: Sequence[str], convention: Convention) -> tuple[int, float]:
+    """Return the column of an angle, and its factor to radians."""
+    units = {"_deg": math.radians(1), "_rad": 1.0}
+    known = {f"{name}{ending}": unit for name in wanted for ending, unit in units.items()}
+    found = [number for number, name in enumerate(names) if name in known]
+    if len(found) > 1:
+        raise MitsonarError(f"trajectory {path} has {wanted[0]} in {len(found)} columns: leave all but one out")
+    if found:
+        return found[0], known[names[found[0]]]
+    if set(wanted) & set(names):
+        bare = next(name for name in wanted if name in names)
+        raise MitsonarError(f"trajectory {path}: the column {bare} has no unit; name it {bare}_deg or {bare}_rad")
+    if "yaw" in wanted and any(name.startswith("heading") for name in names):
+        raise MitsonarError(
+            f"trajectory {path} has a heading, which turns clockwise from north; {convention.name} has a yaw, which turns "
+            "anticlockwise from east: name the column yaw_deg if it is that, or give the file's --frame"
+        )
+    near = nearest_names(f"{wanted[0]}_deg", known)
+    raise MitsonarError(
+        f"trajectory {path} has no column {wanted[0]} ({', '.join(names)[:80]}): {near}; columns are {COLUMNS}"
+    )
+
+
+def _readings_only(words: list[str], columns: list[int]) -> bool:
+    """Return whether a line has a time and no pose, but something else: readings of sensors at a time of their own."""
+    held = {number for number, word in enumerate(words) if word.strip()}
+    return not held & set(columns[1:]) and columns[0] in held and len(held) > 1
+
+
+def _csv_row(path: str | Path, number: int, words: list[str], columns: list[int]) -> list[float]:
+    try:
+        row = [] if "_" in "".join(words) else [float(words[column]) for column in columns]
+    except (ValueError, IndexError):
+        row = []
+    zero = len(columns) == 8 and bool(row) and not np.linalg.norm(row[4:]) >= 1e-6
+    if not row or not (np.abs(row) <= FARTHEST).all() or zero:
+        raise MitsonarError(
+            f"trajectory {path}, line {number}: expected finite numbers in the columns that its first line names, and no "
+            f"quaternion of zero, got {','.join(words)[:60]!r}"
+        )
+    return row
+
+
+# ---------------- Conventions of poses by name: mitsonar's own, that of ROS (REP 103), and that of navigation at sea
+# | name | world: x, y, z | body: x, y, z | pitch > 0 | roll > 0 | turn about the vertical |
+# |---|---|---|---|---|---|
+# | ``mitsonar`` | east, north, up | starboard, forward, up | looks down | starboard down | heading, clockwise from north |
+# | ``ros-enu`` | east, north, up | forward, left, up | looks down | starboard down | yaw, anticlockwise from east |
+# | ``ned`` | north, east, down | forward, right, down | looks up | starboard down | heading, clockwise from north |
+#
+# East and north are names of the world's first two axes. The user chooses their directions on the earth.
+
+
+@dataclass(frozen=True)
+class Convention:
+    """A convention for the poses of a file.
+
+    Attributes:
+        name: for the user, ``ros-enu``.
+        axes: of world and body, in words.
+        world: its world axes in mitsonar's world, as columns ``(3, 3)``.
+        body: starboard, forward and up in its body axes, as columns ``(3, 3)``.
+        signs: of pitch, roll and the turn about the vertical, relative to mitsonar's.
+        north: its turn about the vertical at heading 0 [rad].
+        turn: names of that turn in a table's column; the first is written.
+    """
+
+    name: str
+    axes: str
+    world: tuple[tuple[int, int, int], ...]
+    body: tuple[tuple[int, int, int], ...]
+    signs: tuple[int, int, int]
+    north: float
+    turn: tuple[str, ...]
+
+    def to_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
+        """Convert positions and attitudes to mitsonar's convention.
+
+        Args:
+            position: in this convention's world ``(n, 3)`` [m].
+            rotation: of its body to its world.
+
+        Returns:
+            Positions ``(n, 3)`` in mitsonar's world [m], and the rotations of (starboard, forward, up) to it.
+        """
+        world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
+        return world.apply(position), world * rotation * body
+
+    def from_ours(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
+        """Convert positions and attitudes from mitsonar's convention, the inverse of :meth:`to_ours`."""
+        world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
+        return world.inv().apply(position), world.inv() * rotation * body.inv()
+
+    def angles_to_ours(self, angles: Table) -> Table:
+        """Convert angles to mitsonar's pitch, roll, heading ``(n, 3)`` [rad].
+
+        Args:
+            angles: pitch, roll and turn about the vertical ``(n, 3)`` [rad]; the rotation takes the turn first,
+                then pitch, then roll.
+        """
+        return np.asarray((angles - (0, 0, self.north)) * self.signs)
+
+    def angles_from_ours(self, angles: Table) -> Table:
+        """Convert angles from mitsonar's convention: the inverse of :meth:`angles_to_ours`."""
+        return np.asarray(angles * self.signs + (0, 0, self.north))
+
+
+CONVENTIONS = {
+    one.name: one
+    for one in (
+        Convention(
+            "mitsonar",
+            "world east, north, up; body starboard, forward, up",
+            ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+            ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+            (1, 1, 1),
+            0.0,
+            ("heading", "yaw"),
+        ),
+        Convention(
+            "ros-enu",
+            "world east, north, up; body forward, left, up",
+            ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+            ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+            (1, 1, -1),
+            math.pi / 2,
+            ("yaw",),
+        ),
+        Convention(
+            "ned",
+            "world north, east, down; body forward, right, down",
+            ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
+            ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
+            (-1, 1, 1),
+            0.0,
+            ("heading", "yaw"),
+        ),
+    )
+}
+"""The conventions that pose files may have, by name."""
+
+
+def convention_named(name: str) -> Convention:
+    """Return the convention of a name.
+
+    Raises:
+        MitsonarError: unknown name.
+    """
+    if name not in CONVENTIONS:
+        raise MitsonarError(f"unknown frame {name!r} of poses: {nearest_names(name, CONVENTIONS)}")
+    return CONVENTIONS[name]
+
+
+LEVEL = math.sin(math.radians(10))
+"""An axis is level where its vertical part is smaller."""
+
+ON_ITS_SIDE = math.sin(math.radians(45))
+"""A sonar lies on its side where the vertical part of its starboard axis is larger."""
+
+ALONG = math.cos(math.radians(60))
+"""A sonar points across its course where the part of its axis along the course, ahead or astern, is smaller."""
+
+
+def sideways_or_up(poses: Table, *, looks_ahead: bool = True) -> NDArray[np.bool_]:
+    """Detect the frames in which a sonar points at the sky or sideways. A file read in a wrong convention has many.
+
+    At the sky: its axis rises by more than 10 deg. Sideways: its starboard axis is 45 deg off the level or more; or its own
+    axis is level to 10 deg while its starboard axis is not, or while it moves across that axis (60..120 deg).
+
+    Args:
+        poses: x, y, z [m], pitch, roll, heading [rad] ``(frames, 6)``.
+        looks_ahead: False for a sonar that points down from a level vehicle, as hydrophones do. It points sideways where the
+            vehicle's own axes are 45 deg off the level, and at the sky where the vehicle is upside down.
+
+    Returns:
+        True for these frames ``(frames,)``.
+    """
+    pitch, roll, heading = poses[:, 3:].T
+    rises, leans, up = -np.sin(pitch), np.abs(np.sin(roll) * np.cos(pitch)), np.cos(roll) * np.cos(pitch)
+    if not looks_ahead:
+        return np.asarray(up < ON_ITS_SIDE)
+    level = np.abs(rises) < LEVEL
+    way = np.gradient(poses[:, :2], axis=0) if len(poses) > 1 else np.zeros((1, 2))
+    length = np.linalg.norm(way, axis=1)
+    ahead = np.abs(way[:, 0] * np.sin(heading) + way[:, 1] * np.cos(heading))
+    across = (length > 1e-6) & (ahead < ALONG * length)
+    return np.asarray((rises > LEVEL) | (leans > ON_ITS_SIDE) | (level & ((leans > LEVEL) | across)))

@@ -24,7 +24,7 @@ from mitsonar.errors import MitsonarError, meant, shortened
 from mitsonar.instruments.channel_sonar import ChannelSonar
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.io.files import read_bytes, write_whole
-from mitsonar.motion.motion_errors import AXES
+from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint_faults import FILE, LARGEST, WORDS, are_numbers, faults_of, first_line, unpacked
 from mitsonar.networks.create import NETWORKS, create_network
 from mitsonar.networks.gaussian_head import GaussianHead

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import write_whole
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import AXES
+from mitsonar.motion.errors import AXES
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import GAMMA
 

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
 from mitsonar.instruments.beam_directions import directions
-from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.mcap_metadata import WRITTEN
 from mitsonar.recordings.ros_messages import PROJECTED, ros2_types
 from mitsonar.records.sonar_frames import SonarFrames, to_float32, to_uint8

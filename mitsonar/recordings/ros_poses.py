@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import poses_from
+from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.bag_file import BagFile, Message, Topic
 from mitsonar.recordings.recording import Part
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.moving_bodies import Moving, MovingBodies
+from mitsonar.motion.bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices, vehicle_rotation
 from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.simulation.moving_scene import SceneMotion, motion_in

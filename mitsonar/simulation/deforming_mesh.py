@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.deforming import VertexLaw
+from mitsonar.motion.bodies import VertexLaw
 
 __all__ = ["DeformingMesh"]
 

@@ -15,7 +15,7 @@ from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
-from mitsonar.motion.moving_bodies import BodyStates
+from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
 from mitsonar.records.sonar_frames import SonarFrames
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from mitsonar.instruments.views import View
-    from mitsonar.motion.moving_bodies import Moving, MovingBodies
+    from mitsonar.motion.bodies import Moving, MovingBodies
     from mitsonar.simulation.expected_former import ExpectedFormer
     from mitsonar.simulation.mirror_parts import Mirroring
     from mitsonar.simulation.tracing import Tracer

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.body_motion import BodyMotion, files_of, read_motions
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.io.files import refuse_beyond_memory
 from mitsonar.io.runs import digest, file_digest
-from mitsonar.motion.deforming import Deforming, MeshSequence
-from mitsonar.motion.moving_bodies import VEHICLE
+from mitsonar.motion.bodies import VEHICLE, BodyMotion, Deforming, MeshSequence, files_of, read_motions
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.worlds.mesh_check import check_mesh

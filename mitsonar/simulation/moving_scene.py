@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.motion.moving_bodies import Moving, MovingBodies
+from mitsonar.motion.bodies import Moving, MovingBodies
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.native_plugins import load_dict
 from mitsonar.simulation.deforming_mesh import DeformingMesh

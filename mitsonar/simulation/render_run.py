@@ -19,7 +19,7 @@ from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
 from mitsonar.io.files import write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest
-from mitsonar.motion.moving_bodies import BodyStates
+from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.plotting.fan_pictures import FanPictures

@@ -20,7 +20,7 @@ from mitsonar.simulation.imaging import Simulator
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from mitsonar.motion.moving_bodies import Moving, MovingBodies
+    from mitsonar.motion.bodies import Moving, MovingBodies
 
 __all__ = ["SoundedPings", "SounderSimulator"]
 

@@ -20,7 +20,7 @@ from mitsonar.instruments.named_sonars import load_sonar, sonar_from
 from mitsonar.instruments.named_sounders import load_sounder
 from mitsonar.instruments.ping_groups import timed_path
 from mitsonar.instruments.sounder import Sounder
-from mitsonar.motion.moving_bodies import Moving, MovingBodies
+from mitsonar.motion.bodies import Moving, MovingBodies
 from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echogram import Echogram

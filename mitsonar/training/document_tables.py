@@ -11,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.motion.motion_errors import AXES, Axis
+from mitsonar.motion.errors import AXES, Axis
 from mitsonar.training.training_types import JsonObject
 
 __all__ = [

@@ -30,7 +30,7 @@ from mitsonar.estimation.learned.trained_network import (
     one_thread,
 )
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.motion.motion_errors import AXES, cluster_resamples
+from mitsonar.motion.errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_types import Array, JsonObject
 
@@ -289,7 +289,7 @@ def _of_axes(row: JsonObject, axes: int) -> JsonObject:
 
 
 def _height_errors(heights: Array, truth: Array, middle: Array, resamples: NDArray[np.int64]) -> JsonObject:
-    """Return the errors of heights ``(n, 1)`` [m], with the fields of :class:`~mitsonar.motion.motion_errors.MotionErrors`.
+    """Return the errors of heights ``(n, 1)`` [m], with the fields of :class:`~mitsonar.motion.errors.MotionErrors`.
 
     Errors are in mm. ``zero`` is the RMSE of always answering the middle of the training heights. Slopes are over the
     differences from this middle.

@@ -20,7 +20,7 @@ from mitsonar.config.training_recipe import TrainingRecipe
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import whole_number, write_whole
 from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind
-from mitsonar.motion.motion_errors import Axis
+from mitsonar.motion.errors import Axis
 from mitsonar.training.training_types import JsonObject
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from mitsonar.motion.motion_errors import Axis
+from mitsonar.motion.errors import Axis
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_data import Material
 from mitsonar.training.training_folder import TRAINED, RunFolder, column

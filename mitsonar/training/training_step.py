@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from mitsonar.config.training_recipe import TrainingRecipe
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.motion_errors import AXES, Axis
+from mitsonar.motion.errors import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import NETWORKS, called, create_network, options_for
 from mitsonar.networks.gaussian_head import GaussianHead

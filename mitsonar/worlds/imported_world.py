@@ -12,7 +12,7 @@ import numpy as np
 
 from mitsonar.acoustics.backscatter import named_materials
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
-from mitsonar.motion.conventions import CONVENTIONS
+from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.worlds.imported_view import view_of_objects
 from mitsonar.worlds.model_pieces import Piece, merged, reflectivity_of
 from mitsonar.worlds.model_search import ModelSearch

@@ -22,10 +22,10 @@ from PIL import Image
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry_run import OdometryFolder
-from mitsonar.mapping.sensor_files import save_sensors
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 

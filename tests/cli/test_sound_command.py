@@ -9,7 +9,7 @@ import pytest
 from helpers import Command, refused
 
 from mitsonar.mapping.open_frames import load_frames
-from mitsonar.mapping.sensor_files import load_sensors
+from mitsonar.motion.sensors import load_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echogram import Echogram
 from mitsonar.records.sonar_frames import SonarFrames

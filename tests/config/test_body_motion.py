@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from mitsonar.config.body_motion import BodyMotion, files_of, read_motions
 from mitsonar.config.vehicle_recipe import load_vehicle_recipe
 from mitsonar.errors import MitsonarError
+from mitsonar.motion.bodies import BodyMotion, files_of, read_motions
 
 
 def test_a_path_or_keys(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from helpers import Command, refused, tiny_recipe
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.motion_errors import cluster_resamples, in_units
+from mitsonar.motion.errors import cluster_resamples, in_units
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [
@@ -42,8 +42,10 @@ from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.estimation.zero import Zero  # noqa: E402
-from mitsonar.motion.composition import Motion  # noqa: E402
-from mitsonar.motion.motion_prior import MotionPrior  # noqa: E402
+from mitsonar.motion.composition import (  # noqa: E402
+    Motion,
+    MotionPrior,
+)
 from mitsonar.records.sonar_frames import SonarFrames  # noqa: E402
 
 

@@ -26,7 +26,7 @@ from mitsonar.exports.recorded_frames import as_pixels, axes_of, frames_with_pos
 from mitsonar.mapping.known_poses import poses_at, stretches
 from mitsonar.mapping.open_frames import load_frames, open_frames
 from mitsonar.motion.composition import motions
-from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.errors import in_units
 from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.recordings.open_recording import open_recording
 from mitsonar.records.sonar_frames import to_uint8

@@ -16,8 +16,7 @@ from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.pair_estimation import estimate_motions
-from mitsonar.motion.composition import Motion, motions
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.records.sonar_frames import SonarFrames
 
 FRAMES, STEPS = 129, 8

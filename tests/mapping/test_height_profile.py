@@ -18,8 +18,7 @@ from mitsonar.mapping.height_profile import ALTIMETER, FIRST_ECHOES, HeightProfi
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

@@ -19,11 +19,10 @@ from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry import Odometry, odometry
 from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.pose_graph import PoseEdges
-from mitsonar.mapping.sensor_files import save_sensors
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.motion.composition import Motion, motions
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames
 

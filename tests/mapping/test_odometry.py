@@ -34,8 +34,7 @@ from mitsonar.mapping.open_frames import load_frames, open_frames
 from mitsonar.mapping.open_source import usual_loop
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.motion.composition import Motion, motions
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

@@ -25,7 +25,7 @@ from mitsonar.mapping.benchmark_table import benchmark_lines
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
 from mitsonar.motion.composition import motions
-from mitsonar.motion.trajectory_errors import path_length
+from mitsonar.motion.errors import path_length
 from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.worlds.ship_hull import ShipHull

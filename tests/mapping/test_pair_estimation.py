@@ -13,8 +13,7 @@ from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 FRAMES = 2 * PAIRS_A_BATCH + 4

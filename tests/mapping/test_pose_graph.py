@@ -18,9 +18,9 @@ from mitsonar.mapping.motion_series import MotionSeries, path_of
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.mapping.pose_graph import PoseEdges, PoseGraph, relative_motions
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.mapping.vehicle_sensors import Headings
 from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import Headings
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.mapping.bag_sensors import open_sensors
-from mitsonar.mapping.sensor_files import ROOT_HOUR, load_sensors, save_sensors
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
-from mitsonar.mapping.vehicle_sensors import Readings, VehicleSensors
 from mitsonar.motion.composition import motions
+from mitsonar.motion.sensors import ROOT_HOUR, Readings, VehicleSensors, load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]

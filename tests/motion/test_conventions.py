@@ -14,9 +14,8 @@ from helpers import Command, axes, refused
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.motion.conventions import CONVENTIONS, convention_named, sideways_or_up
 from mitsonar.motion.pose import Pose, to_world_matrices
-from mitsonar.motion.trajectory import Trajectory
+from mitsonar.motion.trajectory import CONVENTIONS, Trajectory, convention_named, sideways_or_up
 from mitsonar.simulation.scene import shipped_scenes, shipped_trajectory
 
 FRAMES = ("mitsonar", "ros-enu", "ned")

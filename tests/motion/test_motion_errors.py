@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.motion_errors import cluster_resamples, in_units, motion_errors
+from mitsonar.motion.errors import cluster_resamples, in_units, motion_errors
 
 
 def test_errors_of_a_method_that_shrinks_and_leans() -> None:

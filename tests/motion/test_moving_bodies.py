@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.deforming import MeshSequence
-from mitsonar.motion.moving_bodies import MovingBodies
+from mitsonar.motion.bodies import MeshSequence, MovingBodies
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 

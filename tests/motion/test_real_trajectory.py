@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mitsonar.motion.errors import assess
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.motion.trajectory_errors import assess
 
 RUN = Path(__file__).resolve().parents[2].parent / "shared/data/real/aracati2017-slam-run"
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.motion_series import path_of
+from mitsonar.motion.errors import segment_drift
 from mitsonar.motion.pose import Pose, to_world_matrices
-from mitsonar.motion.segment_drift import segment_drift
 from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]

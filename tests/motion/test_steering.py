@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mitsonar.motion.steering import steered
+from mitsonar.motion.composition import steered
 from mitsonar.motion.trajectory import Trajectory, velocities
 
 

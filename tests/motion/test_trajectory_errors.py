@@ -15,17 +15,9 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.motion_series import path_of
+from mitsonar.motion.errors import Alignment, absolute_errors, aligned, assess, associated, path_length, relative_errors
 from mitsonar.motion.pose import Pose, poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.motion.trajectory_errors import (
-    Alignment,
-    absolute_errors,
-    aligned,
-    assess,
-    associated,
-    path_length,
-    relative_errors,
-)
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar import open_recording
 from mitsonar.mapping.open_frames import open_frames
-from mitsonar.motion.conventions import CONVENTIONS
 from mitsonar.motion.pose import vehicle_rotation
+from mitsonar.motion.trajectory import CONVENTIONS
 
 
 def flown() -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,7 +11,7 @@ from helpers import Array, floor, separate, sphere
 from test_moving_scene import SONAR, fixed
 
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.deforming import Deforming
+from mitsonar.motion.bodies import Deforming
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.camera import CameraSimulator, camera_of

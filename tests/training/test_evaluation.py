@@ -20,7 +20,7 @@ from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion, motions
-from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.errors import in_units
 from mitsonar.records.sonar_frames import SonarFrames
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")

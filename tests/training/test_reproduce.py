@@ -20,7 +20,7 @@ from matplotlib.patches import Rectangle
 from mitsonar.config.data_recipe import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.errors import in_units
 from mitsonar.training.document_tables import (
     LOUD,
     NOISES,

@@ -21,8 +21,7 @@ from scipy.ndimage import maximum_filter
 from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["Correlation"]

@@ -28,8 +28,7 @@ from mitsonar.estimation.channel.motion_search import ReceiverBand, Search, rece
 from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.estimator import Estimate, PlainTable, rejected
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 
 __all__ = ["Likelihood"]

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from mitsonar.estimation.estimator import INPUTS, Estimate, rejected, two_frames
 from mitsonar.estimation.external.ground_pair import package
 from mitsonar.geometry.attitude import Attitude, attitude_of
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["CfarGicp"]

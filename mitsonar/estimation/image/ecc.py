@@ -12,8 +12,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_rejection, rejected, two_frames
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Ecc"]

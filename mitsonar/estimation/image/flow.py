@@ -35,8 +35,7 @@ from mitsonar.estimation.image.displacement_map import FlowLevel, WindowGrid, wi
 from mitsonar.estimation.image.displacement_match import STILL, TINY, WindowFlow, in_blocks, match_map, match_vector
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import moved
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["Flow"]

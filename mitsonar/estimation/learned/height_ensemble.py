@@ -11,7 +11,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.learned.image_network import ImageNetwork
 from mitsonar.estimation.learned.view_network import ViewNetwork
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames

@@ -33,8 +33,7 @@ from mitsonar.estimation.learned.trained_network import BEYOND, Trained, Trained
 from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.instruments.named_sonars import sonar_from
-from mitsonar.motion.composition import Motion, inverse
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, inverse
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.warp_grid import Ground, WarpGrid

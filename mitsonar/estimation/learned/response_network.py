@@ -15,9 +15,8 @@ from mitsonar.estimation.channel.pings import pings_of
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.estimation.learned.trained_network import HEIGHT_OFF, Trained, answer_of, one_thread
 from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_errors import AXES
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
+from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.impulse_responses import ImpulseResponses
 

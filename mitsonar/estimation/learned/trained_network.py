@@ -20,7 +20,7 @@ from mitsonar.estimation.estimator import INPUTS
 from mitsonar.geometry.scan_conversion import cartesian_map
 from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_errors import AXES
+from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
 from mitsonar.networks.gaussian_head import GaussianHead

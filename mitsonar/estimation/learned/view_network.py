@@ -14,8 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, Record, rejected
 from mitsonar.estimation.learned.trained_network import Trained, answer_of, one_thread
 from mitsonar.instruments.views import SEGMENTS
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.records.view_frames import ViewFrames
 

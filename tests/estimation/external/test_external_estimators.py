@@ -22,8 +22,7 @@ from mitsonar.estimation.external.ground_pair import ground_pair
 from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.mapping.odometry import odometry
-from mitsonar.motion.composition import Motion, compose
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

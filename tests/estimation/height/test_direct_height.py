@@ -27,8 +27,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.view_source import open_views
-from mitsonar.motion.composition import Motion
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames
 from mitsonar.simulation.imaging import Simulator

@@ -18,8 +18,7 @@ from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.echo_heights import FirstEchoes
 from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.motion.composition import Motion, compose, motions
-from mitsonar.motion.motion_prior import MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

@@ -10,7 +10,7 @@ import pytest
 from mitsonar.config.data_recipe import load_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
-from mitsonar.motion.motion_errors import in_units
+from mitsonar.motion.errors import in_units
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant")]

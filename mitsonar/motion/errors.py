@@ -1,12 +1,13 @@
-"""Errors of an estimated path: absolute and relative errors as `evo` defines them, and drift at the end."""
+"""Errors of motions with names and units, as every table prints them, and their confidence intervals."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
@@ -14,17 +15,201 @@ from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
+    "AXES",
     "Alignment",
+    "Axis",
     "DeltaUnit",
+    "MotionErrors",
     "PathErrors",
+    "SegmentDrift",
     "absolute_errors",
     "aligned",
     "assess",
     "associated",
+    "cluster_resamples",
     "distance_driven",
+    "in_units",
+    "motion_errors",
     "path_length",
     "relative_errors",
+    "segment_drift",
 ]
+
+
+Array = NDArray[np.float64]
+
+
+class Axis(NamedTuple):
+    """One number of a motion: its name, its printed unit, and the factor from m or rad to that unit."""
+
+    name: str
+    unit: str
+    scale: float
+
+
+AXES = (Axis("sideways", "mm", 1e3), Axis("forward", "mm", 1e3), Axis("yaw", "deg", 180 / np.pi))
+"""The numbers of a motion, always in this order."""
+
+LARGE = 0.5
+"""Motions beyond this part of the largest get a separate error: methods that learned the usual size are worse there."""
+
+
+def in_units(motions: ArrayLike) -> Array:
+    """Convert motions ``(..., 3)`` from m, m, rad to mm, mm, deg."""
+    scaled: Array = np.asarray(motions, dtype=float) * np.array([axis.scale for axis in AXES])
+    return scaled
+
+
+@dataclass(frozen=True)
+class MotionErrors:
+    """Errors of estimated motions, each ``(3,)``: sideways [mm], forward [mm], yaw [deg].
+
+    Attributes:
+        pairs: number of motions.
+        failures: number of rejected estimates; they count as zero motion.
+        rmse: root of the mean square.
+        rmse_low: lower end of its 95 % interval (clustered bootstrap), where resamples were given.
+        rmse_high: upper end of that interval.
+        median: of the absolute errors.
+        p95: their 95th percentile.
+        bias: mean error.
+        slope: of the estimates over the true motions, by least squares through the origin. 1 is unbiased; below 1 the
+            estimates are too small.
+        large: RMSE of motions beyond half the largest, axis by axis.
+        zero: RMSE of the answer zero for every motion.
+        skill: 1 - rmse / zero.
+        believed: RMSE of the valid estimates alone.
+        nees: normalised estimation error squared, a third of it (1: consistent); nan without covariances.
+    """
+
+    pairs: int
+    failures: int
+    rmse: Array
+    rmse_low: Array
+    rmse_high: Array
+    median: Array
+    p95: Array
+    bias: Array
+    slope: Array
+    large: Array
+    zero: Array
+    skill: Array
+    believed: Array
+    nees: float
+
+
+def motion_errors(
+    estimated: Array,
+    true: Array,
+    valid: NDArray[np.bool_],
+    covariances: Array | None = None,
+    resamples: NDArray[np.int64] | None = None,
+) -> MotionErrors:
+    """Compute the errors of estimated motions against the true ones. Rejected estimates count as zero motion.
+
+    Args:
+        estimated: sideways, forward [m], yaw [rad] ``(n, 3)``.
+        true: the same of the true motions.
+        valid: False for estimates that the method rejected ``(n,)``.
+        covariances: of the estimates ``(n, 3, 3)``, nan where unknown.
+        resamples: see :func:`cluster_resamples`.
+
+    Raises:
+        MitsonarError: shapes that do not fit, no motions.
+    """
+    if not len(true) or estimated.shape != true.shape or valid.shape != (len(true),):
+        raise MitsonarError(
+            "errors need as many estimates as true motions, one at least: got "
+            f"{estimated.shape}, {true.shape}, {valid.shape}"
+        )
+    answer = in_units(np.where(valid[:, None], estimated, 0.0))
+    truth = in_units(true)
+    error = answer - truth
+    rmse, zero = _rms_by_column(error), _rms_by_column(truth)
+    low, high = (rmse, rmse) if resamples is None else _rms_interval(error, resamples)
+    size = np.abs(truth)
+    large = np.where(size > LARGE * size.max(axis=0), error, np.nan)
+    power = (truth**2).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope, skill = (answer * truth).sum(axis=0) / power, 1 - rmse / zero
+    return MotionErrors(
+        pairs=len(true),
+        failures=int((~valid).sum()),
+        rmse=rmse,
+        rmse_low=low,
+        rmse_high=high,
+        median=np.median(np.abs(error), axis=0),
+        p95=np.percentile(np.abs(error), 95, axis=0),
+        bias=error.mean(axis=0),
+        slope=slope,
+        large=_rms_of_known(large),
+        zero=zero,
+        skill=skill,
+        believed=_rms_by_column(error[valid]) if valid.any() else np.full(3, np.nan),
+        nees=_nees(estimated - true, covariances, valid),
+    )
+
+
+def cluster_resamples(scene: ArrayLike, *, count: int = 1000, seed: int = 0) -> NDArray[np.int64]:
+    """Draw bootstrap samples by scene, then by sequence.
+
+    Each resample draws as many scenes as there are, with replacement, and from each as many of its sequences. Scenes differ
+    in size. So surplus draws are left out, and missing ones are drawn from the same scenes, until each resample has n.
+
+    With few scenes the intervals are too narrow. In a trial whose scenes differed by a factor of 1.8 they held the true RMSE
+    in 73 % of cases with 5 scenes, 79 % with 10 and 88 % with 50.
+
+    Args:
+        scene: of each sequence ``(n,)``.
+        count: number of resamples.
+        seed: of the draws.
+
+    Returns:
+        Indices ``(count, n)`` into arrays of one pair a sequence.
+    """
+    names, group = np.unique(np.asarray(scene), return_inverse=True)
+    total = len(group)
+    order, size = np.argsort(group, kind="stable"), np.bincount(group)
+    start = np.concatenate([[0], np.cumsum(size)[:-1]])
+    rng = np.random.default_rng([seed, 7])
+    table = np.empty((count, total), dtype=np.int64)
+    for row in table:
+        drawn = rng.integers(len(names), size=len(names))
+        of = np.repeat(drawn, size[drawn])
+        of = np.concatenate([of, rng.choice(of, size=max(0, total - len(of)))])[:total]
+        row[:] = order[start[of] + (rng.random(total) * size[of]).astype(np.int64)]
+    return table
+
+
+def _rms_interval(error: Array, resamples: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the 95 % interval of the root of the mean square."""
+    low, high = np.percentile(np.sqrt((error**2)[resamples].mean(axis=1)), [2.5, 97.5], axis=0)
+    return low, high
+
+
+def _rms_by_column(error: Array) -> Array:
+    return np.asarray(np.sqrt((error**2).mean(axis=0)))
+
+
+def _rms_of_known(error: Array) -> Array:
+    """Return the root of the mean square of the values that are not nan; nan where there are none."""
+    count = np.isfinite(error).sum(axis=0)
+    return np.where(count > 0, np.sqrt(np.nansum(error**2, axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def _nees(error: Array, covariances: Array | None, valid: NDArray[np.bool_]) -> float:
+    """Return the mean normalised squared error of the valid estimates that have a covariance, a third of it."""
+    if covariances is None:
+        return float("nan")
+    known = valid & np.isfinite(covariances).all(axis=(1, 2))
+    if not known.any():
+        return float("nan")
+    solved = (np.linalg.pinv(covariances[known], hermitian=True) @ error[known][..., None])[..., 0]
+    return float((error[known] * solved).sum(axis=1).mean() / 3)
+
+
+# ---------------- Errors of an estimated path: absolute and relative errors as `evo` defines them, and drift at the end
+
 
 Alignment = Literal["none", "first", "plane", "space"]
 """Alignment of an estimated path with the true one.
@@ -34,8 +219,6 @@ plane that fit all positions best. ``space``: by the rotation and shift in space
 """
 
 DeltaUnit = Literal["frames", "metres"]
-
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SHORTEST_PATH_M = 1e-3
@@ -320,3 +503,83 @@ def _nearest(among: Array, wanted: Array) -> Index:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+# ---------------- Drift over segments of a path, as the KITTI odometry benchmark defines it (Geiger et al., 2012),
+# with intervals
+# Segments of given lengths begin at every frame (KITTI: at every tenth). The error of a segment is the motion between
+# its ends as estimated, seen from the true one: its distance over the length, and its angle over the length. The drift
+# is the mean over all segments of all lengths. KITTI takes lengths of 100 to 800 m; a sonar's path is shorter.
+
+
+@dataclass(frozen=True)
+class SegmentDrift:
+    """The errors of all segments of a path.
+
+    Attributes:
+        lengths_m: lengths that fit into the path [m].
+        length_m: of each segment ``(n,)`` [m].
+        translation: error of each, as a part of its length ``(n,)``.
+        rotation_rad_per_m: angle between the attitudes over its length ``(n,)`` [rad/m].
+        start_m: distance driven before each begins ``(n,)`` [m].
+    """
+
+    lengths_m: tuple[float, ...]
+    length_m: Array
+    translation: Array
+    rotation_rad_per_m: Array
+    start_m: Array
+
+    @property
+    def percent(self) -> float:
+        """Return the mean translation error in percent of the length."""
+        return 100 * float(self.translation.mean())
+
+    @property
+    def deg_per_100m(self) -> float:
+        """Return the mean rotation error in deg per 100 m."""
+        return 100 * float(np.degrees(self.rotation_rad_per_m.mean()))
+
+    @property
+    def blocks(self) -> NDArray[np.int64]:
+        """Return the block of each segment ``(n,)``: those that begin within one shortest length belong together."""
+        return np.asarray((self.start_m + 1e-9) // min(self.lengths_m), dtype=np.int64)
+
+    def intervals(self, *, seed: int = 0) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return 95 % intervals of percent and of deg per 100 m, by a bootstrap over blocks of the path.
+
+        Segments overlap and are no independent draws; blocks are nearly so. With fewer than ten blocks the intervals are
+        too narrow, see :func:`mitsonar.motion.errors.cluster_resamples`.
+        """
+        drawn = cluster_resamples(self.blocks, seed=seed)
+        tables = 100 * self.translation, 100 * np.degrees(self.rotation_rad_per_m)
+        ends = [np.percentile(table[drawn].mean(axis=1), [2.5, 97.5]) for table in tables]
+        return (float(ends[0][0]), float(ends[0][1])), (float(ends[1][0]), float(ends[1][1]))
+
+
+def segment_drift(estimated: Trajectory, true: Trajectory, lengths_m: Sequence[float]) -> SegmentDrift | None:
+    """Compute the errors of all segments; one begins at every frame.
+
+    Args:
+        estimated: the path to judge.
+        true: the true path, with the same frames.
+        lengths_m: of the segments [m], along the true path. Those that are longer than the path are left out.
+
+    Returns:
+        The errors; None where no length fits into the path.
+
+    Raises:
+        MitsonarError: another number of poses, or a length that is not above 0.
+    """
+    if not lengths_m or min(lengths_m) <= 0:
+        raise MitsonarError(f"lengths of segments must be above 0 m: got {list(lengths_m)}")
+    driven = distance_driven(true)
+    fitting = tuple(length for length in lengths_m if driven[-1] >= length * (1 - 1e-9))
+    if not fitting:
+        return None
+    parts = []
+    for length in fitting:
+        distance, angle = relative_errors(estimated, true, length, "metres", overlapping=True)
+        parts.append([np.full(len(distance), length), distance / length, angle / length, driven[: len(distance)]])
+    length_m, translation, rotation, start = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return SegmentDrift(fitting, length_m, translation, rotation, start)

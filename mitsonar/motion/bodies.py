@@ -2,21 +2,96 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mitsonar.errors import MitsonarError
-from mitsonar.motion.deforming import Deforming, VertexLaw
+from mitsonar.errors import MitsonarError, complaint
+from mitsonar.io.files import read_yaml
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["VEHICLE", "BodyStates", "Moving", "MovingBodies"]
+__all__ = [
+    "VEHICLE",
+    "BodyMotion",
+    "BodyStates",
+    "Deforming",
+    "MeshSequence",
+    "Moving",
+    "MovingBodies",
+    "VertexLaw",
+    "files_of",
+    "motions_from",
+    "read_motions",
+]
+
+
+# ---------------- Bodies whose shape changes while they move: a path, and where the vertices of the mesh are at a time
+
+
+VertexLaw: TypeAlias = Callable[[float], NDArray[Any]]
+"""Vertices ``(vertices, 3)`` [m] in the body's own axes at a time [s], in the order of the shape's mesh."""
+
+
+@dataclass(frozen=True)
+class Deforming:
+    """A body that moves along a path and changes its shape.
+
+    Attributes:
+        path: of the body; a single pose: it stays there.
+        vertices: of its mesh at a time.
+    """
+
+    path: Trajectory
+    vertices: VertexLaw
+
+    def __repr__(self) -> str:
+        law = self.vertices
+        shown = (
+            f"{len(law.vertices)} meshes" if isinstance(law, MeshSequence) else getattr(law, "__name__", type(law).__name__)
+        )
+        return f"Deforming({shown} along {self.path})"
+
+
+@dataclass(frozen=True)
+class MeshSequence:
+    """Vertices of meshes that follow one another; between two they move on straight lines.
+
+    Attributes:
+        vertices: ``(meshes, vertices, 3)`` [m].
+        rate_hz: meshes a second; the first is at time 0.
+        loop: after the last mesh comes the first; else the last one stays.
+    """
+
+    vertices: NDArray[np.float32]
+    rate_hz: float
+    loop: bool = True
+
+    def __post_init__(self) -> None:
+        if self.vertices.ndim != 3 or self.vertices.shape[2] != 3 or not len(self.vertices):
+            raise MitsonarError(f"meshes are vertices (meshes, vertices, 3): got {self.vertices.shape}")
+        if not 0 < self.rate_hz < np.inf:
+            raise MitsonarError(f"the rate of meshes must be positive: got {self.rate_hz:g}; give meshes a second")
+
+    def __call__(self, time_s: float) -> NDArray[np.float32]:
+        """Return the vertices ``(vertices, 3)`` at a time [s]; before time 0 the first mesh holds, or the loop."""
+        count = len(self.vertices)
+        place = time_s * self.rate_hz
+        place = place % count if self.loop else min(max(place, 0.0), count - 1.0)
+        first = int(place)
+        part = np.float32(place - first)
+        after = self.vertices[(first + 1) % count if self.loop else min(first + 1, count - 1)]
+        return np.asarray(self.vertices[first % count] * (1 - part) + after * part, dtype=np.float32)
+
+
+# ---------------- moving bodies
+
 
 Moving: TypeAlias = Mapping[str, Trajectory | str | Path | Deforming | Sequence[Trajectory]]
 """Trajectories, or their TUM or CSV files, by the ids of the shapes that follow them; several: a shape in several places.
@@ -153,3 +228,74 @@ class MovingBodies:
         turn = vehicle_rotation(poses.reshape(-1, 6)).as_matrix().reshape(*poses.shape[:2], 3, 3)
         back = turn.swapaxes(-1, -2)
         return np.concatenate([back, -(back @ poses[..., :3, None])], axis=-1)
+
+
+# ---------------- How a scene's bodies move, as a YAML file says it: a path each, and meshes where the body deforms
+
+
+SEE = " (see docs/guides/moving.md)"
+
+
+class BodyMotion(BaseModel):
+    """Where one shape of the scene moves, and how it deforms."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    path: str | None = Field(
+        None, description="a TUM or CSV file, several as school/*.tum, or vehicle; default: the body stays in its place"
+    )
+    frame: str = Field("mitsonar", description="convention of the file: mitsonar, ros-enu or ned")
+    meshes: str | None = Field(None, description="PLY files of a mesh that deforms: fish/*.ply, in the order of their names")
+    rate_hz: float = Field(10.0, gt=0, le=1e6, description="meshes a second [Hz]; the first is at time 0")
+    loop: bool = Field(True, description="after the last mesh comes the first")
+
+    @classmethod
+    def create(cls, name: str, given: Any) -> Self:
+        """Create the motion of a shape from its keys, or from a path alone.
+
+        Raises:
+            MitsonarError: an unknown key, a value of another type, or neither a path nor meshes.
+        """
+        fields = {"path": given} if isinstance(given, str) else given
+        if not (isinstance(fields, dict) and all(isinstance(key, str) for key in fields)):
+            raise MitsonarError(f"moving: {name} takes a path, or keys such as path and meshes: got {type(given).__name__}")
+        try:
+            made = cls(**fields)
+        except ValidationError as error:
+            raise MitsonarError(f"moving: {name}: {complaint(error, cls, 'motion', SEE)}") from None
+        if made.path is None and made.meshes is None:
+            raise MitsonarError(f"moving: {name} needs a path or meshes{SEE}")
+        return made
+
+
+def read_motions(file: str | Path) -> dict[str, BodyMotion]:
+    """Read a YAML file: ``id: path.tum``, or the keys of :class:`BodyMotion` below the id.
+
+    Raises:
+        MitsonarError: unreadable, or wrong keys.
+    """
+    return motions_from(read_yaml(file, "file of moving bodies"), str(file))
+
+
+def motions_from(table: Any, source: str) -> dict[str, BodyMotion]:
+    """Return the motions in a table by the ids of the shapes; ``source`` is named in errors.
+
+    Raises:
+        MitsonarError: no table of ids, or wrong keys.
+    """
+    if not (isinstance(table, dict) and table and all(isinstance(name, str) for name in table)):
+        raise MitsonarError(f"{source} must hold `shape id: path` lines{SEE}")
+    return {name: BodyMotion.create(name, given) for name, given in table.items()}
+
+
+def files_of(name: str, folder: Path) -> list[Path]:
+    """Return the file of a name, or the files of a pattern such as ``school/*.tum`` in the order of their names.
+
+    Raises:
+        MitsonarError: none matches.
+    """
+    whole = folder / name
+    found = sorted(whole.parent.glob(whole.name)) if "*" in whole.name else [whole]
+    if not found:
+        raise MitsonarError(f"no file matches {whole}: give TUM, CSV or PLY files")
+    return found
