@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsonar import ChannelSimulator, ChannelSonar
-from mitsonar.instruments.channel_sonar import FieldOfView, Hydrophone
+from mitsonar.instruments.hydrophones import FieldOfView, Hydrophone
 from mitsonar.simulation.variant import ensure_variant, use_threads
 from mitsonar.worlds.sea_surface import SeaSurface
 

@@ -28,8 +28,8 @@ from bench_render import machine
 from rocky_seabed import mitsuba_scene, rocky_seabed
 
 from mitsonar import MitsonarWarning, Simulator, Sonar, SonarFrames, Trajectory, load_scene
-from mitsonar.instruments.named_sonars import named_sonars, preset
-from mitsonar.instruments.ping_groups import frame_period_s, scans
+from mitsonar.instruments.sonar import frame_period_s, scans
+from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.plotting.fan_figure import fan_figure
 from mitsonar.simulation.variant import ensure_variant
 

@@ -17,8 +17,8 @@ from bench_impulse import cpu
 
 from mitsonar.environments.sonar_env import SonarEnv
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import ensure_variant

@@ -23,7 +23,7 @@ import numpy as np
 from bench_render import machine
 
 from mitsonar import Simulator, Sonar, load_scene
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sounder import preset
 from mitsonar.simulation.variant import ensure_variant
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ import numpy as np
 from bench_impulse import cpu
 from numpy.typing import NDArray
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.bodies import Deforming
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

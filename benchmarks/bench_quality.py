@@ -27,9 +27,8 @@ from bench_render import machine
 from numpy.typing import NDArray
 
 import mitsonar
-from mitsonar.instruments.named_sonars import named_sonars, preset
-from mitsonar.instruments.ping_groups import one_beam, scans
-from mitsonar.instruments.quality import FAR_GRAZING_RAD, QUALITIES
+from mitsonar.instruments.sonar import FAR_GRAZING_RAD, QUALITIES, one_beam, scans
+from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.io.files import write_whole
 from mitsonar.simulation.variant import ensure_variant
 

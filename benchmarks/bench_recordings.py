@@ -25,7 +25,7 @@ from scipy import ndimage
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.open_frames import open_frames

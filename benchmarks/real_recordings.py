@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import preset
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["FOLDER", "RECORDINGS", "Outline", "as_recorded", "outline_of", "recordings_folder"]

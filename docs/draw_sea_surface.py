@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mitsonar
-from mitsonar.instruments.channel_sonar import FieldOfView, Hydrophone
+from mitsonar.instruments.hydrophones import FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator, impulse_response
 from mitsonar.simulation.variant import ensure_variant

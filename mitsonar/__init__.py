@@ -34,11 +34,9 @@ if TYPE_CHECKING:
     from mitsonar.estimation.estimator import Estimate
     from mitsonar.estimation.named_estimators import create_estimator, load_checkpoint
     from mitsonar.geometry.scan_conversion import to_cartesian
-    from mitsonar.instruments.channel_sonar import ChannelSonar
-    from mitsonar.instruments.imaging_sonar import Sonar
-    from mitsonar.instruments.named_sonars import load_sonar
-    from mitsonar.instruments.named_sounders import load_sounder
-    from mitsonar.instruments.sounder import Sounder
+    from mitsonar.instruments.hydrophones import ChannelSonar
+    from mitsonar.instruments.sonar import Sonar
+    from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder
     from mitsonar.mapping.illumination import illumination
     from mitsonar.mapping.mosaic import build_mosaic
     from mitsonar.mapping.motion_series import path_of
@@ -139,7 +137,7 @@ __all__ = [
 
 _MODULES = {
     "ChannelSimulator": "simulation.channel",
-    "ChannelSonar": "instruments.channel_sonar",
+    "ChannelSonar": "instruments.hydrophones",
     "Comparison": "estimation.benchmark_tables",
     "DataStore": "datasets.store",
     "Deforming": "motion.bodies",
@@ -157,7 +155,7 @@ _MODULES = {
     "SeaSurface": "worlds.sea_surface",
     "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.imaging",
-    "Sonar": "instruments.imaging_sonar",
+    "Sonar": "instruments.sonar",
     "SonarEnv": "environments.sonar_env",
     "SonarFrames": "records.sonar_frames",
     "SonarPairs": "datasets.torch_pairs",
@@ -182,8 +180,8 @@ _MODULES = {
     "load_recipe": "config.data_recipe",
     "load_scene": "simulation.scene",
     "load_sensors": "motion.sensors",
-    "load_sonar": "instruments.named_sonars",
-    "load_sounder": "instruments.named_sounders",
+    "load_sonar": "instruments.sounder",
+    "load_sounder": "instruments.sounder",
     "load_tables": "training.document_tables",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.instruments.channel_sonar import LOOKS, ChannelSonar, FieldOfView, four_receivers
+from mitsonar.instruments.hydrophones import LOOKS, ChannelSonar, FieldOfView, four_receivers
 from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
 from mitsonar.plugins.native_plugins import load_dict
 
@@ -24,7 +24,7 @@ OWN = tuple(name for name in ChannelSonar.model_fields if name not in ("transmit
 class ChannelSensor(mi.Sensor):
     """A transmitter and named receivers between which channel impulse responses are measured.
 
-    Properties: those of :class:`mitsonar.instruments.channel_sonar.ChannelSonar` (``carrier_hz`` [Hz, 80000],
+    Properties: those of :class:`mitsonar.instruments.hydrophones.ChannelSonar` (``carrier_hz`` [Hz, 80000],
     ``bandwidth_hz`` [Hz, 4800], ``sampling_hz`` [Hz, 8000], ``frequency_step_hz`` [Hz, 10], ``rolloff`` [0.5], ``range_max``
     [m, 25], ``sound_speed`` [m/s, 1500], ``frame_rate_hz`` [Hz, 20], ``model`` [scatterers], ``spreading``,
     ``bounces`` [1], ``direct`` [false], ``points_per_m2`` [1700],

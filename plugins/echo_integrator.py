@@ -10,7 +10,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.imaging_sonar_sensor import Fan, ImagingSonar, is_imaging_sonar
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.records.echoes import CHANNELS, Echoes

@@ -11,8 +11,8 @@ import numpy as np
 
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import sonar_from
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import sonar_from
 from mitsonar.motion.pose import Pose, pose_from_to_world, to_world_matrices
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.plugins.native_plugins import load_dict
@@ -57,7 +57,7 @@ class ImagingSonar(mi.Sensor):
     ``bearing: azimuth`` (cos e sin b, cos e cos b, sin e); ``bearing: cone``, what a line array measures,
     (sin b, cos b cos e, cos b sin e).
 
-    Properties: those of :class:`mitsonar.instruments.imaging_sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
+    Properties: those of :class:`mitsonar.instruments.sonar.Sonar` (``azimuth_fov_deg`` [deg, 29],
     ``elevation_fov_deg`` [deg, 14], ``beams`` [96], ``range_min`` [m, 3.2], ``range_max`` [m, 5.6], ``range_bins`` [512],
     ``sound_speed`` [m/s, 1500], ``bearing`` [azimuth], ``beam_layout`` [even], ``beam_width_deg`` [deg, the spacing],
     ``jitter`` [physical: true], ``seed`` [0], ``model`` [physical], ``gain_exponent`` [0], ``bounces`` [1],

@@ -14,7 +14,7 @@ from mitsonar.acoustics.backscatter import Material
 from mitsonar.acoustics.effective_mu import FLATTEST, mu_table, normal_mu, reference_hz
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial, is_acoustic_material
 
 __all__ = ["law_rows", "material_of", "mirror_rows", "weighed"]

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from mitsonar.acoustics.effective_mu import hearing_notes
 from mitsonar.arrays import DeviceArray
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial
 from mitsonar.plugins.bsdf_reflectance import (
     APPROXIMATED,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

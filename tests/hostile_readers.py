@@ -19,8 +19,8 @@ from foreign_scenes import make_sdf, make_urdf
 from helpers import HEARD, TINY, TINY_TRAINING, tiny_network, tiny_recipe, tiny_samples
 from mutations import Rng, changed_arrays, changed_bytes, changed_json, changed_text, changed_value, npz
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
@@ -220,7 +220,7 @@ def make_sonar(folder: Path) -> None:
 def read_sonar(folder: Path) -> None:
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.config.training_recipe import load_training_recipe
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.sounder import load_sonar
 
     load_sonar(folder / "sonar.yaml")
     load_noise(str(folder / "noise.yaml"))

@@ -9,7 +9,7 @@ import numpy as np
 from helpers import axes
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.records.impulse_responses import ImpulseResponses

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 if TYPE_CHECKING:
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["coded", "coding_slope", "decoded"]
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from mitsonar.arrays import AnyArray
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["LevelParts", "largest_level", "level"]
 

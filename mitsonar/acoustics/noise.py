@@ -17,7 +17,7 @@ from scipy.special import ndtr
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, complaint, meant, shortened
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.checked_model import CheckedModel
 from mitsonar.io.files import read_yaml
 

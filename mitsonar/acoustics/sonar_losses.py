@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.sea_water import Water, absorption_db_per_m, absorption_warning
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 
 __all__ = [
     "absorption_line",

@@ -39,7 +39,7 @@ def _check_sphere() -> None:
     """Check that inside a sphere of 10 m every range is 10 m and every cosine 1."""
     import numpy as np
 
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.plugins.native_plugins import load_dict
     from mitsonar.simulation.imaging import Simulator
 
@@ -58,7 +58,7 @@ def _check_floor() -> None:
     import mitsuba as mi
     import numpy as np
 
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.plugins.native_plugins import load_dict
     from mitsonar.simulation.imaging import Simulator
 

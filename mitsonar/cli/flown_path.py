@@ -16,7 +16,7 @@ from mitsonar.errors import MitsonarError, meant
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
@@ -53,7 +53,7 @@ def path_for(
     speed: float | None = None,
 ) -> Trajectory:
     """Return the poses that the options say."""
-    from mitsonar.instruments.ping_groups import first_sweeps, frame_period_s, scans
+    from mitsonar.instruments.sonar import first_sweeps, frame_period_s, scans
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import shipped_trajectory
@@ -136,7 +136,7 @@ def poses_line(path: Trajectory, mounts: Mapping[str, ArrayLike] | None = None) 
 
 def _ends(sonar: Sonar, frames: int) -> int:
     """Return the poses of a vehicle that rests for so many frames; those of a head that turns are the sweeps between."""
-    from mitsonar.instruments.ping_groups import scans
+    from mitsonar.instruments.sonar import scans
 
     return frames + 1 if scans(sonar) and frames > 1 else frames
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mitsonar.instruments.channel_sonar import ChannelSonar
+    from mitsonar.instruments.hydrophones import ChannelSonar
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
 
@@ -109,7 +109,7 @@ def _instrument(
     found: tuple[ChannelSonar, Pose] | None, model: str | None, seed: int | None, changes: list[str]
 ) -> tuple[ChannelSonar, Pose | None]:
     """Return the instrument with its changes, and its pose in the scene; by default the instrument of Almanza-Medina."""
-    from mitsonar.instruments.channel_sonar import ChannelSonar
+    from mitsonar.instruments.hydrophones import ChannelSonar
 
     sonar, attitude = found if found is not None else (ChannelSonar(name="thesis"), None)
     fields: dict[str, Any] = {}

@@ -11,8 +11,8 @@ from mitsonar.cli.console import answered, say
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 
 if TYPE_CHECKING:
-    from mitsonar.instruments.imaging_sonar import Sonar
-    from mitsonar.instruments.named_sonars import NamedSonar
+    from mitsonar.instruments.sonar import Sonar
+    from mitsonar.instruments.sounder import NamedSonar
 
 __all__ = ["presets", "scenes"]
 
@@ -22,7 +22,7 @@ def presets(
     name: Annotated[str | None, typer.Argument(help="One preset: every number with its source.")] = None,
 ) -> None:
     """Print the sonars and instruments that can be named, or one of them with the document behind each number."""
-    from mitsonar.instruments.named_sonars import named_sonars, preset
+    from mitsonar.instruments.sounder import named_sonars, preset
 
     if name is not None:
         return _one(name)
@@ -44,8 +44,7 @@ def _one(name: str) -> None:
     Raises:
         MitsonarError: neither a sonar nor an instrument, with the nearest names.
     """
-    from mitsonar.instruments.named_sonars import named_sonars, preset
-    from mitsonar.instruments.named_sounders import OF_KIND, load_sounder, named_sounders
+    from mitsonar.instruments.sounder import OF_KIND, load_sounder, named_sonars, named_sounders, preset
 
     sonars, sounders = named_sonars(), named_sounders()
     found = OF_KIND.get(name, name)
@@ -63,7 +62,7 @@ def _one(name: str) -> None:
 def _print_keys(name: str, known: NamedSonar, sonar: Sonar, own: dict[str, object] | None = None) -> None:
     """Print every key with its source: those of an instrument first, then those of its sonar."""
     from mitsonar.acoustics.sonar_losses import absorption_line
-    from mitsonar.instruments.imaging_sonar import RAYS
+    from mitsonar.instruments.sonar import RAYS
 
     say(f"{name}: {known.about}")
     for key, value in {**(own or {}), **sonar.model_dump(exclude={"name"})}.items():
@@ -75,7 +74,7 @@ def _print_keys(name: str, known: NamedSonar, sonar: Sonar, own: dict[str, objec
 
 def _instruments() -> list[str]:
     """Return a line for each instrument of `mitsonar sound`."""
-    from mitsonar.instruments.named_sounders import load_sounder, named_sounders
+    from mitsonar.instruments.sounder import load_sounder, named_sounders
 
     lines = [
         "",
@@ -91,7 +90,7 @@ def _instruments() -> list[str]:
 
 def _accuracy(names: list[str]) -> list[str]:
     """Return the measured errors of each quality, preset by preset."""
-    from mitsonar.instruments.quality import measured_errors
+    from mitsonar.instruments.sonar import measured_errors
 
     about, measured = measured_errors()
     lines = [

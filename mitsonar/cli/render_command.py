@@ -13,7 +13,7 @@ from mitsonar.cli.flown_path import FRAMES, SIX, SPEED, Frame, path_for, poses_l
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.imaging import Simulator
@@ -80,7 +80,7 @@ def render(
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.sonar_losses import absorption_line
     from mitsonar.cli.vehicle_rendering import VehicleOptions, first_pose, render_vehicle, vehicle_file
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.io.runs import file_digest
     from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import convention_named
@@ -208,7 +208,7 @@ def instrument_for(
     scene: Any, name: str | None, model: str | None, seed: int | None, changes: dict[str, Any] | None = None
 ) -> tuple[Sonar, Pose | None]:
     """Return the sonar to use and the pose that the scene gives it."""
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.sounder import load_sonar
     from mitsonar.simulation.scene import sonar_in
 
     found = sonar_in(scene)

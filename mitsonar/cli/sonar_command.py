@@ -14,7 +14,7 @@ from mitsonar.io.files import write_whole
 from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["fit", "from_recording", "sonars"]
@@ -107,7 +107,7 @@ class _Told(NamedTuple):
 
 def _told(sonar: str | None, changes: list[str] | None) -> _Told:
     """Return what the user tells: faults of it are reported before frames are read."""
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.sounder import load_sonar
 
     return _Told(None if sonar is None else load_sonar(sonar), dict(changes_of(changes or [], None)))
 

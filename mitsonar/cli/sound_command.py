@@ -48,7 +48,7 @@ def sound(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was broken off.")] = False,
 ) -> None:
     """Simulate an instrument of beams on a vehicle: waterfall, ranges, points or velocities in the folder OUT."""
-    from mitsonar.instruments.named_sounders import load_sounder
+    from mitsonar.instruments.sounder import load_sounder
     from mitsonar.io.runs import file_digest
     from mitsonar.mapping.sounding_run import run_sounder
     from mitsonar.motion.bodies import MovingBodies

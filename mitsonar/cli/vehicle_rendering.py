@@ -57,7 +57,7 @@ def render_vehicle(
     options: VehicleOptions,
 ) -> None:
     """Run all sensors of a vehicle along a path, and say where they lie."""
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder
     from mitsonar.mapping.vehicle_run import run_vehicle
     from mitsonar.motion.pose import Pose

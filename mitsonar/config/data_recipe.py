@@ -17,10 +17,10 @@ from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, mode
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
 from mitsonar.config.recipe_parts import Flight, MirrorKeys, Mount, ReceiverSpec, RecipePart, Recorded, Scenes, Split
 from mitsonar.errors import MitsonarError, complaint, shortened
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.mirror_rules import check_channel_mirrors, check_image_mirrors
-from mitsonar.instruments.named_sonars import sonar_from
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole
 from mitsonar.io.runs import digest
 from mitsonar.worlds.families import create_family

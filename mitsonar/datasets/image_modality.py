@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.noise import NoiseModel, load_noise
 from mitsonar.config.data_recipe import Recipe, array_names
 from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, Values, ground_reach
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
 from mitsonar.records.sonar_frames import LABELS
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mitsonar.acoustics.noise import NoiseModel
     from mitsonar.config.data_recipe import Recipe
     from mitsonar.datasets.plan import Scene
-    from mitsonar.instruments.imaging_sonar import Instrument
+    from mitsonar.instruments.sonar import Instrument
 
 __all__ = [
     "Fields",

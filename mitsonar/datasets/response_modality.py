@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.signal_to_noise import snr_of
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, ground_reach
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 
 __all__ = ["ResponseModality"]
 

@@ -16,7 +16,7 @@ from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
 from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import mounted
 from mitsonar.records.sonar_frames import to_uint8
 from mitsonar.simulation.imaging import Simulator

@@ -20,7 +20,7 @@ from mitsonar.environments.sonar_spaces import (
 )
 from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.bodies import Moving
 
 __all__ = ["SonarEnv"]

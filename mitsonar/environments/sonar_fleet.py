@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.noise import refuse_noise
 from mitsonar.environments.sonar_task import SonarTask, Table, Transition
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.bodies import Moving
 from mitsonar.motion.composition import steered
 from mitsonar.simulation.imaging import Simulator

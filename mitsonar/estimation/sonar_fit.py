@@ -17,7 +17,7 @@ from mitsonar.acoustics.coding import decoded
 from mitsonar.acoustics.sonar_losses import gain_of, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.water_fit import glow_by_beam, near_glow, volume
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 __all__ = ["SonarFit", "fit_sonar"]

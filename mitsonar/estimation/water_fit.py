@@ -11,7 +11,7 @@ from scipy import optimize, special
 
 from mitsonar.acoustics import image_statistics as statistics
 from mitsonar.acoustics.sonar_losses import loss_of
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["glow_by_beam", "moved_correlation", "near_glow", "volume"]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from, shipped_recipes
 from mitsonar.config.recipe_keys import Keys, set_key
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar, named_sonars
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar, named_sonars
 from mitsonar.simulation.scene import covered_squares_in, find_scene, load_scene, shape_boxes_in, shape_names_in, sonar_in
 
 __all__ = ["DetectorViews", "detector_recipe"]

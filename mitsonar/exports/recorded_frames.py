@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.runs import shown
 from mitsonar.mapping.any_recording import recording_at
 from mitsonar.mapping.known_poses import poses_at, stretches

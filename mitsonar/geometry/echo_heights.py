@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.aperture import half_power, shaded_sinc
-from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.beams import half_power, shaded_sinc
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from array_api_compat import array_namespace, is_array_api_obj
 from numpy.typing import NDArray
 
 from mitsonar.arrays import AnyArray
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
 __all__ = ["GroundGeometry", "arc_elevation", "moved", "nearest_known"]

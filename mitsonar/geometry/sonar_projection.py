@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.geometry.ground_plane import arc_elevation
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import vehicle_rotation
 
 __all__ = ["Projection", "Views", "points_at", "polar_of", "projection_of"]

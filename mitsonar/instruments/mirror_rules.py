@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View, Whole
 
 __all__ = ["check_channel_mirrors", "check_image_mirrors"]

@@ -11,14 +11,14 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Bearing, Sonar
 from mitsonar.motion.pose import Pose
 
-__all__ = ["CONES", "SEGMENTS", "Receiver", "Segment", "View", "Whole"]
+__all__ = ["CONES", "SEGMENTS", "Receiver", "Segment", "View", "Whole", "directions"]
+
 
 SEGMENTS = {
     "whole": (None, None),
@@ -180,3 +180,20 @@ class Receiver:
             )
         if math.dist(self.offset[:3], (0, 0, 0)) / 2 >= max(sonar.range_min, sonar.bin_m) and sonar.model == "physical":
             raise MitsonarError(f"receiver {name}: range_min must exceed half its distance from the transmitter")
+
+
+# ---------------- Directions of beams in the sonar's frame
+
+
+def directions(bearing: Bearing, bearing_rad: ArrayLike, elevation_rad: ArrayLike) -> NDArray[np.float64]:
+    """Compute unit vectors ``(..., 3)`` as (starboard, forward, up) of the sonar's frame, for both kinds of bearing.
+
+    Args:
+        bearing: ``azimuth``, or ``cone``, the angle that a line array measures.
+        bearing_rad: of the directions [rad].
+        elevation_rad: of the directions [rad]; the two are broadcast.
+    """
+    b, e = np.broadcast_arrays(np.asarray(bearing_rad, dtype=float), np.asarray(elevation_rad, dtype=float))
+    if bearing == "azimuth":
+        return np.stack([np.cos(e) * np.sin(b), np.cos(e) * np.cos(b), np.sin(e)], axis=-1)
+    return np.stack([np.sin(b), np.cos(b) * np.cos(e), np.cos(b) * np.sin(e)], axis=-1)

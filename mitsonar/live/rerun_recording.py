@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.sonar_messages import FanEncoder
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.motion.pose import vehicle_rotation

@@ -19,8 +19,8 @@ from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at, laws_of
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.io.runs import RunDirectory
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_frames import open_frames

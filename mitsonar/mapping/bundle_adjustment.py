@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from mitsonar.geometry.sonar_projection import Views, projection_of
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
 
 __all__ = ["PLANAR", "Adjusted", "Observations", "adjusted", "cauchy", "track_weight"]
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import SonarFrames
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.estimation.image.patches import COLUMNS, ROWS, Patches, PatchImage, align, corners, cut
 from mitsonar.geometry.sonar_projection import Views, points_at, polar_of, projection_of
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
 from mitsonar.mapping.bundle_adjustment import Observations
 
 __all__ = ["Found", "ImageAxes", "Landmarks"]

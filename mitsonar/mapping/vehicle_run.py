@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.mapping.sounding_run import run_sounder

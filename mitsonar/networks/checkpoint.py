@@ -21,8 +21,8 @@ from mitsonar.datasets.batches import Batches
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.sample_index import Part, split_for
 from mitsonar.errors import MitsonarError, meant, shortened
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import read_bytes, write_whole
 from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint_faults import FILE, LARGEST, WORDS, are_numbers, faults_of, first_line, unpacked

@@ -14,8 +14,8 @@ from torch import Tensor
 from mitsonar.datasets.arrangement import LABELS, Coordinates, Layout
 from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import check_plain
 
 __all__ = ["FILE", "LARGEST", "WORDS", "are_numbers", "faults_of", "first_line", "unpacked"]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from mitsonar.datasets.ground_nodes import ground_at
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.named_sonars import sonar_from
+from mitsonar.instruments.sounder import sonar_from
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import NETWORKS
 from mitsonar.networks.gaussian_head import GaussianHead

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.beam_table import TABLES, aris_bearings
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
 from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, mapped

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.aris import BEAMS, KINDS, LEAST_SPEED, MOST_SAMPLES, MOST_SPEED
 from mitsonar.recordings.beam_table import TABLES, aris_bearings
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.csv_table import CsvTable
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.picture_file import Grey, is_whole, picture_size, read_picture

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import preset
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
 from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, mapped
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mitsonar.errors import MitsonarError, complaint
-from mitsonar.instruments.imaging_sonar import Bearing, Coding
+from mitsonar.instruments.sonar import Bearing, Coding
 from mitsonar.io.files import read_yaml
 
 __all__ = ["PictureGeometry", "geometry_beside", "load_geometry"]

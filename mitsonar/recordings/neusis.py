@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import FileArray, PlainValue, finite_number, read_json
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.picture_folder import naturally

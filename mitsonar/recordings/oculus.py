@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import preset
 from mitsonar.recordings.oculus_images import OculusImages
 from mitsonar.recordings.oculus_messages import HEADER, Messages, find_messages
 from mitsonar.recordings.ping_file import Header, layout, mapped

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import read_bytes
 from mitsonar.recordings.fan_outline import doubts
 from mitsonar.recordings.fan_sampler import FanSampler

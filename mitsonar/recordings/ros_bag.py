@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted, nearest_names
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.bag_file import BagFile, Topic
 from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of

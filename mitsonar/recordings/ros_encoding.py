@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
-from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.mcap_metadata import WRITTEN

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.effective_mu import FLATTEST
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import PlainValue
 
 __all__ = ["CHANNELS", "Echoes", "load_exr", "save_exr"]

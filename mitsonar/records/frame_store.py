@@ -13,7 +13,7 @@ import numpy as np
 import zarr
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import FileArray, whole_number
 from mitsonar.records.columns import StoredArray, arrays_in, check_column
 from mitsonar.records.sonar_frames import COLUMNS, PER_FRAME, SonarFrames

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.io.files import FileArray, PlainValue, read_npz, refuse_beyond_memory, write_whole
 from mitsonar.records.columns import Column, StoredArray, check_column, open_group, table_in
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.beam_directions import directions
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.records.sonar_frames import SonarFrames
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.coding import decoded
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import read_npz, refuse_beyond_memory
 from mitsonar.records.columns import Column, check_column, number_of, open_group, table_in, text_of
 

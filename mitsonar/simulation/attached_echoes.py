@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from mitsonar.acoustics.echo_level import level
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.tracing import Rays, Tracer
 

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from mitsonar.instruments.aperture import Aperture
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.pulse import Pulse
-from mitsonar.instruments.quality import rays_over_elevation
+from mitsonar.instruments.beams import Aperture, Pulse
+from mitsonar.instruments.sonar import Sonar, rays_over_elevation
 
 __all__ = ["BeamFormer", "CommonFan", "elevation_end", "side_lobes"]
 

@@ -7,7 +7,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.device_arrays import DeviceArray
 
 __all__ = ["angles_of", "beam_at", "beam_of"]

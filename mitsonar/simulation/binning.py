@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.echo_level import level
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.device_arrays import DeviceArray

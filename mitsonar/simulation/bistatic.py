@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mitsonar.instruments.imaging_sonar import RAYS, Sonar
+from mitsonar.instruments.sonar import RAYS, Sonar
 from mitsonar.instruments.views import Receiver
 from mitsonar.motion.pose import mounted, to_world_matrices
 from mitsonar.records.echoes import Echoes

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Whole
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.plugins.material_laws import material_of

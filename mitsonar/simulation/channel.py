@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, nearest_names
-from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
+from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.instruments.mirror_rules import check_channel_mirrors
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.plugins.surfaces import Surfaces, registry_index
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables, padded
 from mitsonar.simulation.image_sources import MirrorWay, mirror_ways, mirrored_table

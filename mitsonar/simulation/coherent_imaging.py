@@ -15,9 +15,8 @@ from scipy.sparse import csr_array
 from mitsonar.acoustics.noise import uniform
 from mitsonar.acoustics.sonar_losses import gain_of, loss_notes, loss_of
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.aperture import series, shaded_sinc
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.quality import Quality
+from mitsonar.instruments.beams import series, shaded_sinc
+from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import CONES, Segment, View, Whole
 from mitsonar.simulation.beam_former import BeamFormer
 from mitsonar.simulation.binning import Counts

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.speckle import BLENDED, patch_amplitudes
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.plugins.surfaces import Hit
 from mitsonar.simulation.beam_former import BeamFormer, CommonFan

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from mitsonar.acoustics.sonar_losses import loss_of, sonar_absorption, undone_absorption
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import RAYS, Sonar
-from mitsonar.instruments.pulse import Pulse
+from mitsonar.instruments.beams import Pulse
+from mitsonar.instruments.sonar import RAYS, Sonar
 from mitsonar.instruments.views import View, Whole
 from mitsonar.simulation.beam_former import PULSE_LENGTHS, elevation_end, side_lobes
 

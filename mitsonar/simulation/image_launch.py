@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.records.echoes import Echoes

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.acoustics.sonar_losses import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
+from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
 from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.io.files import write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.io.storage import refuse_codecs

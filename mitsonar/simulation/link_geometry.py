@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar, FieldOfView, Maths
+from mitsonar.instruments.hydrophones import PADDING, ChannelSonar, FieldOfView, Maths
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.tracing import hidden

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import PADDING, ChannelSonar
+from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.simulation.channel_tracing import ChannelTracer, EchoValues
 from mitsonar.simulation.device_arrays import DeviceArray, padded
 from mitsonar.simulation.facet_integral import facet_echoes, half_fresnel_m

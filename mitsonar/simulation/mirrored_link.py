@@ -8,7 +8,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.simulation.device_arrays import DeviceArray
 from mitsonar.simulation.image_sources import ROW
 from mitsonar.simulation.link_geometry import LINK, Leg, LinkGeometry, ScatteringPoints

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.imaging_sonar_sensor import Fan
 from mitsonar.plugins.surfaces import Hit, Surfaces
 from mitsonar.simulation.device_arrays import DeviceArray

@@ -8,7 +8,7 @@ import finufft
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.simulation.variant import current_variant
 
 __all__ = ["TOLERANCE", "phasor_sums", "phasors"]

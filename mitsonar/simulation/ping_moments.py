@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
 from mitsonar.instruments.mirror_rules import check_image_mirrors
-from mitsonar.instruments.ping_groups import group_of_beams, one_beam, scans, turned_heads
+from mitsonar.instruments.sonar import Sonar, group_of_beams, one_beam, scans, turned_heads
 from mitsonar.instruments.views import View, Whole
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.simulation.binning import Counts

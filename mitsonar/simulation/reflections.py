@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.hashed_texture import ROUNDS
 from mitsonar.simulation.device_arrays import DeviceArray
 

@@ -15,8 +15,7 @@ from PIL import Image
 
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.ping_groups import TimedPath, overlap_notes, timed_path
+from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
 from mitsonar.io.files import write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.motion.bodies import BodyStates

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.coding import coded
 
 if TYPE_CHECKING:
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.simulation.binning import Counts
 
 __all__ = ["CutRays", "RenderedPings", "constant_gain", "to_image"]

@@ -24,7 +24,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.plugins.bsdf_reflectance import is_black, reflectances_of, reflectivity_at
 from mitsonar.plugins.cell_noise import CellNoise
 from mitsonar.plugins.hashed_texture import ROUNDS

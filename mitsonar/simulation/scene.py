@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.plugins.native_plugins import file_resolver, own_code_only, search_in
 from mitsonar.simulation.moving_files import refuse_unread_motions

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import finite_number, whole_number
 from mitsonar.simulation.empty_frames import NEARLY_EMPTY, empty_frames, percent
 from mitsonar.simulation.rendered_pings import RenderedPings

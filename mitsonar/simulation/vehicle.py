@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
-from mitsonar.config.vehicle_recipe import SensorKeys, check_sensor_name, load_vehicle_recipe
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar, sonar_from
-from mitsonar.instruments.named_sounders import load_sounder
-from mitsonar.instruments.ping_groups import timed_path
-from mitsonar.instruments.sounder import Sounder
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar, timed_path
+from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder, sonar_from
+from mitsonar.instruments.vehicle import SensorKeys, check_sensor_name, load_vehicle_recipe
 from mitsonar.motion.bodies import Moving, MovingBodies
 from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world
 from mitsonar.motion.trajectory import Trajectory

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 from numpy.typing import ArrayLike
 
 from mitsonar.acoustics.echo_level import largest_level
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.records.echoes import Echoes
 from mitsonar.simulation.device_arrays import DeviceArray, LaunchTables

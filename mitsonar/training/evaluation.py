@@ -29,7 +29,7 @@ from mitsonar.estimation.learned.trained_network import (
     inputs_of,
     one_thread,
 )
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.errors import AXES, cluster_resamples
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.training.training_types import Array, JsonObject

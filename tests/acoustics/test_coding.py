@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.acoustics.coding import coded, decoded
-from mitsonar.instruments.imaging_sonar import Coding, Sonar
+from mitsonar.instruments.sonar import Coding, Sonar
 
 
 @pytest.mark.parametrize("coding", ["linear", "dB", "gamma"])

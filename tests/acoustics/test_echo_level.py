@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mitsonar.acoustics.echo_level import largest_level, level
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.echoes import CHANNELS, Echoes
 
 

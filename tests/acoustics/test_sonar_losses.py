@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from mitsonar.acoustics.sonar_losses import absorption_line, loss_notes, sonar_absorption
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import preset
 
 LOW = Sonar.create(model="coherent", frequency_hz=4e5, beam_width_deg=1.0, pulse_m=0.02)
 

@@ -19,7 +19,7 @@ from helpers import Command, diffuse, files_of, floor, refused, scene
 from numpy.typing import NDArray
 from PIL import Image
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.mapping.odometry_run import OdometryFolder
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors

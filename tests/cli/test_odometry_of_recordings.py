@@ -10,7 +10,7 @@ import pytest
 from drawn_frames import over_ground, sway
 from helpers import Command, refused
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import motions
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.aris_writer import write_aris

@@ -17,7 +17,7 @@ from PIL import Image
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames, to_uint8

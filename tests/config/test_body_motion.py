@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from mitsonar.config.vehicle_recipe import load_vehicle_recipe
 from mitsonar.errors import MitsonarError
+from mitsonar.instruments.vehicle import load_vehicle_recipe
 from mitsonar.motion.bodies import BodyMotion, files_of, read_motions
 
 

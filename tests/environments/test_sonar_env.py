@@ -15,7 +15,7 @@ from mitsonar.environments.sonar_env import SonarEnv
 from mitsonar.environments.sonar_task import SonarTask, TaskFields
 from mitsonar.environments.sonar_vector_env import SonarVectorEnv
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
 

@@ -10,8 +10,8 @@ import pytest
 from helpers import Command
 
 from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 OCULUS = Path(__file__).resolve().parents[2].parent / "shared/data/real/oculus-m1200d-three-pings/three_pings_8bit.raw"

@@ -12,8 +12,8 @@ from helpers import Array, Command, diffuse, essence, floor, refused, scene, sph
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.sonar_fit import fit_sonar
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 PLAIN = Sonar.create(model="coherent", frequency_hz=1.8e6, range_min=1.4, range_max=5.6, bearing="cone", gain_exponent=2,

@@ -24,8 +24,8 @@ from mitsonar.exports.labelled_pictures import LabelledPictures, class_rules
 from mitsonar.exports.named_exports import export_to
 from mitsonar.exports.run_length import compressed, runs_of
 from mitsonar.geometry.scan_conversion import nearest_cells
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.frame_store import FrameStore

@@ -13,8 +13,8 @@ from helpers import lit_plane
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.attitude import STD_GIVEN, STD_MEASURED, UNKNOWN_MOST, UNKNOWN_PER_S, attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.trajectory import Trajectory
 
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)

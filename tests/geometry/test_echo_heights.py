@@ -10,8 +10,8 @@ import pytest
 from helpers import lit_plane
 
 from mitsonar.geometry.echo_heights import TOPS, echo_heights
-from mitsonar.instruments.aperture import half_power
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.beams import half_power
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)

@@ -9,7 +9,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.geometry.scan_conversion import cartesian_map, to_cartesian
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.records.sonar_frames import SonarFrames

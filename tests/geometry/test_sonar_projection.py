@@ -7,7 +7,7 @@ import pytest
 
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.geometry.sonar_projection import Views, points_at, polar_of, projection_of
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
 
 POSE = np.array([1.2, -0.7, 2.5, np.radians(35), np.radians(4), np.radians(70)])
 POINTS = np.array([[4.0, 0.2, 0.1], [4.6, -0.9, 0.4], [3.8, -0.5, 0.0]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal.windows import taylor
 
-from mitsonar.instruments.aperture import SHADINGS, Aperture, Shading, series
+from mitsonar.instruments.beams import SHADINGS, Aperture, Shading, series
 
 LOBES_DB = {"uniform": -13.26, "hann": -31.47, "hamming": -42.68, "taylor": -30.3}
 """Highest side lobe of each shading (Harris 1978, table 1; Taylor by design)."""

@@ -11,8 +11,8 @@ from pydantic import ValidationError
 import mitsonar
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
+from mitsonar.instruments.sonar import Sonar
 
 DEFAULTS = {
     "name": "custom",

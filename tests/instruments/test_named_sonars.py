@@ -9,8 +9,8 @@ import pytest
 from helpers import diffuse, floor, floor_levels, scene
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import RAYS, Sonar
-from mitsonar.instruments.named_sonars import load_sonar, named_sonars, preset, sonar_from
+from mitsonar.instruments.sonar import RAYS, Sonar
+from mitsonar.instruments.sounder import load_sonar, named_sonars, preset, sonar_from
 from mitsonar.simulation.imaging import Simulator
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import RAYS, Sonar
-from mitsonar.instruments.named_sonars import preset
-from mitsonar.instruments.ping_groups import (
+from mitsonar.instruments.sonar import (
+    RAYS,
+    Sonar,
     first_sweeps,
     frame_period_s,
     group_of_beams,
@@ -18,6 +18,7 @@ from mitsonar.instruments.ping_groups import (
     scans,
     timed_path,
 )
+from mitsonar.instruments.sounder import preset
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 

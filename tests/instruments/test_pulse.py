@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.instruments.pulse import Pulse
+from mitsonar.instruments.beams import Pulse
 
 
 def test_half_power_at_half_the_resolution() -> None:

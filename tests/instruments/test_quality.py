@@ -12,16 +12,17 @@ from helpers import diffuse, floor, floor_levels, scene, slope
 
 from mitsonar.config.data_recipe import load_recipe
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import RAYS, Sonar
-from mitsonar.instruments.named_sonars import load_sonar, named_sonars, preset, sonar_from
-from mitsonar.instruments.quality import (
+from mitsonar.instruments.sonar import (
     FAR_GRAZING_RAD,
     QUALITIES,
+    RAYS,
     Quality,
+    Sonar,
     measured_errors,
     rays_across,
     rays_over_elevation,
 )
+from mitsonar.instruments.sounder import load_sonar, named_sonars, preset, sonar_from
 from mitsonar.simulation.imaging import Simulator
 
 PINGS = 4

@@ -170,7 +170,7 @@ quick = settings(
 @quick
 @given(key=some.sampled_from([*TINY["sonar"], "jitter", "seed", "sound_speed", "range_min", "range_max"]), value=values)
 def test_any_value_of_a_sonar(key: str, value: Any) -> None:
-    from mitsonar.instruments.named_sonars import sonar_from
+    from mitsonar.instruments.sounder import sonar_from
 
     outcome(lambda: sonar_from({**TINY["sonar"], key: value}).bearing_rad)
 
@@ -183,7 +183,7 @@ def test_any_value_of_a_sonar(key: str, value: Any) -> None:
     value=values,
 )
 def test_any_value_of_a_channel(key: str, value: Any) -> None:
-    from mitsonar.instruments.channel_sonar import ChannelSonar
+    from mitsonar.instruments.hydrophones import ChannelSonar
 
     outcome(lambda: ChannelSonar.create(**{key: value}).delay_s)
 
@@ -769,7 +769,7 @@ HOSTILE_YAML = {
 def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import load_noise
     from mitsonar.config.data_recipe import load_recipe
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.sounder import load_sonar
 
     path = tmp_path / f"{kind}.yaml"
     path.write_text(HOSTILE_YAML[name])
@@ -835,7 +835,7 @@ def test_long_words_of_frames_and_data_sets_are_cut(spoilt: Path, tmp_path: Path
 
 
 def test_aliases_that_help_are_read(tmp_path: Path) -> None:
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.sounder import load_sonar
 
     (tmp_path / "s.yaml").write_text("range_min: &near 1.0\nrange_max: 9\nazimuth_fov_deg: *near\n")
     assert load_sonar(tmp_path / "s.yaml").azimuth_fov_deg == 1.0

@@ -25,8 +25,8 @@ pytest.importorskip("foxglove")
 pytest.importorskip("websockets")
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.live.foxglove_server import FoxgloveServer
 from mitsonar.live.live_client import LiveClient, image_of
 from mitsonar.live.live_loop import LivePing, live_pings

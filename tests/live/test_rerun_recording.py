@@ -14,7 +14,7 @@ from PIL import Image
 
 pytest.importorskip("rerun")
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.rerun_recording import Shown, first_eye, lit_corners, wedge_lines
 from mitsonar.live.sonar_messages import FanEncoder
 from mitsonar.motion.pose import Pose

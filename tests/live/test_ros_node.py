@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.live_loop import LivePing
 from mitsonar.live.pose_mailbox import PoseMailbox
 from mitsonar.live.ros_node import RosNode

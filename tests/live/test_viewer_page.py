@@ -17,7 +17,7 @@ pytest.importorskip("websockets")
 
 from browser import CHROMIUM, Page, opened, served
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.rerun_recording import BEAMS, ESTIMATED, TRUE, WHOLE
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mitsonar.geometry.sonar_projection import Views, polar_of
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
 from mitsonar.mapping.bundle_adjustment import Adjusted, Observations, adjusted
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.closure import Closure, closure_of
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry

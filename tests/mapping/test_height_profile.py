@@ -105,7 +105,7 @@ def test_a_resumed_run_has_the_same_profile(source: FrameSource, tmp_path: Path)
 @pytest.mark.thorough
 def test_a_slope_shows_at_constant_depth(tmp_path: Path, variant: str) -> None:
     """Ground that rises forward by 10 deg: where first echoes put it is within their standard deviation of it."""
-    from mitsonar.instruments.named_sonars import load_sonar
+    from mitsonar.instruments.sounder import load_sonar
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
     from mitsonar.worlds.pattern import Pattern

@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.sonar_projection import Views, polar_of
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import local_map
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.landmarks import ImageAxes

@@ -17,8 +17,8 @@ from scipy import ndimage
 
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.views import directions
 from mitsonar.mapping.geotiff import save_geotiff
 from mitsonar.mapping.illumination import illumination
 from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic

@@ -22,7 +22,7 @@ from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import odometry_run
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.graph_odometry import errors_along

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.estimation.zero import Zero
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.mapping import benchmark_row, benchmark_sets, odometry_benchmark, odometry_run
 from mitsonar.mapping.benchmark_row import Case, measured_row
 from mitsonar.mapping.benchmark_sets import SETS, STEP_M, RenderedSet, benchmark_course, dive_course

@@ -10,7 +10,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, rejected
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, MotionPrior

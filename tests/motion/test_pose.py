@@ -11,7 +11,7 @@ import pytest
 from helpers import axes
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose, mounted, pose_from_to_world, to_world_matrices
 from mitsonar.motion.trajectory import Trajectory

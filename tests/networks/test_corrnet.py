@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mitsonar.datasets.ground_nodes import NODES, ground_at
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
 from mitsonar.motion.composition import Motion, compose, inverse
 from mitsonar.motion.pose import Pose
 from mitsonar.networks import create_network

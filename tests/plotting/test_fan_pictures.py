@@ -10,7 +10,7 @@ import pytest
 from helpers import Command, scene, sphere
 from PIL import Image
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.sonar_frames import SonarFrames

@@ -15,7 +15,7 @@ from helpers import MitsubaDict, diffuse, essence, floor, scene
 from mitsonar.acoustics.backscatter import GRAZING_DEG, material, sigma_at, sigma_table
 from mitsonar.acoustics.effective_mu import mu_at, mu_table, single_mu
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
 

@@ -9,7 +9,7 @@ import pytest
 from helpers import MitsubaDict
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, four_receivers
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, four_receivers
 
 ROWS = {(4.8e3, 8e3): 800, (9.6e3, 16e3): 1600, (19.2e3, 32e3): 3200}
 

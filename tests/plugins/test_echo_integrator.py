@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import MitsubaDict, box, diffuse, essence, floor, floor_levels, scene, sphere
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Receiver
 from mitsonar.motion.pose import Pose
 from mitsonar.records.echoes import CHANNELS

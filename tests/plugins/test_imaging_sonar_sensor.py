@@ -12,8 +12,8 @@ from helpers import MitsubaDict, angles, axes, cells, direction, essence
 from scipy import stats
 
 from mitsonar.arrays import DeviceArray
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import preset
 from mitsonar.motion.pose import Pose, to_world_matrices
 
 if TYPE_CHECKING:

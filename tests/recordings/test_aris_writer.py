@@ -12,7 +12,7 @@ from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError, SonarFrames, open_recording
 from mitsonar.estimation.image.direct import Direct
-from mitsonar.instruments.named_sonars import preset
+from mitsonar.instruments.sounder import preset
 from mitsonar.recordings.aris import FRAME
 from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.recordings.beam_table import TABLES, aris_bearings

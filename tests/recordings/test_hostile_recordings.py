@@ -21,7 +21,7 @@ from mutations import Rng, changed_bytes, changed_text, outcome
 from recording_files import aris_file, didson_file, oculus_log, oculus_ping, some_pings
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.recordings.mcap_writer import write_mcap
 
 USUAL, FEWER, MANY = 100, 10, 10_000

@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mitsonar import MitsonarError, Simulator, SonarFrames, open_recording
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.mcap_writer import SPAN_DB, write_mcap
 from mitsonar.recordings.ros_pings import is_beam_major

@@ -11,7 +11,7 @@ import pytest
 from fans import drawn
 
 from mitsonar import MitsonarError, MitsonarWarning, SonarFrames, create_estimator, open_recording
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.open_frames import open_frames
 from mitsonar.recordings.open_recording import format_of
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.named_sounders import load_sounder
+from mitsonar.instruments.sounder import load_sounder
 from mitsonar.recordings.xtf_writer import write_xtf
 from mitsonar.records.echogram import Echogram
 

@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.echoes import CHANNELS, Echoes, load_exr, save_exr
 
 SONAR = Sonar(beams=5, rays_per_beam=9, rays_across=2)

@@ -8,7 +8,7 @@ import numpy as np
 from helpers import diffuse, floor, scene
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator
 

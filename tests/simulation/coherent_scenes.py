@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from helpers import Array, diffuse, plate, scene
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 
 if TYPE_CHECKING:
     import mitsuba as mi

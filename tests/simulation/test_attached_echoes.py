@@ -9,7 +9,7 @@ import pytest
 from helpers import Array, diffuse, floor, scene
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 from helpers import box, diffuse, floor, run_python, scene, sphere
 
 from mitsonar.acoustics.echo_level import largest_level
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes, load_exr, save_exr

@@ -10,7 +10,7 @@ import pytest
 from helpers import Array, diffuse, essence, floor, plate, scene, sphere
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment
 from mitsonar.simulation.imaging import Simulator
 

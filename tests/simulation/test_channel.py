@@ -13,7 +13,7 @@ from helpers import diffuse, floor, plate, scene
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone, four_receivers
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, Hydrophone, four_receivers
 from mitsonar.motion.composition import steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

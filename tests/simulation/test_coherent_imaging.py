@@ -17,9 +17,8 @@ from scipy import stats
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.acoustics.speckle import contrast
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.aperture import series, shaded_sinc
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.pulse import Pulse
+from mitsonar.instruments.beams import Pulse, series, shaded_sinc
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.simulation import beam_former
 from mitsonar.simulation.imaging import Simulator

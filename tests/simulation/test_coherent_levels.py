@@ -13,8 +13,8 @@ from scipy import special
 from scipy.ndimage import uniform_filter
 
 from mitsonar.acoustics.sonar_losses import gain_of, sonar_absorption
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import named_sonars, preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:

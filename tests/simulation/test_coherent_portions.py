@@ -11,7 +11,7 @@ from helpers import Array, box, diffuse, essence, floor, scene
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, View
 from mitsonar.motion.pose import Pose, mounted
 

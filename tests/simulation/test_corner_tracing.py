@@ -10,7 +10,7 @@ import pytest
 from helpers import Array, essence
 from scipy.spatial.transform import Rotation
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 
 if TYPE_CHECKING:
     import mitsuba as mi

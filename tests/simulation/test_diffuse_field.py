@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import diffuse, essence, floor, plate, scene
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:

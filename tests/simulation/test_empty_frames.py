@@ -12,7 +12,7 @@ from helpers import Command, diffuse, floor, plate, refused, scene, separate, sp
 from numpy.typing import ArrayLike
 
 from mitsonar.errors import MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.empty_frames import angle_hint, empty_frames, view_of
 from mitsonar.simulation.imaging import Simulator

@@ -11,8 +11,8 @@ from helpers import Array, diffuse, essence, floor, scene, sphere
 
 from mitsonar.acoustics.sonar_losses import sonar_absorption
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import named_sonars, preset
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:

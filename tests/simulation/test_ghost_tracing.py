@@ -9,7 +9,7 @@ import pytest
 from coherent_scenes import one_point
 from helpers import Array, diffuse, essence, plate, separate
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]

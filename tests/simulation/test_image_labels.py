@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import box, diffuse, floor, place_of, scene
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator

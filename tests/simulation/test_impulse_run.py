@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from channel_scenes import LEVEL, cells_floor, simulator
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.simulation.channel import Paths
 from mitsonar.simulation.impulse_run import spread_of
 

@@ -11,8 +11,8 @@ from helpers import box, diffuse, essence, floor, plate, scene, sphere
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from helpers import Array, box, diffuse, essence, floor, plate, scene, sphere
 
 from mitsonar.acoustics.backscatter import Material, material, mirror_amplitude
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:

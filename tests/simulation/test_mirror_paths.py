@@ -13,7 +13,7 @@ from helpers import box, diffuse, plate
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator, Paths, frequency_response, impulse_response
 

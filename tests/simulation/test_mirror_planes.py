@@ -11,7 +11,7 @@ from channel_scenes import C, received_from, unmerged
 from helpers import diffuse, plate
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.worlds.sea_surface import SeaSurface

@@ -8,7 +8,7 @@ from channel_scenes import C, points, received_from, scatterers_of, unmerged
 from helpers import diffuse, plate
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator
 

@@ -11,7 +11,7 @@ from coherent_scenes import one_point
 from helpers import Array, box, diffuse, floor, plate, separate, sphere
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator

@@ -9,7 +9,7 @@ import pytest
 from helpers import box, diffuse, floor, plate, separate, sphere
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator

@@ -9,8 +9,7 @@ import pytest
 from helpers import Array, diffuse, plate, scene
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.ping_groups import group_of_beams, scanned
+from mitsonar.instruments.sonar import Sonar, group_of_beams, scanned
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.sonar_frames import SonarFrames

@@ -11,8 +11,8 @@ import pytest
 from coherent_scenes import SONAR, imager, one_point
 from helpers import Array, essence
 
-from mitsonar.instruments.aperture import Pattern
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.beams import Pattern
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.beam_former import elevation_end
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]

@@ -9,7 +9,7 @@ import pytest
 from channel_scenes import CELLS, LEVEL, C, cells_floor, points, received_from, scatterers_of, simulator
 from helpers import box, diffuse, essence, floor, scene, sphere
 
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView, Hydrophone
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator
 
@@ -90,7 +90,7 @@ def test_energy_is_that_of_the_imaging_sonar() -> None:
 
     The mean over 12 headings, since the power |zeta|^2 of each of the 40,000 points in view is drawn.
     """
-    from mitsonar.instruments.imaging_sonar import Sonar
+    from mitsonar.instruments.sonar import Sonar
     from mitsonar.simulation.imaging import Simulator
 
     field = FieldOfView(tilt_deg=40.0, across_deg=20.0, along_deg=30.0, taper=0.0)

@@ -10,9 +10,9 @@ import pytest
 from helpers import box, diffuse, essence, floor, plate, separate, sphere
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sounders import load_sounder
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.channel import ChannelSimulator

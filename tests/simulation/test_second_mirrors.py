@@ -10,7 +10,7 @@ from coherent_scenes import one_point
 from helpers import diffuse, plate, separate, sphere
 from test_bounce_sums import ball
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore:.*lie outside the window")]

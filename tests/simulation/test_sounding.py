@@ -8,8 +8,7 @@ import pytest
 
 from mitsonar.acoustics.bottom_detection import first_echoes, strongest_echoes
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.named_sounders import load_sounder
-from mitsonar.instruments.sounder import Sounder
+from mitsonar.instruments.sounder import Sounder, load_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.dvl_readings import velocity_of

@@ -22,7 +22,7 @@ from helpers import (
     world_directions,
 )
 
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.records.echoes import CHANNELS, Echoes
 from mitsonar.simulation.imaging import Simulator

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.vehicle_run import run_vehicle
 from mitsonar.motion.pose import Pose, mount_between, mounted
 from mitsonar.motion.trajectory import Trajectory

@@ -8,7 +8,7 @@ from helpers import axes, box, diffuse, direction, essence, floor, plate, scene
 from numpy.typing import ArrayLike
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import SEGMENTS, Receiver, Segment
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.simulation.imaging import Simulator

@@ -18,7 +18,7 @@ from helpers import Command, refused, run_python, tiny_recipe
 
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.errors import in_units
 from mitsonar.records.sonar_frames import SonarFrames

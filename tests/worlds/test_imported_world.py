@@ -10,7 +10,7 @@ from foreign_scenes import BUOY, SDF, URDF, make_sdf, make_urdf
 from helpers import Command, refused
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator

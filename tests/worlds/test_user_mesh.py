@@ -12,7 +12,7 @@ from helpers import Command
 from PIL import Image
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, sonar_in

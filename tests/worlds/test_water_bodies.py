@@ -9,7 +9,7 @@ import pytest
 from helpers import scene, sphere
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
 

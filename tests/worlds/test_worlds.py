@@ -13,7 +13,7 @@ from helpers import files_of, place_of
 from scipy import stats
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, sonar_in

@@ -20,7 +20,7 @@ from scipy.ndimage import maximum_filter
 
 from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.estimator import Estimate, rejected
-from mitsonar.instruments.channel_sonar import ChannelSonar, FieldOfView
+from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.impulse_responses import ImpulseResponses
 

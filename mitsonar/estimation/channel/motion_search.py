@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter
 
 from mitsonar.estimation.channel.response_covariance import ResponseCovariance
 from mitsonar.estimation.channel.sub_bands import Band
-from mitsonar.instruments.channel_sonar import ChannelSonar, Hydrophone
+from mitsonar.instruments.hydrophones import ChannelSonar, Hydrophone
 
 __all__ = ["ReceiverBand", "Search", "receiver_bands_of", "response_covariance_of", "single_receiver"]
 

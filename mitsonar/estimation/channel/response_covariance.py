@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.channel_sonar import ChannelSonar, Hydrophone
+from mitsonar.instruments.hydrophones import ChannelSonar, Hydrophone
 from mitsonar.simulation.propagation_delay import delay_exact
 
 __all__ = ["LinkResponse", "ResponseCovariance", "block_toeplitz", "link_response"]

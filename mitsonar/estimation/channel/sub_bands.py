@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 
 __all__ = ["BAND_HZ", "Band", "bands_of"]
 

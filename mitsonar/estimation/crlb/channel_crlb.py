@@ -16,7 +16,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.channel.motion_search import ReceiverBand, receiver_bands_of
 from mitsonar.estimation.channel.response_covariance import ResponseCovariance, block_toeplitz
 from mitsonar.estimation.channel.sub_bands import bands_of
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 
 __all__ = ["NOISELESS_DB", "channel_crlb", "impulse_information"]
 

@@ -13,7 +13,7 @@ from mitsonar.estimation.crlb.crlb_subject import Subject
 from mitsonar.estimation.crlb.fisher_bound import Bound, overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at, laws_of, varied
 from mitsonar.estimation.estimator import PlainTable
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain
 

@@ -14,7 +14,7 @@ from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.variant import release_memory

@@ -20,9 +20,8 @@ from mitsonar.acoustics.noise import Information, NoiseModel, information, infor
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.estimation.crlb.fisher_bound import Bound, fisher, together
 from mitsonar.estimation.crlb.speckle_crlb import SPECKLE_LAWS, SpeckleBounds
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.views import Segment
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.views import Segment, directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.simulation.derivatives import FIRST_PING, PINGS, Derivative, differentiate, jittered
 from mitsonar.simulation.imaging import Simulator

@@ -26,8 +26,7 @@ from mitsonar.acoustics.rician import rician_information, score_shares
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.fisher_bound import Bound, fisher_by
 from mitsonar.estimation.crlb.score_covariance import CellCorrelation, ScoreCovariance
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.quality import Quality
+from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.derivatives import FIRST_PING, PINGS, differentiate, evenly, step_for

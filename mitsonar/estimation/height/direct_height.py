@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.height.floor_profile import FloorProfile
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import SEGMENTS, Segment, Whole
 from mitsonar.records.sonar_frames import SonarFrames
 from mitsonar.records.view_frames import ViewFrames

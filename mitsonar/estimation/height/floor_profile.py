@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.beam_directions import directions
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
 __all__ = ["FloorProfile"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.instruments.imaging_sonar import Bearing
+from mitsonar.instruments.sonar import Bearing
 
 __all__ = ["FlowLevel", "WindowGrid", "window_grid"]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 from mitsonar.records.sonar_frames import SonarFrames
 

@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.channel.pings import pings_of
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.estimation.learned.trained_network import HEIGHT_OFF, Trained, answer_of, one_thread
-from mitsonar.instruments.channel_sonar import ChannelSonar
+from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint

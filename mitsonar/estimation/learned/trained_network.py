@@ -18,7 +18,7 @@ from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS
 from mitsonar.geometry.scan_conversion import cartesian_map
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint

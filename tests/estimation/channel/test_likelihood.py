@@ -21,7 +21,7 @@ from mitsonar.estimation.channel.response_covariance import ResponseCovariance, 
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.crlb.channel_crlb import channel_crlb, impulse_information
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.instruments.channel_sonar import ChannelSonar, four_receivers
+from mitsonar.instruments.hydrophones import ChannelSonar, four_receivers
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities

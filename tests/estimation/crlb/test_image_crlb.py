@@ -26,7 +26,7 @@ from mitsonar.estimation.crlb.image_crlb import (
     varied,
 )
 from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.records.sonar_frames import to_uint8

@@ -18,7 +18,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
 from mitsonar.estimation.crlb.score_covariance import CellCorrelation, ScoreCovariance
 from mitsonar.estimation.crlb.speckle_crlb import CellScores, SpeckleBounds, grain_law
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 

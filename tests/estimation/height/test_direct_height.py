@@ -21,8 +21,8 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.height.direct_height import DirectHeight
 from mitsonar.estimation.height.floor_profile import FloorProfile
 from mitsonar.estimation.height.named_height_estimators import height_estimator_from
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.pair_estimation import estimate_motions

@@ -17,7 +17,7 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.echo_heights import FirstEchoes
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, MotionPrior, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

@@ -18,8 +18,8 @@ from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.estimation.image.image_slopes import blurred
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.attitude import Attitude
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.sonar_frames import SonarFrames
 
 ATTITUDE = Attitude(2.5, 0.05, np.radians(35))

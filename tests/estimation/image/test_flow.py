@@ -14,7 +14,7 @@ from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.flow import Flow
 from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

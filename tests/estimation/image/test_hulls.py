@@ -7,7 +7,7 @@ import pytest
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.instruments.imaging_sonar import Sonar
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

@@ -18,8 +18,8 @@ from mitsonar.estimation.named_estimators import create_estimator, estimators_fo
 from mitsonar.estimation.zero import Zero
 from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.geometry.ground_plane import moved
-from mitsonar.instruments.imaging_sonar import Sonar
-from mitsonar.instruments.named_sonars import load_sonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

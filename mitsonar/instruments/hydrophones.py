@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.instruments.imaging_sonar import FieldValue, Instrument
+from mitsonar.instruments.sonar import FieldValue, Instrument
 from mitsonar.io.checked_model import CheckedModel
 
 __all__ = [

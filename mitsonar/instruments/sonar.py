@@ -3,19 +3,349 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from mitsonar.instruments.aperture import Aperture, Pattern, Shading
-from mitsonar.instruments.ping_groups import GroupOrder, check_groups, scans
-from mitsonar.instruments.pulse import Pulse
-from mitsonar.instruments.quality import Quality, rays_across, rays_over_elevation
+from mitsonar.errors import MitsonarError, nearest_names, shortened
+from mitsonar.instruments.beams import Aperture, Pattern, Pulse, Shading
 from mitsonar.io.checked_model import CheckedModel
+from mitsonar.motion.pose import Pose, mounted
+from mitsonar.motion.trajectory import Trajectory
 
-__all__ = ["RAYS", "Bearing", "Coding", "FieldValue", "Instrument", "Model", "Sonar"]
+__all__ = [
+    "FAR_GRAZING_RAD",
+    "QUALITIES",
+    "RAYS",
+    "Bearing",
+    "Coding",
+    "FieldValue",
+    "GroupOrder",
+    "Instrument",
+    "Measured",
+    "Model",
+    "Quality",
+    "Sonar",
+    "TimedPath",
+    "check_groups",
+    "first_sweeps",
+    "frame_period_s",
+    "group_of_beams",
+    "measured_errors",
+    "one_beam",
+    "overlap_notes",
+    "ping_interval_s",
+    "rays_across",
+    "rays_over_elevation",
+    "scanned",
+    "scans",
+    "timed_path",
+]
+
+
+# ---------------- Number of rays for an accuracy, and the measured error of each quality
+# Errors of the physical model, from ``benchmarks/bench_quality.py``:
+#
+# Plain ground: a ray spreads its level evenly over the ranges that its cell of elevation covers. Cells join without
+# gap, so only the slope of the level within a cell is lost. The error grows with the cell's length along range as a
+# part of the range, ``dR / R = de / tan(grazing angle)``, whatever the range bins are. It falls faster than 1 / rays,
+# and more rays across lower the part of the error that is jitter.
+#
+# Textured ground, where a ray's cell is larger than a cell of the texture: each ray reads one value at random. The
+# error is the texture's contrast over the square root of the rays in one bin. These are ``rays_across`` until an
+# elevation cell is shorter than a bin. The error falls as 1 / sqrt(rays), and faster once rays are denser than the
+# texture. Rays jitter anew each ping, so a sonar at rest sees this error change. It looks like speckle, and is none.
+
+
+FAR_GRAZING_RAD = math.asin(0.2)
+"""Grazing angle on the reference ground at the window's far end [rad]; the sonar is a fifth of that range above it."""
+
+STEEPEST_RAD = math.radians(75)
+"""Bearing beyond which a beam's width has no effect [rad]: the ground leaves the window there."""
+
+MOST_ACROSS = 4096
+
+
+class RayCounts(NamedTuple):
+    """Requirements of a quality on the rays.
+
+    Attributes:
+        reach: longest range interval of one ray's cell on the reference ground, as a part of the range.
+        apart_m: distance of rays across a beam at the far end of the window [m].
+        across: rays across a beam at most, unless ``reach`` needs more.
+    """
+
+    reach: float
+    apart_m: float
+    across: int
+
+
+QUALITIES: dict[str, RayCounts] = {
+    "draft": RayCounts(0.03, math.inf, 1),
+    "standard": RayCounts(0.01, 0.0075, 4),
+    "fine": RayCounts(0.0025, 0.00375, 8),
+}
+"""Requirements of each quality, coarsest first."""
+
+
+def _known(name: object) -> object:
+    if not isinstance(name, str) or name not in QUALITIES:
+        raise ValueError(f"unknown quality {shortened(name)}: {nearest_names(str(name)[:40], QUALITIES)}")
+    return name
+
+
+Quality = Annotated[Literal["draft", "standard", "fine"], BeforeValidator(_known)]
+
+
+def rays_over_elevation(quality: str, elevation_fov_rad: float) -> int:
+    """Compute the number of rays over a beam's elevation. It is even, since segments halve the field of view.
+
+    A cell of height ``de`` covers ``de / tan(grazing)`` of the range. At the far end of the window it may cover ``reach``.
+    """
+    needed = elevation_fov_rad / (math.tan(FAR_GRAZING_RAD) * QUALITIES[quality].reach)
+    return 2 * math.ceil(needed / 2)
+
+
+def rays_across(quality: str, beam_width_rad: float, azimuth_fov_rad: float, range_max: float) -> int:
+    """Compute the number of rays across a beam's width.
+
+    Texture needs rays ``apart_m`` apart at the far end. At the edge of a wide fan the ground's range changes across a beam
+    by the part ``tan(bearing)`` times the beam's width. Each ray may cover twice ``reach`` of it.
+    """
+    wanted = QUALITIES[quality]
+    texture = min(wanted.across, math.ceil(beam_width_rad * range_max / wanted.apart_m))
+    oblique = math.ceil(beam_width_rad * math.tan(min(azimuth_fov_rad / 2, STEEPEST_RAD)) / (2 * wanted.reach))
+    return min(MOST_ACROSS, max(1, texture, oblique))
+
+
+class Measured(NamedTuple):
+    """Measured errors of a quality of a preset.
+
+    Attributes:
+        rays_per_beam: over elevation.
+        rays_across: across a beam.
+        plain_percent: rms error of a ping's bins on plain ground, in % of their level.
+        textured_percent: on ground of 15 mm cells with reflectivities spread evenly over 0..1, in % of the level of plain
+            ground of the same mean.
+        still_correlation: of the levels of two pings of a sonar at rest over that ground, relative to plain ground.
+    """
+
+    rays_per_beam: int
+    rays_across: int
+    plain_percent: float
+    textured_percent: float
+    still_correlation: float
+
+
+@cache
+def measured_errors() -> tuple[str, dict[str, dict[str, Measured]]]:
+    """Read the machine and date of the measurement, and the measured errors by preset and quality."""
+    table = yaml.safe_load(files("mitsonar.instruments").joinpath("quality.yaml").read_text(encoding="utf-8"))
+    found = {
+        preset: {quality: Measured(**numbers) for quality, numbers in rows.items()}
+        for preset, rows in table["presets"].items()
+    }
+    return f"{table['machine']}, {table['date']}", found
+
+
+# ---------------- Frames that take time: groups of beams that ping one after another, and heads that turn from beam
+# to beam
+# A frame of a DIDSON is 8 pings of 12 beams, one of an ARIS 4 to 8 pings. A mechanically scanned sonar has one beam and
+# turns it: its frame is a sweep, each beam of which is a ping of its own. The time of a frame is the middle of its pings.
+
+
+GroupOrder: TypeAlias = Literal["interleaved", "sequential"]
+
+
+def check_groups(sonar: Sonar) -> None:
+    """Check the ping groups of a sonar.
+
+    Raises:
+        ValueError: more groups than beams.
+    """
+    if sonar.ping_groups > sonar.beams:
+        raise ValueError(
+            f"each ping group has a beam at least: got ping_groups {sonar.ping_groups} and beams {sonar.beams}; lower "
+            "ping_groups"
+        )
+
+
+def scans(sonar: Sonar) -> bool:
+    """Return whether each beam is a ping of its own: a head that turns."""
+    return 1 < sonar.beams == sonar.ping_groups
+
+
+def group_of_beams(sonar: Sonar) -> NDArray[np.int64]:
+    """Return the number of the group of each beam ``(beams,)``; groups ping in the order of their numbers."""
+    beam = np.arange(sonar.beams)
+    return beam % sonar.ping_groups if sonar.group_order == "interleaved" else beam * sonar.ping_groups // sonar.beams
+
+
+def ping_interval_s(sonar: Sonar) -> float:
+    """Return the time from the ping of one group to that of the next [s]: as given, or echo and overhead."""
+    if sonar.group_interval_s is not None:
+        return sonar.group_interval_s
+    return 2 * sonar.range_max / sonar.sound_speed + sonar.group_overhead_s
+
+
+def frame_period_s(sonar: Sonar) -> float:
+    """Return the time from frame to frame [s]: one over the frame rate, of a head that turns its sweep."""
+    return sonar.ping_groups * ping_interval_s(sonar) if scans(sonar) else 1 / sonar.frame_rate_hz
+
+
+def scanned(sonar: Sonar, *, sector_deg: float = 360.0, step_deg: float = 0.9, overhead_s: float = 0.0) -> Sonar:
+    """Return the sonar whose beams are the steps of a head that turns a one-beam sonar from port to starboard.
+
+    Each step is a ping with its own time and pose. It lasts ``2 range_max / sound_speed + overhead_s``. A frame is a sweep.
+
+    Args:
+        sonar: with one beam; ``beam_width_deg``, or its ``azimuth_fov_deg``, is the width of the beam.
+        sector_deg: that is swept, at most 360 [deg]; 0 deg is ahead, in its middle.
+        step_deg: from beam to beam [deg]; the sector must be a whole number of them.
+        overhead_s: for turning and reporting, a step [s].
+
+    Raises:
+        MitsonarError: more beams than one; a sector that is no whole number of steps.
+    """
+    if sonar.beams != 1:
+        raise MitsonarError(f"a head that turns has one beam: got {sonar.beams}; give a sonar with beams 1")
+    steps = round(sector_deg / step_deg) if step_deg > 0 and 0 < sector_deg <= 360 else 0
+    if steps < 2 or not math.isclose(steps * step_deg, sector_deg, rel_tol=1e-6):
+        raise MitsonarError(
+            f"a sector of at most 360 deg is a whole number of steps: got {sector_deg:g} deg and steps of {step_deg:g} deg"
+        )
+    if not 0 <= overhead_s < math.inf:
+        raise MitsonarError(f"the overhead of a step must be 0 s or more: got {overhead_s:g}")
+    interval = 2 * sonar.range_max / sonar.sound_speed + overhead_s
+    return sonar.replace(
+        beams=steps,
+        azimuth_fov_deg=sector_deg,
+        beam_width_deg=math.degrees(sonar.beam_width_rad),
+        bearing="azimuth",
+        beam_layout="even",
+        ping_groups=steps,
+        group_order="sequential",
+        group_interval_s=None,
+        group_overhead_s=overhead_s,
+        frame_rate_hz=1 / (steps * interval),
+    )
+
+
+def one_beam(sonar: Sonar) -> Sonar:
+    """Return the one beam that a head turns, of a sonar that scans."""
+    width = math.degrees(sonar.beam_width_rad)
+    return sonar.replace(beams=1, azimuth_fov_deg=width, beam_width_deg=width, ping_groups=1)
+
+
+@dataclass(frozen=True)
+class TimedPath:
+    """The pings of all frames.
+
+    Attributes:
+        frames: pose and time of each frame, the middle of its pings.
+        time_s: of each ping ``(frames, groups)``, or ``(frames,)`` where a frame is one ping [s].
+        poses: of each ping ``(frames, groups, 6)``, or ``(frames, 6)`` [m, rad].
+    """
+
+    frames: Trajectory
+    time_s: NDArray[np.float64]
+    poses: NDArray[np.float64]
+
+    def of_beams(self, sonar: Sonar) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Return the time of each beam ``(frames, beams)`` and its pose; ``(frames,)`` and None for one ping a frame."""
+        if self.time_s.ndim == 1:
+            return self.time_s, None
+        group = group_of_beams(sonar)
+        return self.time_s[:, group], self.poses[:, group]
+
+
+def timed_path(sonar: Sonar, path: Trajectory) -> TimedPath:
+    """Return the pings of all frames along a path.
+
+    A frame is due at each time of the path. Poses of its pings lie between those of the path; before its first and after
+    its last one the vehicle goes on as beside it. A head that turns sweeps without a pause from the path's begin on, as
+    often as the path is long; along a single pose it sweeps once.
+
+    Raises:
+        MitsonarError: a path that is too short for a sweep, or whose times do not grow.
+    """
+    if sonar.ping_groups == 1:
+        return TimedPath(path, path.time_s, path.poses)
+    offsets = (np.arange(sonar.ping_groups) - (sonar.ping_groups - 1) / 2) * ping_interval_s(sonar)
+    due = path.time_s
+    if scans(sonar) and len(path) > 1:
+        sweep = ping_interval_s(sonar) * sonar.ping_groups
+        lasts = path.time_s[-1] - path.time_s[0]
+        if lasts < sweep * (1 - 1e-9):
+            raise MitsonarError(f"a sweep lasts {sweep:.4g} s and the path {lasts:.4g} s: give a longer path")
+        due = path.time_s[0] + (np.arange(int(lasts / sweep + 1e-9)) + 0.5) * sweep
+    longer = path.lengthened(-offsets[0])
+    time = due[:, None] + offsets
+    poses = longer.at(time.ravel()).reshape(*time.shape, 6)
+    frames = path if due is path.time_s else Trajectory(longer.at(due), due)
+    return TimedPath(frames, time, poses)
+
+
+def first_sweeps(sonar: Sonar, path: Trajectory, count: int) -> Trajectory:
+    """Return the part of a path along which a head that turns makes its first ``count`` sweeps.
+
+    Raises:
+        MitsonarError: the path is shorter; a single pose counts as one sweep.
+    """
+    sweep, lasts = frame_period_s(sonar), float(path.time_s[-1] - path.time_s[0])
+    if lasts < count * sweep * (1 - 1e-9) and (len(path) > 1 or count > 1):
+        raise MitsonarError(
+            f"a sweep lasts {sweep:.4g} s and the path {lasts:.4g} s, room for {int(lasts / sweep + 1e-9)}: got {count}; "
+            "--frames counts the sweeps of a head that turns: give fewer, or a longer path"
+        )
+    if len(path) == 1:
+        return path
+    end = path.time_s[0] + count * sweep
+    inside = path.time_s < end
+    return Trajectory(np.concatenate([path.poses[inside], path.at([end])]), np.concatenate([path.time_s[inside], [end]]))
+
+
+def overlap_notes(sonar: Sonar, time_s: NDArray[np.float64]) -> list[str]:
+    """Return what to tell where the pings of a frame last longer than the time to the next frame: no instrument pings so.
+
+    Args:
+        sonar: whose frames follow each other.
+        time_s: of the frames ``(frames,)`` [s].
+    """
+    lasts = sonar.ping_groups * ping_interval_s(sonar)
+    apart = np.diff(time_s).min(initial=np.inf)
+    if sonar.ping_groups == 1 or scans(sonar) or lasts <= apart * (1 + 1e-6):
+        return []
+    return [
+        f"the {sonar.ping_groups} pings of a frame last {lasts:.3g} s and the next frame is due {apart:.3g} s later: they "
+        f"overlap, which no instrument does; a frame_rate_hz of {_down(1 / lasts)} would do (of poses in a file, that many "
+        "a second), or a shorter range_max"
+    ]
+
+
+def _down(value: float) -> str:
+    """Return a number to three digits, rounded down."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{math.floor(value / step) * step:.3g}"
+
+
+def turned_heads(sonar: Sonar, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the poses of the head of a sonar that scans, from those of the vehicle, both ``(frames, beams, 6)``."""
+    found = np.empty_like(poses)
+    group = group_of_beams(sonar)
+    for beam, bearing in enumerate(sonar.bearing_rad):
+        found[:, group[beam]] = mounted(poses[:, group[beam]], Pose(0, 0, 0, heading=float(bearing)))
+    return found
+
+
+# ---------------- imaging sonar
+
 
 FieldValue: TypeAlias = Any
 """The value of an instrument's field, before pydantic checks it."""
