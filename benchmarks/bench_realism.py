@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from real_recordings import FOLDER, RECORDINGS, as_recorded, recordings_folder
 from realism_scenes import STAGES, Stage
 
-from mitsonar.acoustics import image_statistics as statistics
-from mitsonar.acoustics.coding import decoded
+from mitsonar.acoustics import statistics
+from mitsonar.acoustics.levels import decoded
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.sonar_fit import SonarFit, fit_sonar
 from mitsonar.geometry.scan_conversion import to_cartesian

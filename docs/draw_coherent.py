@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import mitsonar
-from mitsonar.acoustics.coding import decoded
+from mitsonar.acoustics.levels import decoded
 from mitsonar.geometry.scan_conversion import to_cartesian
 from mitsonar.simulation.scene import sonar_in
 

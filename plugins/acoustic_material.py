@@ -7,8 +7,7 @@ from typing import Any, cast
 
 import mitsuba as mi
 
-from mitsonar.acoustics.backscatter import Material, material, named_materials
-from mitsonar.acoustics.effective_mu import single_mu
+from mitsonar.acoustics.materials import Material, material, named_materials, single_mu
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
 from mitsonar.plugins.hashed_texture import number_of_property
@@ -27,7 +26,7 @@ LOUDEST, FAINTEST = 1.0, 1e-6
 
 
 class AcousticMaterial(mi.BSDF):
-    """A surface of a material of :mod:`mitsonar.acoustics.backscatter`: its echo follows a law of the grazing angle.
+    """A surface of a material of :mod:`mitsonar.acoustics.materials`: its echo follows a law of the grazing angle.
 
     Properties: ``material``: a name, or a YAML file (its path counts from the scene's folder), or ``none``, which makes
     a plain ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number.

@@ -10,8 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mitsonar.acoustics.backscatter import Material
-from mitsonar.acoustics.effective_mu import FLATTEST, mu_table, normal_mu, reference_hz
+from mitsonar.acoustics.materials import FLATTEST, Material, mu_table, normal_mu, reference_hz
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
@@ -51,7 +50,7 @@ def mirror_rows(materials: Sequence[Material]) -> mi.Float:
 def weighed(laws: mi.Float, material: DeviceArray, reflectivity: DeviceArray, cosine: DeviceArray) -> DeviceArray:
     """Return the effective reflectivity of points at the angle of their rays; unchanged where there is no material.
 
-    It is that of :func:`mitsonar.acoustics.effective_mu.mu_at`, and at most 1 / cosine.
+    It is that of :func:`mitsonar.acoustics.materials.mu_at`, and at most 1 / cosine.
 
     Args:
         laws: of :func:`law_rows`.

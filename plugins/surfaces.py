@@ -20,7 +20,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.acoustics.effective_mu import hearing_notes
+from mitsonar.acoustics.materials import hearing_notes
 from mitsonar.arrays import DeviceArray
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.plugins.acoustic_material import AcousticMaterial

@@ -239,7 +239,7 @@ def make_materials(folder: Path) -> None:
 
 
 def read_materials(folder: Path) -> None:
-    from mitsonar.acoustics.backscatter import material, sigma_table
+    from mitsonar.acoustics.materials import material, sigma_table
 
     for name in ("table", "plate", "floor"):
         assert np.isfinite(sigma_table(material(folder / f"{name}.yaml"), 80e3)).all()

@@ -7,6 +7,7 @@ It is kept as published, for its tables: a pixel's law depends on whether it hol
 from __future__ import annotations
 
 import math
+import re
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -29,8 +30,11 @@ __all__ = [
     "information_of_sums",
     "load_noise",
     "refuse_noise",
+    "snr_of",
+    "snr_said",
     "uniform",
 ]
+
 
 MASK = 0xFFFFFFFF
 
@@ -363,3 +367,25 @@ def load_noise(text: str) -> NoiseModel:
             f"noise must be {', '.join(NOISE_MODELS)}, three fractions mean,std,scale, or a YAML file: got {shortened(text)}"
             f"{meant(text, NOISE_MODELS)}"
         ) from None
+
+
+# ---------------- Signal to noise ratios, as recipes and commands write them
+
+
+def snr_of(text: str) -> float | None:
+    """Parse a signal to noise ratio in dB: ``20 dB``; ``none`` for no noise.
+
+    Raises:
+        MitsonarError: something else.
+    """
+    found = re.fullmatch(r"\s*([+-]?\d+(?:\.\d+)?)\s*dB\s*", text)
+    if text != "none" and not found:
+        raise MitsonarError(
+            f"noise of impulse responses is a signal to noise ratio such as '20 dB', or none: got {shortened(text)}"
+        )
+    return float(found[1]) if found else None
+
+
+def snr_said(snr_db: float | None) -> str:
+    """Format a signal to noise ratio [dB] as :func:`snr_of` parses it."""
+    return "none" if snr_db is None else f"{snr_db:g} dB"

@@ -6,7 +6,7 @@ arrays broadcast. Sources: Urick, Principles of Underwater Sound, 3rd edition (1
 
 Echoes of the model ``physical`` have no unit: their reflectivity C is Lambert's mu itself, not pi mu. A surface of C = 1
 scatters pi times what arrives, 5 dB more than it can. A level in dB re 1 uPa needs ``mu = C / pi`` or less, see
-:mod:`mitsonar.acoustics.backscatter`.
+:mod:`mitsonar.acoustics.materials`.
 """
 
 from __future__ import annotations

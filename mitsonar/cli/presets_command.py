@@ -61,7 +61,7 @@ def _one(name: str) -> None:
 
 def _print_keys(name: str, known: NamedSonar, sonar: Sonar, own: dict[str, object] | None = None) -> None:
     """Print every key with its source: those of an instrument first, then those of its sonar."""
-    from mitsonar.acoustics.sonar_losses import absorption_line
+    from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import RAYS
 
     say(f"{name}: {known.about}")

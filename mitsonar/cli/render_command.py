@@ -78,7 +78,7 @@ def render(
 ) -> None:
     """Render what the sonar receives: frames.npz, images/, poses.tum and run.json in the folder OUT."""
     from mitsonar.acoustics.noise import load_noise, refuse_noise
-    from mitsonar.acoustics.sonar_losses import absorption_line
+    from mitsonar.acoustics.water import absorption_line
     from mitsonar.cli.vehicle_rendering import VehicleOptions, first_pose, render_vehicle, vehicle_file
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.io.runs import file_digest

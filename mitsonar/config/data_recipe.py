@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, SerializerFunctionWrapHandler, ValidationError, model_serializer, model_validator
 
+from mitsonar.acoustics.materials import check_channel_mirrors, check_image_mirrors
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
 from mitsonar.config.recipe_parts import Flight, MirrorKeys, Mount, ReceiverSpec, RecipePart, Recorded, Scenes, Split
 from mitsonar.errors import MitsonarError, complaint, shortened
 from mitsonar.instruments.hydrophones import ChannelSonar
-from mitsonar.instruments.mirror_rules import check_channel_mirrors, check_image_mirrors
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import sonar_from
 from mitsonar.instruments.views import Receiver, Segment, View, Whole

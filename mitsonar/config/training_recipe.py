@@ -12,8 +12,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from mitsonar.acoustics.noise import load_noise
-from mitsonar.acoustics.signal_to_noise import snr_of
+from mitsonar.acoustics.noise import load_noise, snr_of
 from mitsonar.config.data_recipe import Split, split_from
 from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
 from mitsonar.config.recipe_parts import SPLITS

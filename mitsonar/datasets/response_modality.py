@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.signal_to_noise import snr_of
+from mitsonar.acoustics.noise import snr_of
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, ground_reach
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView

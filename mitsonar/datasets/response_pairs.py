@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mitsonar.acoustics.signal_to_noise import snr_of, snr_said
+from mitsonar.acoustics.noise import snr_of, snr_said
 from mitsonar.datasets.batches import Batch, Device, RawSample, StoredBatches
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.response_packing import Packing

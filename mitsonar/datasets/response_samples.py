@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.signal_to_noise import snr_of
+from mitsonar.acoustics.noise import snr_of
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.datasets.response_packing import Packing, packed

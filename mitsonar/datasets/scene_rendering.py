@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.sonar_losses import noise_of
+from mitsonar.acoustics.water import noise_of
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values

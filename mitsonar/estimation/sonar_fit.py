@@ -12,9 +12,9 @@ import yaml
 from numpy.typing import NDArray
 from scipy import ndimage, optimize, special
 
-from mitsonar.acoustics import image_statistics as statistics
-from mitsonar.acoustics.coding import decoded
-from mitsonar.acoustics.sonar_losses import gain_of, loss_of
+from mitsonar.acoustics import statistics
+from mitsonar.acoustics.levels import decoded
+from mitsonar.acoustics.water import gain_of, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.water_fit import glow_by_beam, near_glow, volume
 from mitsonar.instruments.sonar import Sonar

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
-from mitsonar.acoustics import image_statistics as statistics
-from mitsonar.acoustics.sonar_losses import loss_of
+from mitsonar.acoustics import statistics
+from mitsonar.acoustics.water import loss_of
 from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["glow_by_beam", "moved_correlation", "near_glow", "volume"]
@@ -46,7 +46,7 @@ def near_glow(flat: Array, noise: float, range_m: Array) -> tuple[float, float] 
     """Return the noise at range 0 above the noise behind [dB], and the range at which it is gone [m]; None without glow.
 
     Two straight lines in dB are fitted to the medians of the first quarter of the bins, from the
-    highest of the first :data:`~mitsonar.acoustics.image_statistics.GLOW_BINS` on. The first one is the glow.
+    highest of the first :data:`~mitsonar.acoustics.statistics.GLOW_BINS` on. The first one is the glow.
 
     Args:
         flat: intensities before the gain ``(frames, bins, beams)``.

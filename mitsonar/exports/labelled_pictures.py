@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.sonar_losses import noise_of
+from mitsonar.acoustics.water import noise_of
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry.scan_conversion import nearest_cells
 from mitsonar.plotting.fan_pictures import FanPictures

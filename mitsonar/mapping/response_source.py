@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.signal_to_noise import snr_of, snr_said
+from mitsonar.acoustics.noise import snr_of, snr_said
 from mitsonar.datasets.response_packing import with_noise
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.trajectory import Trajectory

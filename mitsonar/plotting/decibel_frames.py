@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mitsonar.acoustics.coding import decoded
+from mitsonar.acoustics.levels import decoded
 from mitsonar.errors import MitsonarError
 from mitsonar.records.sonar_frames import SonarFrames, to_float32
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.effective_mu import FLATTEST
+from mitsonar.acoustics.materials import FLATTEST
 from mitsonar.arrays import AnyArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar

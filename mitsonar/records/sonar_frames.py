@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.coding import decoded
+from mitsonar.acoustics.levels import decoded
 from mitsonar.errors import MitsonarError, shortened
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.io.files import read_npz, refuse_beyond_memory
@@ -21,7 +21,7 @@ from mitsonar.records.columns import Column, check_column, number_of, open_group
 __all__ = ["LABELS", "LEVELS", "SonarFrames", "to_float32", "to_uint8"]
 
 LEVELS = ("linear", "dB", "gamma", "contrast")
-"""How image values stand for level; ``contrast`` is :class:`~mitsonar.acoustics.local_contrast.LocalContrast`'s."""
+"""How image values stand for level; ``contrast`` is :class:`~mitsonar.acoustics.levels.LocalContrast`'s."""
 
 FLOOR_DB = -100.0
 """Least level over full scale [dB]: an image has zeros."""

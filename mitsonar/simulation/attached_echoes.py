@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mitsonar.acoustics.echo_level import level
+from mitsonar.acoustics.levels import level
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.device_arrays import DeviceArray
@@ -75,7 +75,7 @@ def _reflectivity(si: mi.SurfaceInteraction3f, active: DeviceArray) -> DeviceArr
 
 @dataclass(frozen=True)
 class _Echo:
-    """What :func:`mitsonar.acoustics.echo_level.level` reads of an echo."""
+    """What :func:`mitsonar.acoustics.levels.level` reads of an echo."""
 
     reflectivity: DeviceArray
     cosine: DeviceArray

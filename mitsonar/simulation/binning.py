@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.echo_level import level
+from mitsonar.acoustics.levels import level
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import View
 from mitsonar.records.echoes import Echoes

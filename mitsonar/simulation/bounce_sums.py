@@ -160,7 +160,7 @@ class BounceSums:
         return found
 
     def _levels(self, arrival: Arrival, echoes: Echoes) -> Echoes:
-        """Return arrivals as echoes of which :func:`mitsonar.acoustics.echo_level.level` makes their level."""
+        """Return arrivals as echoes of which :func:`mitsonar.acoustics.levels.level` makes their level."""
         radius, distance = (dr.select(v > self.nearest, v, self.nearest) for v in (arrival.range_m, arrival.distance))
         return replace(
             echoes,

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.acoustics.materials import check_channel_mirrors
 from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
-from mitsonar.instruments.mirror_rules import check_channel_mirrors
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.impulse_responses import ImpulseResponses

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mitsonar.acoustics.noise import uniform
-from mitsonar.acoustics.sonar_losses import gain_of, loss_notes, loss_of
+from mitsonar.acoustics.water import gain_of, loss_notes, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.beams import series, shaded_sinc
 from mitsonar.instruments.sonar import Quality, Sonar

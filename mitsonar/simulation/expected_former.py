@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.sonar_losses import loss_of, sonar_absorption, undone_absorption
+from mitsonar.acoustics.water import loss_of, sonar_absorption, undone_absorption
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.beams import Pulse
 from mitsonar.instruments.sonar import RAYS, Sonar

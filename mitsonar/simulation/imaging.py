@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
-from mitsonar.acoustics.sonar_losses import loss_notes
+from mitsonar.acoustics.water import loss_notes
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_path
 from mitsonar.motion.bodies import BodyStates

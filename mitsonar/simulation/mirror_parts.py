@@ -2,7 +2,7 @@
 
 A shape of reflection coefficient V and rms height h reflects the amplitude ``V exp(-2 k^2 h^2 cos^2)`` as a mirror: its
 energy is ``V^2 exp(-4 k^2 h^2 cos^2)``. What it scatters is multiplied by ``1 - exp(-4 k^2 h^2 cos^2)``. Both are the laws
-of :mod:`mitsonar.acoustics.backscatter`.
+of :mod:`mitsonar.acoustics.materials`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.backscatter import Material
+from mitsonar.acoustics.materials import Material
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.plugins.material_laws import material_of
 from mitsonar.plugins.surfaces import Hit

@@ -8,8 +8,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mitsonar.acoustics.materials import check_image_mirrors
 from mitsonar.errors import MitsonarError
-from mitsonar.instruments.mirror_rules import check_image_mirrors
 from mitsonar.instruments.sonar import Sonar, group_of_beams, one_beam, scans, turned_heads
 from mitsonar.instruments.views import View, Whole
 from mitsonar.motion.pose import refuse_beyond_reach

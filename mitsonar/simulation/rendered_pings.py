@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.coding import coded
+from mitsonar.acoustics.levels import coded
 
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.bottom_detection import Detected, first_echoes, strongest_echoes
-from mitsonar.acoustics.sonar_losses import gain_of
+from mitsonar.acoustics.levels import Detected, first_echoes, strongest_echoes
+from mitsonar.acoustics.water import gain_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.motion.trajectory import Trajectory

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from numpy.typing import ArrayLike
 
-from mitsonar.acoustics.echo_level import largest_level
+from mitsonar.acoustics.levels import largest_level
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import Segment, View, Whole
 from mitsonar.records.echoes import Echoes

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mitsonar.acoustics.backscatter import named_materials
+from mitsonar.acoustics.materials import named_materials
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.worlds.imported_view import view_of_objects

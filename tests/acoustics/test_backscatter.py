@@ -12,23 +12,21 @@ import pytest
 from scipy import integrate
 from scipy.special import j0
 
-from mitsonar.acoustics.backscatter import (
+from mitsonar.acoustics.materials import (
     GRAZING_DEG,
     LARGEST_MU,
     LAWS,
     Material,
+    Sediment,
     band_warning,
     material,
     mirror_amplitude,
     named_materials,
-    sigma_at,
-    sigma_table,
-)
-from mitsonar.acoustics.rough_fluid import (
-    Sediment,
     reflection,
     rough_fluid_sigma,
     roughness_sigma,
+    sigma_at,
+    sigma_table,
     structure_constant,
     structure_integral,
     volume_sigma,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.acoustics.coding import coded, decoded
+from mitsonar.acoustics.levels import coded, decoded
 from mitsonar.instruments.sonar import Coding, Sonar
 
 

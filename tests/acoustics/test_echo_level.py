@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.acoustics.echo_level import largest_level, level
+from mitsonar.acoustics.levels import largest_level, level
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.echoes import CHANNELS, Echoes
 

@@ -5,15 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.acoustics.backscatter import GRAZING_DEG, Material, material, sigma_at, sigma_table
-from mitsonar.acoustics.effective_mu import (
+from mitsonar.acoustics.materials import (
     FLATTEST,
+    GRAZING_DEG,
+    Material,
     depends_on_frequency,
     hearing_notes,
+    material,
     mu_at,
     mu_table,
     normal_mu,
     reference_hz,
+    sigma_at,
+    sigma_table,
     single_mu,
 )
 

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsonar.acoustics.backscatter import material, sigma_table
-from mitsonar.acoustics.grain_size import SEDIMENTS, sediment_of
-from mitsonar.acoustics.rough_fluid import reflection
+from mitsonar.acoustics.materials import SEDIMENTS, material, reflection, sediment_of, sigma_table
 from mitsonar.errors import MitsonarError
 
 JACKSON = {  # density, speed, loss, spectral strength in the project hyo2_openbst, after a program of D. R. Jackson

@@ -7,8 +7,8 @@ import pytest
 from helpers import Array
 from scipy import ndimage, special
 
-from mitsonar.acoustics import image_statistics as statistics
-from mitsonar.acoustics.image_statistics import decibels
+from mitsonar.acoustics import statistics
+from mitsonar.acoustics.statistics import decibels
 
 SHAPE = (4, 248, 90)
 

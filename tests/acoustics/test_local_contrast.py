@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from mitsonar.acoustics.local_contrast import SMOOTHINGS, LocalContrast, alike, fitted_contrast
+from mitsonar.acoustics.levels import SMOOTHINGS, LocalContrast, alike, fitted_contrast
 
 BINS, BEAMS = 256, 96
 

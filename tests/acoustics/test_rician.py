@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special
 
-from mitsonar.acoustics.rician import rician_information, score_shares
+from mitsonar.acoustics.speckle import rician_information, score_shares
 
 Array = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 

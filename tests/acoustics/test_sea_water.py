@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mitsonar.acoustics.sea_water import (
+from mitsonar.acoustics.water import (
     Formula,
     Water,
     absorption_db_per_m,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mitsonar.acoustics.sonar_losses import absorption_line, loss_notes, sonar_absorption
+from mitsonar.acoustics.water import absorption_line, loss_notes, sonar_absorption
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
 

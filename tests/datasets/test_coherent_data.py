@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import files_of, tiny_recipe
 
-from mitsonar.acoustics.coding import coded
+from mitsonar.acoustics.levels import coded
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import Command, files_of, impulse_recipe, refused, run_python, tiny_recipe
 
-from mitsonar.acoustics.signal_to_noise import snr_of
+from mitsonar.acoustics.noise import snr_of
 from mitsonar.config.data_recipe import load_recipe, shipped_recipes
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset

@@ -47,7 +47,7 @@ from zarr.abc.codec import BytesBytesCodec
 from zarr.registry import register_codec
 
 import mitsonar
-from mitsonar.acoustics.backscatter import material
+from mitsonar.acoustics.materials import material
 from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.records.impulse_responses import ImpulseResponses

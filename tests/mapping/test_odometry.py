@@ -17,7 +17,7 @@ from helpers import files_of, lit_plane, tiny_recipe
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.local_contrast import LocalContrast
+from mitsonar.acoustics.levels import LocalContrast
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import AnyEstimator, Estimate

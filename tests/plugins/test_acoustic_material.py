@@ -12,8 +12,7 @@ import pytest
 import yaml
 from helpers import MitsubaDict, diffuse, essence, floor, scene
 
-from mitsonar.acoustics.backscatter import GRAZING_DEG, material, sigma_at, sigma_table
-from mitsonar.acoustics.effective_mu import mu_at, mu_table, single_mu
+from mitsonar.acoustics.materials import GRAZING_DEG, material, mu_at, mu_table, sigma_at, sigma_table, single_mu
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import box, diffuse, floor, run_python, scene, sphere
 
-from mitsonar.acoustics.echo_level import largest_level
+from mitsonar.acoustics.levels import largest_level
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory

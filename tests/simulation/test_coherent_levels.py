@@ -12,7 +12,7 @@ from helpers import Array, diffuse, essence, floor, scene
 from scipy import special
 from scipy.ndimage import uniform_filter
 
-from mitsonar.acoustics.sonar_losses import gain_of, sonar_absorption
+from mitsonar.acoustics.water import gain_of, sonar_absorption
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.simulation.imaging import Simulator

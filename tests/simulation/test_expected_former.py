@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import Array, diffuse, essence, floor, scene, sphere
 
-from mitsonar.acoustics.sonar_losses import sonar_absorption
+from mitsonar.acoustics.water import sonar_absorption
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import named_sonars, preset

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import Array, box, diffuse, essence, floor, plate, scene, sphere
 
-from mitsonar.acoustics.backscatter import Material, material, mirror_amplitude
+from mitsonar.acoustics.materials import Material, material, mirror_amplitude
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsonar.acoustics.bottom_detection import first_echoes, strongest_echoes
+from mitsonar.acoustics.levels import first_echoes, strongest_echoes
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder, load_sounder
 from mitsonar.motion.pose import Pose

@@ -1,7 +1,7 @@
 """The Cramer-Rao lower bound of motion in the model ``coherent``, whose pixels are |s + n|: speckle s, receiver's noise n.
 
 *Grain known*: an oracle owns the scatterers, so s is a function of the pose. A pixel has the Rice law
-(:mod:`mitsonar.acoustics.rician`), and what changes with the motion is |s|^2. Only amplitudes are observed: the phase of s,
+(:mod:`mitsonar.acoustics.speckle`), and what changes with the motion is |s|^2. Only amplitudes are observed: the phase of s,
 which turns once in a quarter of a millimetre, tells nothing. Neighbouring cells share noise.
 
 *Ground known*: an oracle knows the expected level of every cell, as that of the other models does, but no scatterers: each
@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.acoustics.coding import coding_slope
-from mitsonar.acoustics.rician import rician_information, score_shares
+from mitsonar.acoustics.levels import coding_slope
+from mitsonar.acoustics.speckle import rician_information, score_shares
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.fisher_bound import Bound, fisher_by
 from mitsonar.estimation.crlb.score_covariance import CellCorrelation, ScoreCovariance

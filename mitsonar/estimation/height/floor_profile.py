@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 class FloorProfile:
     """The range profile of level ground of constant reflectivity, as a curve over range / height.
 
-    Levels are those of :func:`mitsonar.acoustics.echo_level.level`: a ray's cosine in the ``thesis`` model; cosine, solid
+    Levels are those of :func:`mitsonar.acoustics.levels.level`: a ray's cosine in the ``thesis`` model; cosine, solid
     angle, spreading and gain in ``physical``.
 
     Args:

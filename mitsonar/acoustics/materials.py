@@ -1,0 +1,787 @@
+"""Backscatter of surfaces: a material is a table of its scattering cross-section over the grazing angle.
+
+The cross-section sigma is that per unit area and steradian [1/sr], for sound that returns where it came from.
+``10 log sigma`` is the bottom scattering strength. The grazing angle lies between ray and surface; its sine is the cosine
+of incidence.
+
+The simulator's reflectivity C is Lambert's mu itself, not pi mu. A surface of C = 1 scatters pi times what arrives, 5 dB
+more than it can. A material's mu is physical: ``pi mu`` is at most 1. Where C is to mean the share that is scattered, mu is
+C / pi.
+
+Named materials are one YAML file each in ``materials/``, every number with its source. In a source ``(not seen)`` marks a
+number that is widely quoted from a document which could not be read when this was written, ``second hand`` one that a third
+party quotes from the named document, ``ours`` a choice or our own arithmetic.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+import yaml
+from array_api_compat import array_namespace, device
+from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, Field, model_validator
+from scipy.special import hankel1
+
+from mitsonar.arrays import AnyArray
+from mitsonar.errors import MitsonarError, argument, nearest_names, shortened
+from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.views import View, Whole
+from mitsonar.io.checked_model import CheckedModel
+from mitsonar.io.files import PlainValue, read_yaml
+
+__all__ = [
+    "COARSEST_PHI",
+    "FINEST_PHI",
+    "FLATTEST",
+    "GRAZING_DEG",
+    "LAWS",
+    "SEDIMENTS",
+    "Law",
+    "Material",
+    "MuTable",
+    "NamedMaterial",
+    "Sediment",
+    "band_warning",
+    "check_channel_mirrors",
+    "check_image_mirrors",
+    "depends_on_frequency",
+    "hearing_notes",
+    "material",
+    "mirror_amplitude",
+    "mu_at",
+    "mu_table",
+    "named_materials",
+    "normal_mu",
+    "reference_hz",
+    "rough_fluid_sigma",
+    "roughness_sigma",
+    "sediment_of",
+    "sigma_at",
+    "sigma_table",
+    "single_mu",
+    "structure_integral",
+    "volume_sigma",
+]
+
+
+# ---------------- Materials as rays read them: the reflectivity, Lambert's mu, that scatters as much at a ray's angle
+# A surface of cross-section sigma at the grazing angle g has the effective reflectivity C = sigma / sin^2 g. A ray then
+# needs one number, whatever the law is. The sine of the grazing angle is the cosine of incidence.
+
+
+FLATTEST = 1e-3
+"""Sine of the flattest grazing angle that a law is asked for; flatter, its reflectivity stays what it is there."""
+
+POWERS = {"lambert": 2, "lommel-seeliger": 1, "rough-fluid": 2, "table": 0}
+"""Power of the sine that is taken out of each law's table, so that what is left is smooth between whole degrees."""
+
+UNBOUNDED_HZ = 100e3
+"""Frequency at which a material without a band is taken where the sonar has none [Hz]."""
+
+
+class MuTable(NamedTuple):
+    """A law as ``C = value sin^(power - 2)``, linear between whole degrees.
+
+    Attributes:
+        values: at grazing angles of 0, 1 ... 90 deg ``(91,)``.
+        power: of the sine that was taken out of the cross-sections.
+    """
+
+    values: NDArray[np.float64]
+    power: int
+
+
+def mu_table(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> MuTable:
+    """Compute the table of a material's effective reflectivity [1/sr].
+
+    A law ``lambert`` is constant, exactly. Between whole degrees a ``table`` is linear in sigma, as ``sigma_at`` is;
+    ``rough-fluid`` is linear in C, which meets the law within 2 % from 5 deg on, and 12 % at 1.5 deg.
+
+    Args:
+        material: the material.
+        frequency_hz: of the carrier.
+        sound_speed_m_s: in the water.
+
+    Raises:
+        MitsonarError: a frequency or speed that is not above 0.
+    """
+    power = POWERS[material.law]
+    sigma = sigma_table(material, frequency_hz, sound_speed_m_s)
+    sine = np.sin(np.radians(GRAZING_DEG))
+    values = sigma.copy()
+    if power:
+        values[1:] = sigma[1:] / sine[1:] ** power
+        values[0] = max(0.0, 2 * values[1] - values[2])
+    return MuTable(values, power)
+
+
+def mu_at(table: MuTable, cosine: ArrayLike) -> NDArray[np.float64]:
+    """Compute the effective reflectivity at angles of incidence, as rays read it, in float64.
+
+    It is bounded by 1 / cosine, or a sonar's sums could overflow: cross-sections above the cosine are clipped to it.
+
+    Args:
+        table: of :func:`mu_table`.
+        cosine: of the angle between ray and normal ``(...)``, 0..1; at least :data:`FLATTEST` counts.
+    """
+    given = np.asarray(cosine, dtype=np.float64)
+    steep = np.maximum(given, FLATTEST)
+    degrees = np.degrees(np.arcsin(np.minimum(given, 1.0)))
+    law = np.interp(degrees, GRAZING_DEG, table.values) * steep ** (table.power - 2)
+    return np.asarray(np.minimum(law, 1 / steep))
+
+
+def single_mu(material: Material, frequency_hz: float | None = None, sound_speed_m_s: float = 1500.0) -> float:
+    """Return one reflectivity for all angles: mu of the law ``lambert``, else sigma / sin^2 at 45 deg of grazing [1/sr].
+
+    Impulse responses use it. A mirror part is not taken off.
+
+    Args:
+        material: the material.
+        frequency_hz: of the carrier; default: :func:`reference_hz`.
+        sound_speed_m_s: in the water.
+    """
+    if material.law == "lambert" and material.mu is not None:
+        return material.mu
+    frequency = reference_hz(material) if frequency_hz is None else frequency_hz
+    return 2 * float(sigma_table(material, frequency, sound_speed_m_s)[45])
+
+
+def normal_mu(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> float:
+    """Return the reflectivity of the model ``thesis``: the law's mu, or sigma at normal incidence without one [1/sr]."""
+    return float(sigma_table(material, frequency_hz, sound_speed_m_s)[90]) if material.mu is None else material.mu
+
+
+def reference_hz(material: Material) -> float:
+    """Return the frequency at which a material is taken where none is given: the middle of its band, or its only end."""
+    low, high = material.band_hz
+    if low and math.isfinite(high):
+        return math.sqrt(low * high)
+    return low or (high if math.isfinite(high) else UNBOUNDED_HZ)
+
+
+def depends_on_frequency(material: Material) -> bool:
+    """Return whether a material's cross-section depends on the frequency."""
+    return material.law == "rough-fluid" or material.has_mirror
+
+
+def hearing_notes(materials: Sequence[Material], frequency_hz: float | None, sound_speed_m_s: float = 1500.0) -> list[str]:
+    """Say in a sentence each what a user should know about materials at a sonar's frequency.
+
+    They are: a frequency that is not given, one outside a material's band, and cross-sections that are clipped.
+
+    Args:
+        materials: of a scene.
+        frequency_hz: of the sonar; None where it has none.
+        sound_speed_m_s: in the water.
+    """
+    notes = []
+    for one in materials:
+        if frequency_hz is None and depends_on_frequency(one):
+            notes.append(
+                f"the sonar has no frequency_hz: material {one.name} is taken at {reference_hz(one) / 1000:,.4g} kHz; give "
+                "the sonar its carrier"
+            )
+        warning = None if frequency_hz is None else band_warning(one, frequency_hz)
+        notes += [warning] if warning else []
+        sigma = sigma_table(one, frequency_hz or reference_hz(one), sound_speed_m_s)
+        above = np.flatnonzero(sigma[1:] > np.sin(np.radians(GRAZING_DEG[1:])) * (1 + 1e-9)) + 1
+        if len(above):
+            notes.append(
+                f"material {one.name} scatters more than sonars can sum: sigma above the sine of the grazing angle is "
+                f"clipped to it, from {above[0]} to {above[-1]} deg"
+            )
+    return notes
+
+
+# ---------------- The sediment of a mean grain size, -1 phi (sandy gravel) to 9 phi (clay), as numbers of a rough fluid
+# The regressions are those of APL-UW TR 9407 (1994), section IV, which could not be read: they are quoted from memory
+# of the literature. At 0.5, 1.5, 2.5 and 6 phi they give the numbers of a program of D. R. Jackson as the project
+# hyo2_openbst has them, which is a second route (``tests/acoustics/test_grain_size.py``). They hold for 10 to 100 kHz.
+
+
+COARSEST_PHI, FINEST_PHI = -1.0, 9.0
+"""Grain sizes that the regressions cover: phi is minus the logarithm to base 2 of the diameter in mm."""
+
+SEDIMENTS: dict[str, float] = {
+    "sandy gravel": -1.0,
+    "very coarse sand": -0.5,
+    "muddy sandy gravel": 0.0,
+    "coarse sand": 0.5,
+    "gravelly muddy sand": 1.0,
+    "medium sand": 1.5,
+    "muddy gravel": 2.0,
+    "fine sand": 2.5,
+    "muddy sand": 3.0,
+    "very fine sand": 3.5,
+    "clayey sand": 4.0,
+    "coarse silt": 4.5,
+    "sandy silt": 5.0,
+    "medium silt": 5.5,
+    "sandy mud": 6.0,
+    "fine silt": 6.5,
+    "sandy clay": 7.0,
+    "very fine silt": 7.5,
+    "silty clay": 8.0,
+    "clay": 9.0,
+}
+"""Names of sediments, and the grain size that stands for each [phi]."""
+
+SPECTRAL_EXPONENT = 3.25
+
+WATER_M_S = 1528.0
+"""Speed of sound of the water that attenuations refer to [m/s]."""
+
+LOSS_OF_ATTENUATION = 2.302585093 / (40 * 3.141592654) * 1e-3
+"""Loss parameter of an attenuation of 1 dB/m/kHz and a speed of 1 m/s."""
+
+
+def sediment_of(phi: float) -> Sediment:
+    """Return the rough fluid that stands for a sediment of a mean grain size.
+
+    Args:
+        phi: mean grain size, -1..9.
+
+    Raises:
+        MitsonarError: a grain size outside the regressions.
+    """
+    if not COARSEST_PHI <= phi <= FINEST_PHI:
+        raise MitsonarError(
+            f"{argument('grain_size_phi')} must lie in {COARSEST_PHI:g}..{FINEST_PHI:g}, sandy gravel to clay: got "
+            f"{shortened(phi)}; give rock the named material, or numbers of your own"
+        )
+    speed = _speed_ratio(phi)
+    return Sediment(
+        density_ratio=_density_ratio(phi),
+        sound_speed_ratio=speed,
+        loss=_attenuation(phi) * speed * WATER_M_S * LOSS_OF_ATTENUATION,
+        volume=0.002 if phi < 5.5 else 0.001,
+        spectral_exponent=SPECTRAL_EXPONENT,
+        spectral_strength=_strength(phi),
+    )
+
+
+def _density_ratio(phi: float) -> float:
+    if phi < 1:
+        return 0.007797 * phi**2 - 0.17057 * phi + 2.3139
+    if phi < 5.3:
+        return -0.0165406 * phi**3 + 0.2290201 * phi**2 - 1.1069031 * phi + 3.0455
+    return -0.0012973 * phi + 1.1565
+
+
+def _speed_ratio(phi: float) -> float:
+    if phi < 1:
+        return 0.002709 * phi**2 - 0.056452 * phi + 1.2778
+    if phi < 5.3:
+        return -0.0014881 * phi**3 + 0.0213937 * phi**2 - 0.1382798 * phi + 1.3425
+    return -0.0024324 * phi + 1.0019
+
+
+def _attenuation(phi: float) -> float:
+    """Return the attenuation [dB/m/kHz]."""
+    if phi < 0:
+        return 0.4556
+    if phi < 2.6:
+        return 0.4556 + 0.0245 * phi
+    if phi < 4.5:
+        return 0.1978 + 0.1245 * phi
+    if phi < 6:
+        return 8.0399 - 2.5228 * phi + 0.20098 * phi**2
+    return max(0.0601, 0.9431 - 0.2041 * phi + 0.0117 * phi**2)
+
+
+def _strength(phi: float) -> float:
+    """Return the strength of the spectrum of heights [m^(4 - 3.25)], from that in cm^4 at 1 / cm."""
+    height_cm = (2.03846 - 0.26923 * phi) / (1 + 0.076923 * phi) if phi < 5 else 0.5
+    centimetre = 0.01
+    return float(0.00207 * height_cm**2 * centimetre**4 * centimetre**-SPECTRAL_EXPONENT)
+
+
+# ---------------- Backscatter of a sea floor that is a rough, absorbing fluid with scatterers within: roughness and
+# volume added
+# Roughness is the small-slope approximation of first order for a power-law spectrum. It becomes the Kirchhoff
+# approximation near normal incidence and first-order perturbation at low grazing angles, without a rule to join them
+# (Jackson and Richardson, High-Frequency Seafloor Acoustics, 2007). APL-UW TR 9407 (1994) joins the same two limits by
+# an interpolation, averages the second over the slopes of the large roughness, and has a law of its own for rock; these
+# three parts are not here. The volume term is that of TR 9407 and of Mourad and Jackson (1989).
+#
+# Not modelled: shear waves (rock), layers, gas, scattering more than once. Slopes must be small: far above 100 kHz rough
+# floors scatter more at low angles than at steep ones, which is a fault of the approximation.
+
+
+Angles = NDArray[np.float64]
+
+LOWEST_COSINE = 1e-5
+"""Cosine that stands for normal incidence, where the formula is 0 / 0."""
+
+
+class Sediment(NamedTuple):
+    """A rough fluid below water.
+
+    Attributes:
+        density_ratio: rho, density over that of the water.
+        sound_speed_ratio: nu, speed of sound over that of the water.
+        loss: delta, imaginary over real part of the wavenumber.
+        volume: sigma_2, volume scattering cross-section per unit volume and steradian over the attenuation in dB per length.
+        spectral_exponent: gamma of the spectrum of heights ``W(K) = w K^-gamma``, 2..4. The integral of W over the plane of
+            wave vectors is the mean square height.
+        spectral_strength: w [m^(4 - gamma)].
+    """
+
+    density_ratio: float
+    sound_speed_ratio: float
+    loss: float
+    volume: float
+    spectral_exponent: float
+    spectral_strength: float
+
+
+def rough_fluid_sigma(sediment: Sediment, grazing_rad: Angles, wavenumber: float) -> Angles:
+    """Compute the scattering cross-section per unit area and steradian ``(n,)`` [1/sr].
+
+    Args:
+        sediment: the sea floor.
+        grazing_rad: angle between ray and surface, 0..pi/2 ``(n,)``.
+        wavenumber: 2 pi f / c of the water [rad/m].
+    """
+    return roughness_sigma(sediment, grazing_rad, wavenumber) + volume_sigma(sediment, grazing_rad)
+
+
+def roughness_sigma(sediment: Sediment, grazing_rad: Angles, wavenumber: float) -> Angles:
+    """Compute the part of the roughness, ``sin^2 |Y|^2 I(q) / (8 pi cos^2)`` ``(n,)`` [1/sr].
+
+    Y is the factor of first-order perturbation for two fluids, I the integral of :func:`structure_integral`, and
+    ``q = 2 C^2 k^2 sin^2 (2 k cos)^(-2 alpha)`` with ``alpha = gamma / 2 - 1`` and the structure constant C^2.
+
+    Args:
+        sediment: the sea floor.
+        grazing_rad: angle between ray and surface, 0..pi/2 ``(n,)``.
+        wavenumber: of the water [rad/m].
+    """
+    sine, cosine = np.sin(grazing_rad), np.maximum(np.cos(grazing_rad), LOWEST_COSINE)
+    alpha = sediment.spectral_exponent / 2 - 1
+    below = _sine_below(sediment, cosine)
+    rho, kappa = sediment.density_ratio, _relative_wavenumber(sediment)
+    factor = ((rho - 1) ** 2 * cosine**2 + rho**2 - kappa**2) / (rho * sine + below) ** 2
+    q = 2 * structure_constant(sediment) * (wavenumber * sine) ** 2 * (2 * wavenumber * cosine) ** (-2 * alpha)
+    return np.asarray((sine * np.abs(factor) / cosine) ** 2 * structure_integral(q, alpha) / (8 * math.pi))
+
+
+def structure_constant(sediment: Sediment) -> float:
+    """Return C^2 [m^(2 - 2 alpha)]: heights a distance r apart differ by ``C^2 r^(2 alpha)`` in the mean square."""
+    alpha = sediment.spectral_exponent / 2 - 1
+    gammas = math.gamma(2 - alpha) / (alpha * (1 - alpha) * math.gamma(1 + alpha))
+    return 2 * math.pi * sediment.spectral_strength * 2 ** (-2 * alpha) * gammas
+
+
+def structure_integral(q: Angles, alpha: float) -> Angles:
+    """Compute ``I(q)``, the integral of ``exp(-q u^(2 alpha)) J0(u) u`` over u from 0, ``(n,)``.
+
+    J0 is the real part of a Hankel function. On a ray turned into the upper half of the complex plane both factors decay; a
+    sum over even steps of log u then converges exponentially. Below q = 1 the integral of ``H0(u) u``, which is zero, is
+    taken away first.
+
+    Args:
+        q: 0 or more ``(n,)``.
+        alpha: 0..1, both excluded.
+    """
+    turn = min(math.pi / 4, math.pi / (8 * alpha))
+    found = np.zeros_like(q)
+    for k, one in enumerate(q):
+        if one > 0:
+            begin, end = -19.0, math.log(40 / math.sin(turn))  # of log u: beyond, nothing is left
+            if one >= 1:
+                begin -= math.log(one) / (2 * alpha)
+                end = min(end, math.log(40 / (one * math.cos(2 * alpha * turn))) / (2 * alpha))
+            t = np.exp(np.arange(begin, end, 0.04))
+            u = t * np.exp(1j * turn)
+            exponent = -one * t ** (2 * alpha) * np.exp(2j * alpha * turn)
+            decay = np.exp(exponent) if one >= 1 else np.expm1(exponent)
+            found[k] = 0.04 * np.sum(decay * hankel1(0, u) * u * u).real
+    return found
+
+
+def volume_sigma(sediment: Sediment, grazing_rad: Angles) -> Angles:
+    """Compute the part of the volume ``(n,)`` [1/sr]: ``5 delta sigma_2 |1 - V^2|^2 sin^2 / (nu ln 10 |P|^2 Im P)``.
+
+    V is the reflection coefficient, P the sine of the grazing angle below the surface times its relative wavenumber.
+
+    Args:
+        sediment: the sea floor.
+        grazing_rad: angle between ray and surface, 0..pi/2 ``(n,)``.
+    """
+    sine, below = np.sin(grazing_rad), _sine_below(sediment, np.cos(grazing_rad))
+    through = np.abs(1 - reflection(sediment, grazing_rad) ** 2) ** 2 * sine**2
+    scale = 5 * sediment.loss * sediment.volume / (sediment.sound_speed_ratio * math.log(10))
+    return np.asarray(scale * through / (np.abs(below) ** 2 * below.imag))
+
+
+def reflection(sediment: Sediment, grazing_rad: Angles) -> NDArray[np.complex128]:
+    """Compute the reflection coefficient of the flat surface, of pressures ``(n,)``."""
+    ratio = sediment.density_ratio * np.sin(grazing_rad) / _sine_below(sediment, np.cos(grazing_rad))
+    return np.asarray((ratio - 1) / (ratio + 1))
+
+
+def _relative_wavenumber(sediment: Sediment) -> complex:
+    """Return kappa, the wavenumber below over that of the water."""
+    return (1 + 1j * sediment.loss) / sediment.sound_speed_ratio
+
+
+def _sine_below(sediment: Sediment, cosine: Angles) -> NDArray[np.complex128]:
+    """Return P, the vertical wavenumber below over the wavenumber of the water ``(n,)``."""
+    return np.asarray(np.sqrt(_relative_wavenumber(sediment) ** 2 - cosine**2))
+
+
+# ---------------- backscatter
+
+
+Law = Literal["lambert", "lommel-seeliger", "rough-fluid", "table"]
+
+GRAZING_DEG = np.arange(91.0)
+"""Grazing angles of every table [deg]."""
+
+LAWS: dict[str, tuple[str, ...]] = {
+    "lambert": ("mu",),
+    "lommel-seeliger": ("mu",),
+    "rough-fluid": ("density_ratio", "sound_speed_ratio", "loss", "volume", "spectral_exponent", "spectral_strength"),
+    "table": ("strength_db",),
+}
+"""Laws of scattering, and the keys that each needs."""
+
+MIRROR = ("reflection", "roughness_m")
+"""Keys of the mirror part, both or none; ``lambert`` and ``lommel-seeliger`` may have them."""
+
+LARGEST_MU = {"lambert": 1 / math.pi, "lommel-seeliger": 1 / (4 * math.pi)}
+"""The mu of each law at which some direction of arrival is scattered without loss."""
+
+
+class Material(CheckedModel):
+    """What a surface is made of: a law of scattering with its numbers, where they hold and where they come from."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    called: ClassVar[str] = "material"
+
+    name: str = Field("custom", max_length=200, description="what the material is called")
+    about: str = Field("", max_length=2000, description="what it stands for")
+    source: str = Field("", max_length=20_000, description="where its numbers come from")
+    law: Law = Field("lambert", description="lambert, lommel-seeliger, rough-fluid or table")
+    mu: float | None = Field(None, gt=0, le=1 / math.pi, description="cross-section at normal incidence [1/sr]")
+    reflection: float | None = Field(
+        None, ge=-1, le=1, description="reflection coefficient of the mirror part, of pressures; -1: the sea surface"
+    )
+    roughness_m: float | None = Field(None, ge=0, le=1, description="rms height of the roughness of the mirror part [m]")
+    density_ratio: float | None = Field(None, ge=0.5, le=20, description="density over that of water")
+    sound_speed_ratio: float | None = Field(None, ge=0.5, le=6, description="speed of sound over that of water")
+    loss: float | None = Field(None, ge=1e-5, le=0.5, description="imaginary over real part of the wavenumber")
+    volume: float | None = Field(None, ge=0, le=1, description="volume cross-section over attenuation in dB")
+    spectral_exponent: float | None = Field(None, ge=2.4, le=3.9, description="exponent of the spectrum of heights")
+    spectral_strength: float | None = Field(
+        None, gt=0, le=1, description="strength of the spectrum of heights [m^(4 - exponent)]"
+    )
+    strength_db: tuple[Annotated[float, Field(ge=-300, le=60)], ...] | None = Field(
+        None, min_length=91, max_length=91, description="10 log sigma at grazing angles of 0, 1 ... 90 deg [dB]"
+    )
+    frequency_min_hz: float | None = Field(None, gt=0, le=1e9, description="lowest frequency at which the numbers hold [Hz]")
+    frequency_max_hz: float | None = Field(None, gt=0, le=1e9, description="highest frequency at which they hold [Hz]")
+
+    @classmethod
+    def create(cls, **fields: PlainValue) -> Self:
+        """Create a material with these fields.
+
+        Raises:
+            MitsonarError: an unknown key, a value outside its limits, or keys that do not fit the law.
+        """
+        return cls(**fields)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        mirror = MIRROR if self.law in LARGEST_MU else ()
+        given = [key for keys in (*LAWS.values(), MIRROR) for key in keys if getattr(self, key) is not None]
+        lacking = [key for key in LAWS[self.law] if key not in given]
+        strange = [key for key in given if key not in LAWS[self.law] + mirror]
+        if lacking:
+            raise ValueError(
+                f"a material of law {self.law} needs {', '.join(LAWS[self.law])}: it lacks {', '.join(lacking)}"
+            )
+        if strange:
+            known = ", ".join(LAWS[self.law] + mirror)
+            raise ValueError(f"a material of law {self.law} has no key {strange[0]}: its keys are {known}")
+        if (self.reflection is None) != (self.roughness_m is None):
+            raise ValueError("a mirror part needs both reflection and roughness_m: got one; give both or none")
+        low, high = self.band_hz
+        if high <= low:
+            raise ValueError(f"frequency_max_hz must exceed frequency_min_hz: got {high:g} <= {low:g}")
+        if self.mu is not None:
+            self._check_energy(self.mu)
+        return self
+
+    def _check_energy(self, mu: float) -> None:
+        """Refuse a mu by which more would be scattered than arrives, or than a mirror part would return."""
+        most = LARGEST_MU[self.law] * (1.0 if self.reflection is None else self.reflection**2)
+        if mu > most * (1 + 1e-9):
+            than = "than arrives" if self.reflection is None else "than its reflection returns"
+            raise ValueError(f"mu of law {self.law} is at most {most:.4g}, or more is scattered {than}: got {mu:g}")
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Return the lowest and the highest frequency at which the numbers hold [Hz]; 0 and infinity where none is given."""
+        return self.frequency_min_hz or 0.0, self.frequency_max_hz or math.inf
+
+    @property
+    def has_mirror(self) -> bool:
+        """Return whether a part of the echo is a mirror's."""
+        return self.reflection is not None
+
+
+def band_warning(material: Material, frequency_hz: float) -> str | None:
+    """Say in one sentence where a frequency lies outside the band of a material; None where it lies within."""
+    low, high = material.band_hz
+    if low <= frequency_hz <= high:
+        return None
+    end = f"from {low / 1000:,.4g} kHz" if frequency_hz < low else f"to {high / 1000:,.4g} kHz"
+    return f"the numbers of material {material.name} hold {end}: {frequency_hz / 1000:,.4g} kHz is extrapolated"
+
+
+@lru_cache(maxsize=256)
+def sigma_table(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> NDArray[np.float64]:
+    """Compute the cross-sections of a material at :data:`GRAZING_DEG` ``(91,)`` [1/sr], read-only.
+
+    ====================  ==========================================================================================
+    law                   sigma at the grazing angle g
+    ====================  ==========================================================================================
+    ``lambert``           ``mu sin^2 g``: a matt surface
+    ``lommel-seeliger``   ``mu sin g``: grains that scatter once, evenly to all sides, each in the shadow of others
+    ``rough-fluid``       :mod:`mitsonar.acoustics.materials`
+    ``table``             as given
+    ====================  ==========================================================================================
+
+    With a mirror part, mu is what a fully rough surface scatters. The rest of the coherent echo of :func:`mirror_amplitude`
+    is scattered: mu is multiplied by ``1 - exp(-4 k^2 h^2 sin^2 g)``. Both together never exceed the reflection.
+
+    Args:
+        material: the material.
+        frequency_hz: of the carrier.
+        sound_speed_m_s: in the water.
+
+    Raises:
+        MitsonarError: a frequency or speed that is not above 0.
+    """
+    wavenumber = _wavenumber(frequency_hz, sound_speed_m_s)
+    grazing = np.radians(GRAZING_DEG)
+    sine = np.sin(grazing)
+    table: NDArray[np.float64]
+    match material.law:
+        case "lambert":
+            table = _number(material, "mu") * sine**2 * _rough_share(material, sine, wavenumber)
+        case "lommel-seeliger":
+            table = _number(material, "mu") * sine * _rough_share(material, sine, wavenumber)
+        case "rough-fluid":
+            sediment = Sediment(*(_number(material, key) for key in LAWS["rough-fluid"]))
+            table = rough_fluid_sigma(sediment, grazing, wavenumber)
+        case _:
+            table = 10.0 ** (np.asarray(material.strength_db) / 10)
+    table.flags.writeable = False
+    return table
+
+
+def sigma_at(material: Material, cosine: AnyArray, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> AnyArray:
+    """Gather the cross-section of a material at angles of incidence, linear between whole degrees, in float64 [1/sr].
+
+    Args:
+        material: the material.
+        cosine: of the angle between ray and normal ``(...)``, NumPy or torch; clipped to 0..1.
+        frequency_hz: of the carrier.
+        sound_speed_m_s: in the water.
+
+    Returns:
+        Like ``cosine``. A smooth law is met within 1e-4 of its largest value.
+
+    Raises:
+        MitsonarError: a frequency or speed that is not above 0.
+    """
+    cosine = np.asarray(cosine, dtype=np.float64) if isinstance(cosine, int | float) else cosine
+    xp = array_namespace(cosine)
+    table = sigma_table(material, float(frequency_hz), float(sound_speed_m_s))
+    values = xp.asarray(table.copy(), device=device(cosine))
+    place = xp.asin(xp.clip(xp.astype(cosine, xp.float64), 0.0, 1.0)) * (180.0 / math.pi)
+    below = xp.clip(xp.floor(place), 0.0, 89.0)
+    index = xp.reshape(xp.astype(below, xp.int64), (-1,))
+    low, high = (xp.reshape(xp.take(values, one, axis=0), place.shape) for one in (index, index + 1))
+    return low + (high - low) * (place - below)
+
+
+def mirror_amplitude(material: Material, cosine: AnyArray, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> AnyArray:
+    """Compute the coherent reflection coefficient of a rough mirror, ``V exp(-2 k^2 h^2 cos^2)``, of pressures.
+
+    V is ``reflection``, taken the same at all angles, h ``roughness_m``, k the wavenumber. The factor is that of Gaussian
+    heights in Kirchhoff's approximation (Jackson and Richardson, High-Frequency Seafloor Acoustics, 2007).
+
+    Args:
+        material: the material.
+        cosine: of the angle between ray and normal ``(...)``, NumPy or torch.
+        frequency_hz: of the carrier.
+        sound_speed_m_s: in the water.
+
+    Returns:
+        Like ``cosine``; zero without a mirror part.
+
+    Raises:
+        MitsonarError: a frequency or speed that is not above 0.
+    """
+    cosine = np.asarray(cosine, dtype=np.float64) if isinstance(cosine, int | float) else cosine
+    height = _wavenumber(frequency_hz, sound_speed_m_s) * (material.roughness_m or 0.0)
+    return (material.reflection or 0.0) * array_namespace(cosine).exp(cosine * cosine * (-2.0 * height * height))
+
+
+def _rough_share(material: Material, sine: NDArray[np.float64], wavenumber: float) -> NDArray[np.float64]:
+    """Return the share of the intensity that roughness takes from a mirror ``(n,)``; one without a mirror part."""
+    if material.roughness_m is None:
+        return np.ones_like(sine)
+    return np.asarray(-np.expm1(-4 * (wavenumber * material.roughness_m * sine) ** 2))
+
+
+def _wavenumber(frequency_hz: float, sound_speed_m_s: float) -> float:
+    """Return 2 pi f / c [rad/m]."""
+    for value, name in ((frequency_hz, "frequency_hz"), (sound_speed_m_s, "sound_speed_m_s")):
+        if not 0 < value < math.inf:
+            raise MitsonarError(f"{name} must be a finite number above 0: got {shortened(value)}")
+    return 2 * math.pi * frequency_hz / sound_speed_m_s
+
+
+def _number(material: Material, key: str) -> float:
+    """Return a number that the material's law needs, and which is therefore there."""
+    return float(getattr(material, key))
+
+
+# ---------------------------------------------------------------- named materials
+
+
+class NamedMaterial(NamedTuple):
+    """A material of the package.
+
+    Attributes:
+        about: what it stands for.
+        values: of the fields of :class:`Material`, by name.
+        sources: where each value comes from.
+    """
+
+    about: str
+    values: dict[str, PlainValue]
+    sources: dict[str, str]
+
+
+@cache
+def named_materials() -> dict[str, NamedMaterial]:
+    """Return all named materials by name, from the files of the package."""
+    found = {}
+    for path in sorted((files("mitsonar.acoustics") / "materials").iterdir(), key=lambda path: path.name):
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values, sources = ({key: one[part] for key, one in table["keys"].items()} for part in ("value", "source"))
+        found[path.name.removesuffix(".yaml")] = NamedMaterial(table["about"], values, sources)
+    return found
+
+
+def material(name_or_file: str | Path) -> Material:
+    """Load a material by its name, or from a YAML file (keys: the fields of :class:`Material`, and ``material``).
+
+    The key ``material`` (optional) names a material whose numbers the others replace. Where they give another ``law``, only
+    name, description and band are taken over. The key ``grain_size_phi`` gives the numbers of a sediment of that mean grain
+    size (:mod:`mitsonar.acoustics.materials`), which the others replace too.
+
+    Raises:
+        MitsonarError: unknown name (with the nearest ones), unreadable file, unknown key, value out of limits.
+    """
+    text = str(name_or_file)
+    if not text.lower().endswith((".yaml", ".yml")):
+        if text in named_materials() or not os.path.exists(text):
+            return Material.create(**_named(text))
+        raise MitsonarError(f"a material's file ends in .yaml: got {text}; rename it, or name a material")
+    fields = read_yaml(text, "material file", " or a material's name")
+    if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
+        raise MitsonarError(f"{text} must hold `key: value` lines of a material")
+    fields = _by_grain_size(fields, text)
+    base = fields.pop("material", None)
+    if not isinstance(base, str | None):
+        raise MitsonarError(f"material in {text} must name a material: got {shortened(base)}")
+    kept = {} if base is None else _named(base)
+    if fields.get("law", kept.get("law")) != kept.get("law"):
+        numbers = {key for keys in (*LAWS.values(), MIRROR) for key in keys}
+        kept = {key: value for key, value in kept.items() if key not in numbers}
+    return Material.create(**{**kept, "name": Path(text).stem, **fields})
+
+
+def _by_grain_size(fields: dict[str, PlainValue], text: str) -> dict[str, PlainValue]:
+    """Return the fields of a file with the numbers of its grain size, where it gives one; its own numbers win."""
+    if "grain_size_phi" not in fields:
+        return fields
+    phi = fields.pop("grain_size_phi")
+    if isinstance(phi, bool) or not isinstance(phi, int | float):
+        raise MitsonarError(f"grain_size_phi in {text} must be a number: got {shortened(phi)}")
+    if "material" in fields:
+        raise MitsonarError(f"grain_size_phi and material say the same: {text} gives both; leave one of them out")
+    band = {"frequency_min_hz": 10e3, "frequency_max_hz": 100e3}
+    source = f"grain size of {phi:g} phi: regressions of APL-UW TR 9407 (1994), section IV (not seen)"
+    return {"law": "rough-fluid", "source": source, **band, **sediment_of(float(phi))._asdict(), **fields}
+
+
+def _named(name: str) -> dict[str, PlainValue]:
+    """Return the fields of a named material, its sources in one text."""
+    known = named_materials()
+    if name not in known:
+        raise MitsonarError(f"unknown material {shortened(name)}: {nearest_names(name, known)}")
+    one = known[name]
+    source = "; ".join(f"{key}: {text}" for key, text in one.sources.items())
+    return {"name": name, "about": one.about, "source": source, **one.values}
+
+
+# ---------------- Which instruments hear mirrors and several reflections: refusals that recipes, commands and
+# simulators share
+
+
+def check_image_mirrors(sonar: Sonar, views: Sequence[View] | None, mirrors: bool) -> None:
+    """Refuse mirrors and several reflections that an imaging sonar does not hear.
+
+    Args:
+        sonar: the instrument.
+        views: of its images; None: the whole.
+        mirrors: whether shapes are to reflect as mirrors.
+
+    Raises:
+        MitsonarError: mirrors in a model without them; several reflections at receivers elsewhere or in portions.
+    """
+    if mirrors and sonar.model != "coherent" and sonar.bounces == 1:
+        raise MitsonarError(
+            f"the model {sonar.model} has no mirrors: give the sonar model coherent"
+            + (", or bounces 2" if sonar.model == "physical" else "")
+        )
+    if sonar.bounces > 1 and any(not isinstance(view, Whole) for view in views or ()):
+        raise MitsonarError(
+            "receivers elsewhere and portions hear one reflection: leave bounces out, or render the whole view"
+        )
+
+
+def check_channel_mirrors(sonar: ChannelSonar, mirrors: bool, lacking: str) -> None:
+    """Refuse several bounces without mirrors, and mirrors in the model ``rays``.
+
+    Args:
+        sonar: the instrument.
+        mirrors: whether any shape reflects as a mirror.
+        lacking: how to name mirrors where the instrument needs them.
+
+    Raises:
+        MitsonarError: they do not fit.
+    """
+    if sonar.bounces > 1 and not mirrors:
+        raise MitsonarError(f"bounces {sonar.bounces} need mirrors, and the scene has none: {lacking}")
+    if mirrors and sonar.model == "rays":
+        raise MitsonarError("mirrors are of the model scatterers: got the model rays; leave them out, or choose scatterers")
