@@ -34,7 +34,7 @@ from mitsonar.mapping.closure import closure_of
 from mitsonar.mapping.open_source import LOOP
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import cluster_resamples, in_units, motion_errors
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]
 Pairs = Iterator[tuple[SonarFrames, Array, int]]

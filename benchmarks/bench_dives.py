@@ -28,7 +28,7 @@ from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import MotionErrors, motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 SEED, PLACES, NEAR_M = 201, 5, 2.5
 """Seed of the first world; pairs in each; how far from its middle."""

@@ -38,8 +38,7 @@ from trajectory_jobs import trajectory_job
 from mitsonar.mapping.simulated_sensors import simulated_sensors
 from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.frame_store import FrameStore
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import FrameStore, SonarFrames
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -40,7 +40,7 @@ from mitsonar.mapping.simulated_sensors import simulated_sensors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import SonarFrames, to_uint8
 
 Array = NDArray[np.float64]
 

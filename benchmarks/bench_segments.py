@@ -42,7 +42,7 @@ from mitsonar.mapping.odometry_run import run_odometry
 from mitsonar.mapping.view_source import open_views
 from mitsonar.motion.errors import in_units
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.training.evaluation import evaluate
 from mitsonar.training.training_run import train
 

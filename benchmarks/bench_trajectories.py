@@ -77,7 +77,7 @@ from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import assess, motion_errors
 from mitsonar.motion.pose import Pose, mounted
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import SonarFrames, to_uint8
 
 Array = NDArray[np.float64]
 PARTS = ("table21", "trajectories")

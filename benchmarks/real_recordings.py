@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import preset
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["FOLDER", "RECORDINGS", "Outline", "as_recorded", "outline_of", "recordings_folder"]
 

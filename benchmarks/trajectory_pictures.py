@@ -15,7 +15,7 @@ from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
 from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import GAMMA
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

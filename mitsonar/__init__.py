@@ -52,11 +52,9 @@ if TYPE_CHECKING:
     from mitsonar.plotting.map_figure import mosaic_figure, path_figure
     from mitsonar.recordings.mcap_writer import write_mcap
     from mitsonar.recordings.open_recording import open_recording
-    from mitsonar.records.echogram import Echogram
-    from mitsonar.records.impulse_responses import ImpulseResponses
-    from mitsonar.records.range_rates import range_rates
-    from mitsonar.records.sonar_frames import SonarFrames
-    from mitsonar.records.soundings import Soundings
+    from mitsonar.records.frames import SonarFrames
+    from mitsonar.records.responses import ImpulseResponses
+    from mitsonar.records.soundings import Echogram, Soundings, range_rates
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.moving_files import load_meshes, load_motions
@@ -141,11 +139,11 @@ _MODULES = {
     "Comparison": "estimation.benchmark_tables",
     "DataStore": "datasets.store",
     "Deforming": "motion.bodies",
-    "Echogram": "records.echogram",
+    "Echogram": "records.soundings",
     "Effort": "training.reproduce",
     "Estimate": "estimation.estimator",
     "ImpulsePairs": "datasets.response_pairs",
-    "ImpulseResponses": "records.impulse_responses",
+    "ImpulseResponses": "records.responses",
     "MitsonarError": "errors",
     "MitsonarWarning": "errors",
     "Motion": "motion.composition",
@@ -157,7 +155,7 @@ _MODULES = {
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.sonar",
     "SonarEnv": "environments.sonar_env",
-    "SonarFrames": "records.sonar_frames",
+    "SonarFrames": "records.frames",
     "SonarPairs": "datasets.torch_pairs",
     "SonarVectorEnv": "environments.sonar_vector_env",
     "Sounder": "instruments.sounder",
@@ -191,7 +189,7 @@ _MODULES = {
     "particle_mesh": "worlds.water_bodies",
     "path_figure": "plotting.map_figure",
     "path_of": "mapping.motion_series",
-    "range_rates": "records.range_rates",
+    "range_rates": "records.soundings",
     "reproduce": "training.reproduce",
     "save_sensors": "motion.sensors",
     "sheet_figure": "plotting.data_sheet",

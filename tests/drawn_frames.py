@@ -12,8 +12,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.frame_store import FrameStore
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import FrameStore, SonarFrames
 
 SONAR = Sonar(bearing="azimuth", beams=96, range_bins=128, range_min=3.6, range_max=5.4)
 START = Pose.from_degrees([1.0, -2.0, 2.5, 35, 0, 40])

@@ -17,7 +17,7 @@ from PIL import Image
 
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:
     import mitsuba as mi

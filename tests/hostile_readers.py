@@ -26,8 +26,8 @@ from mitsonar.mapping.odometry_run import ODOMETRY, OdometryFolder
 from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.sensors import load_sensors, save_sensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.simulation.render_run import RENDERING, progress_of
 
 
@@ -131,7 +131,7 @@ def spoil_yaml(name: str) -> Callable[[Rng, Path], None]:
 
 
 def make_frames_zarr(folder: Path) -> None:
-    from mitsonar.records.frame_store import FrameStore
+    from mitsonar.records.frames import FrameStore
 
     store = FrameStore.create(folder / "frames.zarr", 3, frames())
     store.write(0, frames())
@@ -147,7 +147,7 @@ def read_frames_zarr(folder: Path) -> None:
 
 
 def resume_frames(folder: Path) -> None:
-    from mitsonar.records.frame_store import FrameStore
+    from mitsonar.records.frames import FrameStore
 
     store = FrameStore.open(folder / "frames.zarr")
     store.check(3, SONAR, 1)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 Array = NDArray[np.float64]
 

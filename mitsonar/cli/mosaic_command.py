@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mitsonar.mapping.frame_source import FrameSource
     from mitsonar.mapping.mosaic import Mosaic
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
 __all__ = ["mosaic"]
 

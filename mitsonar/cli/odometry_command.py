@@ -122,7 +122,7 @@ def odometry(
     from mitsonar.mapping.odometry_run import run_odometry, table_lines
     from mitsonar.mapping.open_source import Reading, frames_for, open_source, record_at, usual_loop
     from mitsonar.motion.pose import Pose
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
     factors = scale if scale is None or scale == "fit" else numbers(scale, 3, "--scale (or fit)")
     first = numbers(start, 6, "--from")

@@ -18,7 +18,7 @@ from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.recordings.recording import Part, Recording
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
 __all__ = ["convert", "info", "recordings", "show", "video"]
 

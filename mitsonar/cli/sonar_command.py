@@ -15,7 +15,7 @@ from mitsonar.io.runs import refuse_to_replace
 
 if TYPE_CHECKING:
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
 __all__ = ["fit", "from_recording", "sonars"]
 
@@ -50,7 +50,7 @@ def fit(
     Give frames of a resting or slow sonar whose darkest parts, shadows or black water, are noise. Bright speckle
     that is new in every frame counts as volume scattering: that holds for a sonar that rests.
     """
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
     refuse_to_replace(out, overwrite=overwrite)
     told = _told(sonar, changes)

@@ -9,7 +9,7 @@ from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, nearest_known
 from mitsonar.geometry.lit_ground import margin_of_light
 from mitsonar.instruments.sonar import Bearing
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["NODES", "ground_at", "ground_of", "light_of"]
 

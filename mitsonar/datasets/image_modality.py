@@ -14,7 +14,7 @@ from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, Va
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose, mounted, vehicle_rotation
-from mitsonar.records.sonar_frames import LABELS
+from mitsonar.records.frames import LABELS
 
 __all__ = ["ImageModality", "footprint"]
 

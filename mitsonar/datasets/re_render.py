@@ -11,7 +11,7 @@ from mitsonar.config.data_recipe import recipe_from
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.variant import release_memory
 
 __all__ = ["re_rendered"]

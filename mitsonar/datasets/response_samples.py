@@ -18,7 +18,7 @@ from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import motions
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["ImpulseSamples", "Leak", "displacement_labels"]
 

@@ -18,7 +18,7 @@ from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed
 from mitsonar.errors import MitsonarError, nearest_names, shortened
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import mounted
-from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.labels import labels_above
 from mitsonar.simulation.rendered_pings import CALIBRATION_FRAMES, RenderedPings, constant_gain, to_image

@@ -23,7 +23,7 @@ from mitsonar.errors import MitsonarError, shortened
 from mitsonar.io.files import check_plain
 from mitsonar.io.runs import other_versions
 from mitsonar.io.storage import Storage, refuse_codecs
-from mitsonar.records.columns import FEW_ROWS, rows_that_fit
+from mitsonar.records.frames import FEW_ROWS, rows_that_fit
 
 __all__ = ["DECIDING", "FORMAT", "PACKAGES", "DataStore"]
 

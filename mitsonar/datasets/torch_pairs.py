@@ -23,7 +23,7 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, refuse_unknown
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import motions
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["ArrangementOptions", "SampleOptions", "Samples", "SonarPairs"]
 

@@ -22,8 +22,8 @@ from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bounds_at
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.motion.errors import MotionErrors, in_units, motion_errors
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.simulation.variant import release_memory
 
 __all__ = [

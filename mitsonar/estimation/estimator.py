@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import SonarFrames, ViewFrames
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = [
     "FEWEST_BLOCKS",

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["NOISE_FIELDS", "as_instrument"]
 

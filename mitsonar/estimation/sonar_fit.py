@@ -18,7 +18,7 @@ from mitsonar.acoustics.water import gain_of, loss_of
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.water_fit import glow_by_beam, near_glow, volume
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["SonarFit", "fit_sonar"]
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from mitsonar.estimation.channel.pings import pings_of
 from mitsonar.estimation.estimator import Estimate, Record, two_frames
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["Zero"]
 

@@ -18,8 +18,7 @@ from mitsonar.datasets.split import PARTS, deal, world_of
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.mapping.open_frames import is_data_set, open_frames, view_in
-from mitsonar.records.columns import open_group
-from mitsonar.records.sonar_frames import COLUMNS, LABELS, SonarFrames
+from mitsonar.records.frames import COLUMNS, LABELS, SonarFrames, open_group
 
 __all__ = ["ExportSource", "open_export"]
 

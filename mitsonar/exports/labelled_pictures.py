@@ -16,7 +16,7 @@ from mitsonar.acoustics.water import noise_of
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry.scan_conversion import nearest_cells
 from mitsonar.plotting.fan_pictures import FanPictures
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import SonarFrames, to_uint8
 
 __all__ = ["LEAST_SNR_DB", "LabelledPictures", "PictureKind", "Region", "class_rules"]
 

@@ -18,7 +18,7 @@ from mitsonar.exports.shots import as_json, refuse_unposed, shots
 from mitsonar.io.files import write_whole
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
-from mitsonar.records.sonar_frames import to_float32
+from mitsonar.records.frames import to_float32
 
 __all__ = ["export_kitti", "export_neusis"]
 

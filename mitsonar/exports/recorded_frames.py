@@ -18,7 +18,7 @@ from mitsonar.mapping.known_poses import poses_at, stretches
 from mitsonar.mapping.open_frames import is_data_set
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import Part
-from mitsonar.records.sonar_frames import SonarFrames, to_float32
+from mitsonar.records.frames import SonarFrames, to_float32
 
 __all__ = ["Axes", "FramesWithPoses", "Stretch", "as_pixels", "axes_of", "frames_with_poses"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from mitsonar.errors import MitsonarError
 from mitsonar.exports.export_source import ExportSource
 from mitsonar.exports.labelled_pictures import LabelledPictures
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Shot", "as_json", "pose_of", "refuse_unlabelled", "refuse_unposed", "regions_of", "shots"]
 

@@ -20,7 +20,7 @@ from mitsonar.geometry.echo_heights import EchoHeights, FirstEchoes, echo_height
 from mitsonar.geometry.ground_plane import GroundGeometry
 
 if TYPE_CHECKING:
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Attitude", "attitude_of"]
 

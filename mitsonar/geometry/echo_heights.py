@@ -19,7 +19,7 @@ from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose, vehicle_rotation
 
 if TYPE_CHECKING:
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
 __all__ = ["EchoHeights", "FirstEchoes", "echo_heights"]
 

@@ -18,7 +18,7 @@ from mitsonar.live.pose_mailbox import Delivered, PoseMailbox
 from mitsonar.live.pose_messages import AskedPose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["LivePing", "LivePublisher", "Pinger", "live_pings"]
 

@@ -18,7 +18,7 @@ from mitsonar.live.sonar_messages import FanEncoder
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import SonarFrames, to_uint8
 from mitsonar.simulation.scene_triangles import Triangles
 
 __all__ = ["Shown", "first_eye", "lit_corners", "wedge_lines", "write_recording"]

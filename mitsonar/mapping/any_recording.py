@@ -15,15 +15,14 @@ from mitsonar.errors import MitsonarError
 from mitsonar.mapping.open_frames import is_data_set, is_recording, open_frames
 from mitsonar.recordings.open_recording import open_recording
 from mitsonar.recordings.recording import Part, Recording
-from mitsonar.records.columns import open_group
-from mitsonar.records.sonar_frames import COLUMNS, LABELS, SonarFrames
+from mitsonar.records.frames import COLUMNS, LABELS, SonarFrames, open_group
 
 __all__ = ["LabelledPart", "recording_at"]
 
 Index = NDArray[np.intp]
 
 Labels: TypeAlias = dict[str, Any]
-"""Arrays of per-pixel truth by the names of :data:`~mitsonar.records.sonar_frames.LABELS`."""
+"""Arrays of per-pixel truth by the names of :data:`~mitsonar.records.frames.LABELS`."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.sensors import Readings, VehicleSensors
-from mitsonar.records.dvl_readings import DvlReadings
+from mitsonar.records.soundings import DvlReadings
 
 __all__ = ["dvl_sensors"]
 

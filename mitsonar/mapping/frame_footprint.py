@@ -13,7 +13,7 @@ from mitsonar.errors import MitsonarError, argument
 from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = [
     "LONGEST_SIDE",

@@ -18,7 +18,7 @@ from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.errors import associated
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels
-from mitsonar.records.sonar_frames import LABELS, SonarFrames, to_float32
+from mitsonar.records.frames import LABELS, SonarFrames, to_float32
 
 if TYPE_CHECKING:
     from mitsonar.estimation.height.direct_height import HeightEstimator

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument
 from mitsonar.mapping.frame_footprint import fan_of, levels_of, poses_and_heights
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["ILLUMINATION_FRAMES", "illumination"]
 

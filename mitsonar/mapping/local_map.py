@@ -27,7 +27,7 @@ from mitsonar.mapping.landmarks import ImageAxes, Landmarks
 from mitsonar.mapping.map_registration import FEWEST, PAIR_STD, Registered, level_turn, registered
 from mitsonar.motion.composition import Motion, compose, motions
 from mitsonar.motion.pose import Pose
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["USED", "map_attitudes", "mapped"]
 

@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.ground_view import GroundView, fan_places
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Canvas", "CoarseView", "Likeness", "likenesses"]
 

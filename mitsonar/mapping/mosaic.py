@@ -33,7 +33,7 @@ from mitsonar.mapping.frame_footprint import (
     squared_span,
 )
 from mitsonar.mapping.map_cells import Box, CellSums, accumulate, box_around, with_slack
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Blend", "Mosaic", "build_mosaic"]
 Array = NDArray[np.float64]

@@ -38,7 +38,7 @@ from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_l
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Odometry", "Row", "Smoothing", "bridged", "odometry", "series_of"]
 

@@ -23,7 +23,7 @@ from mitsonar.mapping.benchmark_sets import DIVE, NOISES, PRESET, SEED, SETS, TE
 from mitsonar.mapping.benchmark_table import benchmark_lines
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_source import LOOP, Reading, open_source, record_at
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["METHODS", "Wanted", "benchmark_odometry"]
 

@@ -16,8 +16,7 @@ from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_nam
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.recordings.open_recording import format_of, known_formats, open_recording
 from mitsonar.recordings.recording import Pixels
-from mitsonar.records.columns import check_column, open_group
-from mitsonar.records.sonar_frames import COLUMNS, LABELS, PER_FRAME, SonarFrames
+from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group
 
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore

@@ -18,9 +18,8 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.open_frames import is_recording, open_frames
 from mitsonar.mapping.response_source import ResponseSource, holds_responses, open_responses
 from mitsonar.mapping.view_source import ViewSource, open_views
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import SonarFrames, ViewFrames
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = [
     "LOOP",

@@ -15,7 +15,7 @@ from mitsonar.acoustics.noise import snr_of, snr_said
 from mitsonar.datasets.response_packing import with_noise
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["ResponseSource", "holds_responses", "open_responses"]
 

@@ -20,8 +20,7 @@ from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting import sounding_figures
 from mitsonar.recordings.xtf_writer import write_xtf
-from mitsonar.records.echogram import Echogram
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.dvl import dvl_readings
 from mitsonar.simulation.render_run import SIMULATORS
 from mitsonar.simulation.sounding import SoundedPings, SounderSimulator

@@ -15,7 +15,7 @@ from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.open_frames import sequence_in
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import ViewFrames
 
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore

@@ -121,7 +121,7 @@ class BodyStates(NamedTuple):
     velocities: NDArray[np.float64] | None = None
 
     def fields(self) -> dict[str, Any]:
-        """Return these as fields of :class:`~mitsonar.records.sonar_frames.SonarFrames`."""
+        """Return these as fields of :class:`~mitsonar.records.frames.SonarFrames`."""
         return {"body_names": self.names, "body_poses": self.poses, "body_velocities": self.velocities}
 
 

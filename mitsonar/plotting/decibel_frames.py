@@ -8,7 +8,7 @@ import numpy as np
 
 from mitsonar.acoustics.levels import decoded
 from mitsonar.errors import MitsonarError
-from mitsonar.records.sonar_frames import SonarFrames, to_float32
+from mitsonar.records.frames import SonarFrames, to_float32
 
 __all__ = ["coded_in_decibels"]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsonar.geometry.scan_conversion import to_cartesian
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map, nearest_cells
 from mitsonar.io.files import write_json, write_whole
-from mitsonar.records.sonar_frames import SonarFrames, to_float32, to_uint8
+from mitsonar.records.frames import SonarFrames, to_float32, to_uint8
 
 __all__ = ["FanPictures"]
 

@@ -12,7 +12,7 @@ from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.geometry.scan_conversion import cartesian_map
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.plotting.decibel_frames import coded_in_decibels
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["CODECS", "write_fan_video"]
 

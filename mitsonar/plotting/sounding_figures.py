@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import counted
-from mitsonar.records.dvl_readings import DvlReadings
-from mitsonar.records.echogram import Echogram
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.soundings import DvlReadings, Echogram, Soundings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

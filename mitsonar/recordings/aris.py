@@ -19,7 +19,7 @@ from mitsonar.recordings.beam_table import TABLES, aris_bearings
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
 from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, mapped
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = [
     "BEAMS",

@@ -17,7 +17,7 @@ from mitsonar.recordings.aris_axes import ArisTable, ArisWindow, Values, half_sp
 from mitsonar.recordings.header_motion import EARTH_M
 from mitsonar.recordings.ping_file import Bytes, Header, layout
 from mitsonar.recordings.recording import CHUNK_BYTES
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["ORIGIN_DEG", "WrittenAris", "write_aris"]
 

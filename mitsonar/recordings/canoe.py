@@ -32,7 +32,7 @@ from mitsonar.io.csv_table import CsvTable
 from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.picture_file import Grey, is_whole, picture_size, read_picture
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["is_canoe", "read_canoe"]
 

@@ -22,7 +22,7 @@ from mitsonar.instruments.sounder import preset
 from mitsonar.recordings.header_motion import MOTION, attitude_of, height_of, poses_of
 from mitsonar.recordings.ping_file import Bytes, EqualFrames, Header, layout, mapped
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["FILE", "FRAME_HEADER", "SIGNATURES", "didson_bearings", "nominal_window", "read_didson"]
 

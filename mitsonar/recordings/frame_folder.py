@@ -11,7 +11,7 @@ import numpy as np
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import RunDirectory, RunKind
 from mitsonar.recordings.recording import Part, Recording
-from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
+from mitsonar.records.frames import LONGEST_NPZ, FrameStore
 
 __all__ = ["CONVERSION", "write_frames"]
 

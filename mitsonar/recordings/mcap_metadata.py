@@ -9,7 +9,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.io.files import finite_number, parse_json
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["RECORD", "WRITTEN", "frames_like", "metadata_of"]
 

@@ -13,7 +13,7 @@ from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.recordings.mcap_metadata import RECORD, WRITTEN, metadata_of
 from mitsonar.recordings.ros_encoding import TOPICS, Encoded, FrameEncoder
-from mitsonar.records.sonar_frames import LABELS, PER_FRAME, SonarFrames, to_uint8
+from mitsonar.records.frames import LABELS, PER_FRAME, SonarFrames, to_uint8
 
 if TYPE_CHECKING:
     from mcap.writer import Writer

@@ -28,7 +28,7 @@ from mitsonar.motion.pose import poses_from
 from mitsonar.recordings.picture_folder import naturally
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording
 from mitsonar.recordings.safe_pickle import read_pickled_arrays
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["is_neusis", "read_neusis"]
 

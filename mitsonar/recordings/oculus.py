@@ -21,7 +21,7 @@ from mitsonar.recordings.oculus_images import OculusImages
 from mitsonar.recordings.oculus_messages import HEADER, Messages, find_messages
 from mitsonar.recordings.ping_file import Header, layout, mapped
 from mitsonar.recordings.recording import Facts, Part, Recording, in_time_order, runs_of
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["LATER", "OLDER", "read_oculus"]
 

@@ -25,7 +25,7 @@ from mitsonar.recordings.geometry_file import (
 )
 from mitsonar.recordings.picture_file import Grey
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Pictures", "geometry_for", "polar_frames", "recording_of"]
 

@@ -21,7 +21,7 @@ from mitsonar.recordings.ros_pictures import read_ros_pictures
 from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
 from mitsonar.recordings.ros_poses import motion_in, with_motion
 from mitsonar.recordings.ros_scan import TopicScan
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["read_ros_bag", "sonar_topic"]
 

@@ -27,7 +27,7 @@ from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.recordings.mcap_metadata import WRITTEN
 from mitsonar.recordings.ros_messages import PROJECTED, ros2_types
-from mitsonar.records.sonar_frames import SonarFrames, to_float32, to_uint8
+from mitsonar.records.frames import SonarFrames, to_float32, to_uint8
 
 __all__ = ["BODY", "SENSOR", "TOPICS", "WORLD", "Encoded", "FrameEncoder", "nanoseconds"]
 

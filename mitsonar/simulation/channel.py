@@ -16,7 +16,7 @@ from mitsonar.errors import MitsonarError, argument, nearest_names
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.simulation.nonuniform_fft import phasor_sums, phasors
 from mitsonar.simulation.variant import thread_count
 
@@ -184,7 +184,7 @@ class ChannelSimulator:
 
         Args:
             flown: poses of the transmitter and times.
-            velocity: in the vehicle's axes, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`; default:
+            velocity: in the vehicle's axes, see :class:`~mitsonar.records.responses.ImpulseResponses`; default:
                 that of the trajectory (:func:`~mitsonar.motion.trajectory.velocities`).
             progress: called with the number of new pings.
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.records.dvl_readings import DvlReadings
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.soundings import DvlReadings, Soundings
 
 __all__ = ["dvl_readings", "true_rates"]
 

@@ -17,7 +17,7 @@ from mitsonar.instruments.sonar import Sonar, TimedPath, overlap_notes, timed_pa
 from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.echoes import Echoes
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.variant import ensure_variant, replayed
 
 if TYPE_CHECKING:

@@ -18,8 +18,8 @@ from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.response_figure import response_png, waterfall_png
-from mitsonar.records.columns import check_column
-from mitsonar.records.impulse_responses import COLUMNS, ImpulseResponses
+from mitsonar.records.frames import check_column
+from mitsonar.records.responses import COLUMNS, ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, Paths
 from mitsonar.simulation.propagation_delay import delay_exact, delay_iterated
 from mitsonar.simulation.render_run import SIMULATORS
@@ -83,7 +83,7 @@ def run_impulse(
     Args:
         simulator: scene and instrument.
         flown: poses and times of the pings.
-        velocity: of the vehicle in each, see :class:`~mitsonar.records.impulse_responses.ImpulseResponses`.
+        velocity: of the vehicle in each, see :class:`~mitsonar.records.responses.ImpulseResponses`.
         folder: of the run.
         origin: what reproduces the run, beside instrument and trajectory.
         overwrite: replace a run that is there.

@@ -13,7 +13,7 @@ __all__ = ["labels_above", "labels_of", "shadow"]
 
 
 def labels_of(pings: RenderedPings, truth: Any, rays: int) -> dict[str, NDArray[Any]]:
-    """Label maps of a batch (see :class:`mitsonar.records.sonar_frames.SonarFrames`), from the strongest ray of each cell.
+    """Label maps of a batch (see :class:`mitsonar.records.frames.SonarFrames`), from the strongest ray of each cell.
 
     ``rays`` is how many a ping has.
     """

@@ -23,8 +23,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting.fan_figure import save_fan
 from mitsonar.plotting.fan_pictures import FanPictures
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
-from mitsonar.records.frame_store import LONGEST_NPZ, FrameStore
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import LONGEST_NPZ, FrameStore, SonarFrames, to_uint8
 from mitsonar.simulation.device_arrays import padded
 from mitsonar.simulation.labels import labels_above
 from mitsonar.simulation.rendered_pings import RenderedPings, constant_gain, to_image

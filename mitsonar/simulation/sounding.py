@@ -13,8 +13,7 @@ from mitsonar.acoustics.water import gain_of
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.echogram import Echogram
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:

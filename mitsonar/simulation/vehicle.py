@@ -20,10 +20,9 @@ from mitsonar.instruments.vehicle import SensorKeys, check_sensor_name, load_veh
 from mitsonar.motion.bodies import Moving, MovingBodies
 from mitsonar.motion.pose import Pose, mount_between, mounted, pose_from_to_world
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.echogram import Echogram
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.responses import ImpulseResponses
+from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.moving_files import Said, motions_of

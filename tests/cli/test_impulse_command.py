@@ -13,7 +13,7 @@ import pytest
 from helpers import PROGRAM, Command, refused
 from PIL import Image
 
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.worlds.sea_surface import SeaSurface
 
 SCENE = """<scene version="3.0.0">

@@ -27,7 +27,7 @@ from mitsonar.motion.composition import motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 DRIVEN = np.tile([0.012, 0.009, np.radians(0.3)], (11, 1))
 

@@ -20,7 +20,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import to_world_matrices
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import SonarFrames, to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.render_run import Outputs, StoredEchoes, run
 from mitsonar.simulation.scene import load_scene, shipped_scenes, shipped_trajectory, sonar_in
@@ -355,7 +355,7 @@ def test_texture_parameter_of_the_pattern() -> None:
 def test_a_run_killed_after_its_last_frame_is_finished_by_resume(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mitsonar.records.frame_store import FrameStore
+    from mitsonar.records.frames import FrameStore
 
     def killed(*_: object) -> None:
         raise KeyboardInterrupt

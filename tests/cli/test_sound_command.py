@@ -11,9 +11,8 @@ from helpers import Command, refused
 from mitsonar.mapping.open_frames import load_frames
 from mitsonar.motion.sensors import load_sensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.echogram import Echogram
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.scene import shipped_trajectory
 
 FILES = {

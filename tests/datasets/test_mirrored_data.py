@@ -23,7 +23,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.crlb.crlb_report import bounds_of_subject
 from mitsonar.estimation.crlb.crlb_subject import subject_of_data
 from mitsonar.estimation.crlb.image_crlb import bounds_at
-from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import to_image

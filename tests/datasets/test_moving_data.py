@@ -14,7 +14,7 @@ from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
-from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.rendered_pings import to_image
 from mitsonar.simulation.scene import load_scene

@@ -46,7 +46,7 @@ from mitsonar.motion.composition import (  # noqa: E402
     Motion,
     MotionPrior,
 )
-from mitsonar.records.sonar_frames import SonarFrames  # noqa: E402
+from mitsonar.records.frames import SonarFrames  # noqa: E402
 
 
 @pytest.fixture(scope="module")

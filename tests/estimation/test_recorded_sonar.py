@@ -12,7 +12,7 @@ from helpers import Command
 from mitsonar.estimation.recorded_sonar import NOISE_FIELDS, as_instrument
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 OCULUS = Path(__file__).resolve().parents[2].parent / "shared/data/real/oculus-m1200d-three-pings/three_pings_8bit.raw"
 

@@ -14,7 +14,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.sonar_fit import fit_sonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 PLAIN = Sonar.create(model="coherent", frequency_hz=1.8e6, range_min=1.4, range_max=5.6, bearing="cone", gain_exponent=2,
                      beam_width_deg=0.3, absorption_db_per_m=0.0)  # fmt: skip

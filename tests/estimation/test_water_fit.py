@@ -13,7 +13,7 @@ from helpers import Array, diffuse, essence, floor, scene
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.sonar_fit import fit_sonar
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -28,8 +28,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.plotting.fan_pictures import FanPictures
-from mitsonar.records.frame_store import FrameStore
-from mitsonar.records.sonar_frames import SonarFrames, to_uint8
+from mitsonar.records.frames import FrameStore, SonarFrames, to_uint8
 from mitsonar.simulation.scene import shape_names_in, shipped_scenes
 
 FRAMES, BINS, BEAMS = 5, 40, 24

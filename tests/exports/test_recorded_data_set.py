@@ -29,7 +29,7 @@ from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import in_units
 from mitsonar.recordings.aris_writer import write_aris
 from mitsonar.recordings.open_recording import open_recording
-from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.records.frames import to_uint8
 
 Array = NDArray[np.float64]
 

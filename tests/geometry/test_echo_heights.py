@@ -12,7 +12,7 @@ from helpers import lit_plane
 from mitsonar.geometry.echo_heights import TOPS, echo_heights
 from mitsonar.instruments.beams import half_power
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 HEIGHT_M, PITCH_RAD = 2.2, np.radians(35)
 SONAR = Sonar(range_min=2.0, range_max=7.0, range_bins=800)

@@ -12,7 +12,7 @@ from mitsonar.geometry.scan_conversion import cartesian_map, to_cartesian
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose, vehicle_rotation
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 
 def pixel_centres(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -50,8 +50,8 @@ import mitsonar
 from mitsonar.acoustics.materials import material
 from mitsonar.errors import MitsonarError, MitsonarWarning, shortened
 from mitsonar.io.storage import refuse_codecs
-from mitsonar.records.impulse_responses import ImpulseResponses
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.worlds.imported_world import imported_world
 from mitsonar.worlds.user_mesh import mesh_world
 

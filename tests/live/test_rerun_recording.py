@@ -19,7 +19,7 @@ from mitsonar.live.rerun_recording import Shown, first_eye, lit_corners, wedge_l
 from mitsonar.live.sonar_messages import FanEncoder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.scene_triangles import Triangles, triangles_in
 
 FRAMES = 20

@@ -21,7 +21,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.live_loop import LivePing
 from mitsonar.live.pose_mailbox import PoseMailbox
 from mitsonar.live.ros_node import RosNode
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 
 class Message:

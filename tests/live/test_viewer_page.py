@@ -20,7 +20,7 @@ from browser import CHROMIUM, Page, opened, served
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.live.rerun_recording import BEAMS, ESTIMATED, TRUE, WHOLE
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 Picture = NDArray[np.uint8]
 

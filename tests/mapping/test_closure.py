@@ -17,7 +17,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.motion.composition import Motion, MotionPrior, motions
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 FRAMES, STEPS = 129, 8
 STD = np.array([1e-3, 5e-4, 2e-4])

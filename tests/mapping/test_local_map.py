@@ -24,7 +24,7 @@ from mitsonar.mapping.odometry import odometry, series_of
 from mitsonar.mapping.pose_covariance import pose_covariances
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 FRAMES, STEP_M = 48, 0.02
 WRONG = np.array([0.0, 0.97, np.radians(0.03)])

@@ -24,7 +24,7 @@ from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]
 

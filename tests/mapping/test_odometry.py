@@ -37,7 +37,7 @@ from mitsonar.mapping.simulated_sensors import SensorNoise, simulated_sensors
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import path_length
 from mitsonar.recordings.aris_writer import write_aris
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.worlds.ship_hull import ShipHull
 from mitsonar.worlds.slope import sloped
 from mitsonar.worlds.world import Floor, World

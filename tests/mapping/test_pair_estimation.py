@@ -14,7 +14,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.pair_estimation import PAIRS_A_BATCH, estimate_motions
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 FRAMES = 2 * PAIRS_A_BATCH + 4
 SONAR = Sonar(range_bins=16, beams=8)

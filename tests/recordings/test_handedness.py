@@ -13,7 +13,7 @@ from mitsonar import MitsonarError, Pose, Simulator, Trajectory, load_scene, loa
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.recordings.handedness import handedness_of
 from mitsonar.recordings.recording import Part
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
 

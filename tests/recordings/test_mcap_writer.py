@@ -21,7 +21,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.mcap_writer import SPAN_DB, write_mcap
 from mitsonar.recordings.ros_pings import is_beam_major
-from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.records.frames import to_uint8
 
 SONAR = Sonar(beams=24, range_bins=60, range_min=3.0, range_max=6.0, frequency_hz=1.8e6)
 

@@ -11,7 +11,7 @@ import pytest
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import load_sounder
 from mitsonar.recordings.xtf_writer import write_xtf
-from mitsonar.records.echogram import Echogram
+from mitsonar.records.soundings import Echogram
 
 
 def echogram(instrument: str = "sidescan", bins: int = 50) -> Echogram:

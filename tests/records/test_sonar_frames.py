@@ -10,7 +10,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.records.sonar_frames import LABELS, SonarFrames, to_float32, to_uint8
+from mitsonar.records.frames import LABELS, SonarFrames, to_float32, to_uint8
 
 SONAR = Sonar(name="small", beams=6, range_bins=10, bearing="cone", beam_width_deg=0.3)
 FRAMES = 4

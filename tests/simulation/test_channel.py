@@ -17,7 +17,7 @@ from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView, Hydropho
 from mitsonar.motion.composition import steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, Paths, impulse_response
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from helpers import diffuse, floor, scene, sphere
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.frame_store import FrameStore
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import FrameStore, SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.render_run import Outputs, run
 

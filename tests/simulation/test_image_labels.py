@@ -10,7 +10,7 @@ from helpers import box, diffuse, floor, place_of, scene
 
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 
 if TYPE_CHECKING:

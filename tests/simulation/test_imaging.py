@@ -17,7 +17,7 @@ from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.tally import Tally
 

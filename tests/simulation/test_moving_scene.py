@@ -141,7 +141,7 @@ def test_scenes_with_instances_are_refused() -> None:
 
 
 def test_poses_of_bodies_are_kept(tmp_path: Any) -> None:
-    from mitsonar.records.sonar_frames import SonarFrames
+    from mitsonar.records.frames import SonarFrames
 
     loaded = separate(floor=floor(diffuse()), wall=plate((0, 0, 0), (0, -1, 0)))
     frames = Simulator(loaded, SONAR, moving={"wall": along(5, 7)}).render(Trajectory.between(HERE, HERE, 3, 2.0))

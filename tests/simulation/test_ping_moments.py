@@ -12,7 +12,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar, group_of_beams, scanned
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]

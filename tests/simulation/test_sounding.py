@@ -11,7 +11,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import Sounder, load_sounder
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.dvl_readings import velocity_of
+from mitsonar.records.soundings import velocity_of
 from mitsonar.simulation.dvl import dvl_readings
 from mitsonar.simulation.sounding import SounderSimulator
 

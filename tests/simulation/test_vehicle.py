@@ -14,9 +14,8 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.vehicle_run import run_vehicle
 from mitsonar.motion.pose import Pose, mount_between, mounted
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.range_rates import range_rates
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.soundings import Soundings
+from mitsonar.records.frames import SonarFrames
+from mitsonar.records.soundings import Soundings, range_rates
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.moving_files import load_motions, motions_of
 from mitsonar.simulation.scene import load_scene

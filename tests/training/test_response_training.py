@@ -24,7 +24,7 @@ from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402
 from mitsonar.networks.blocks import SameAverage  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network  # noqa: E402
-from mitsonar.records.impulse_responses import ImpulseResponses  # noqa: E402
+from mitsonar.records.responses import ImpulseResponses  # noqa: E402
 from mitsonar.training.evaluation import evaluate, predictions, samples_for  # noqa: E402
 from mitsonar.training.training_run import train  # noqa: E402
 

@@ -22,7 +22,7 @@ from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.estimator import Estimate, rejected
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["Correlation"]
 

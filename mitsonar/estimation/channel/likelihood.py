@@ -29,7 +29,7 @@ from mitsonar.estimation.channel.pings import assumed_height, pings_of, reach_of
 from mitsonar.estimation.channel.sub_bands import bands_of
 from mitsonar.estimation.estimator import Estimate, PlainTable, rejected
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["Likelihood"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["Pings", "assumed_height", "pings_of", "reach_of"]
 

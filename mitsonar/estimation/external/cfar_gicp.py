@@ -12,7 +12,7 @@ from mitsonar.estimation.estimator import INPUTS, Estimate, rejected, two_frames
 from mitsonar.estimation.external.ground_pair import package
 from mitsonar.geometry.attitude import Attitude, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["CfarGicp"]
 

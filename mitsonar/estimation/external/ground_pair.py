@@ -14,7 +14,7 @@ from mitsonar.estimation.estimator import Estimate, rejected, two_frames
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["GroundPair", "ground_pair", "package"]
 

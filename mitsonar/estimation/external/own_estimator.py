@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError, meant
 from mitsonar.estimation.estimator import Estimate, Options
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["HasEstimate", "OwnEstimator", "checked_options", "created", "own_class", "own_estimator"]
 

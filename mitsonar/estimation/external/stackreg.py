@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from mitsonar.estimation.estimator import INPUTS, Estimate, rejected
 from mitsonar.estimation.external.ground_pair import ground_pair, package
 from mitsonar.motion.composition import MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["StackReg"]
 

@@ -13,8 +13,7 @@ from mitsonar.errors import MitsonarError, argument
 from mitsonar.estimation.height.floor_profile import FloorProfile
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import SEGMENTS, Segment, Whole
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import SonarFrames, ViewFrames
 
 __all__ = ["Above", "DirectHeight", "HeightEstimate", "HeightEstimator", "profile_of", "rejection_of_profile"]
 

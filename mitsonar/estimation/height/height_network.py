@@ -13,7 +13,7 @@ from mitsonar.estimation.height.direct_height import Above, HeightEstimate, prof
 from mitsonar.estimation.learned.trained_network import NetworkInput, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.instruments.views import Whole
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import ViewFrames
 
 __all__ = ["HeightNetwork"]
 

@@ -38,7 +38,7 @@ from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.prior_gate import prior_rejection
 from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import LABELS, SonarFrames
+from mitsonar.records.frames import LABELS, SonarFrames
 
 __all__ = ["Direct", "is_far"]
 

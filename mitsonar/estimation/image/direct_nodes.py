@@ -12,7 +12,7 @@ from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
 from mitsonar.geometry.lit_ground import margin_of_light
 from mitsonar.motion.composition import Motion, inverse
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["NODES", "GroundNodes", "node_axes"]
 

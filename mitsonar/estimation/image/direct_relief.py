@@ -29,7 +29,7 @@ from mitsonar.estimation.image.direct_registration import (
 )
 from mitsonar.estimation.image.image_slopes import blurred, sampled, slopes_of
 from mitsonar.geometry.attitude import Attitude
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["registered_over_relief"]
 

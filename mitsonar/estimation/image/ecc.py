@@ -13,7 +13,7 @@ from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_reje
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Ecc"]
 

@@ -36,7 +36,7 @@ from mitsonar.estimation.image.displacement_match import STILL, TINY, WindowFlow
 from mitsonar.geometry.attitude import attitude_of
 from mitsonar.geometry.ground_plane import moved
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["Flow"]
 

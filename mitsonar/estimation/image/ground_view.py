@@ -13,7 +13,7 @@ from mitsonar.geometry.attitude import Attitude
 from mitsonar.geometry.ground_plane import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["GroundView", "fan_places"]
 

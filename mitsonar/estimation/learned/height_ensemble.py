@@ -13,8 +13,7 @@ from mitsonar.estimation.learned.image_network import ImageNetwork
 from mitsonar.estimation.learned.view_network import ViewNetwork
 from mitsonar.motion.composition import MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import SonarFrames, ViewFrames
 
 __all__ = ["HeightEnsemble"]
 

@@ -37,7 +37,7 @@ from mitsonar.motion.composition import Motion, MotionPrior, inverse
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.warp_grid import Ground, WarpGrid
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 __all__ = ["ImageNetwork"]
 

@@ -15,7 +15,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate, rejected, two_frames
 from mitsonar.estimation.learned.trained_network import NetworkInput, answer_of, one_thread
 from mitsonar.motion.composition import Motion
-from mitsonar.records.sonar_frames import SonarFrames, to_float32
+from mitsonar.records.frames import SonarFrames, to_float32
 
 if TYPE_CHECKING:
     from mitsonar.datasets.torch_pairs import Samples

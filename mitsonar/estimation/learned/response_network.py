@@ -18,7 +18,7 @@ from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.errors import AXES
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 
 __all__ = ["ResponseNetwork"]
 

@@ -25,8 +25,7 @@ from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.create import called
 from mitsonar.networks.gaussian_head import GaussianHead
 from mitsonar.networks.warp_grid import Ground
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import SonarFrames, ViewFrames
 
 __all__ = [
     "ANGLE_OFF_DEG",

@@ -16,7 +16,7 @@ from mitsonar.estimation.learned.trained_network import Trained, answer_of, one_
 from mitsonar.instruments.views import SEGMENTS
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.networks.checkpoint import Checkpoint
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import ViewFrames
 
 __all__ = ["ViewNetwork", "reads_views"]
 
@@ -75,7 +75,7 @@ class ViewNetwork(Trained):
         """Estimate the motion between two pings, with the covariance of validation.
 
         Args:
-            records: two :class:`~mitsonar.records.view_frames.ViewFrames`.
+            records: two :class:`~mitsonar.records.frames.ViewFrames`.
             prior: ignored: the network answers in the range of its training.
 
         Raises:

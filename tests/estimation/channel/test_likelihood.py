@@ -25,7 +25,7 @@ from mitsonar.instruments.hydrophones import ChannelSonar, four_receivers
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.records.impulse_responses import ImpulseResponses
+from mitsonar.records.responses import ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, impulse_response
 
 HEIGHT = 4.0

@@ -29,7 +29,7 @@ from mitsonar.geometry.ground_plane import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
-from mitsonar.records.sonar_frames import to_uint8
+from mitsonar.records.frames import to_uint8
 
 if TYPE_CHECKING:
     from mitsonar.simulation.imaging import Simulator

@@ -25,7 +25,7 @@ from mitsonar.mapping.odometry import odometry
 from mitsonar.motion.composition import Motion, MotionPrior, compose
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 START = Pose.from_degrees([1.0, -2.0, 2.5, 35, 0, 40])
 UNITS = np.array([1e3, 1e3, 180 / np.pi])

@@ -28,8 +28,7 @@ from mitsonar.mapping.measured_heights import measured
 from mitsonar.mapping.pair_estimation import estimate_motions
 from mitsonar.mapping.view_source import open_views
 from mitsonar.motion.composition import Motion, MotionPrior
-from mitsonar.records.sonar_frames import SonarFrames
-from mitsonar.records.view_frames import ViewFrames
+from mitsonar.records.frames import SonarFrames, ViewFrames
 from mitsonar.simulation.imaging import Simulator
 
 pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")]

@@ -21,7 +21,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, MotionPrior, compose, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, shipped_trajectory, sonar_in
 from mitsonar.worlds.rocky_field import RockyField

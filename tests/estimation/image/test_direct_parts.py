@@ -20,7 +20,7 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.geometry.attitude import Attitude
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
-from mitsonar.records.sonar_frames import SonarFrames
+from mitsonar.records.frames import SonarFrames
 
 ATTITUDE = Attitude(2.5, 0.05, np.radians(35))
 

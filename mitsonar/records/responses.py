@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.io.files import FileArray, PlainValue, read_npz, refuse_beyond_memory, write_whole
-from mitsonar.records.columns import Column, StoredArray, check_column, open_group, table_in
+from mitsonar.records.frames import Column, StoredArray, check_column, open_group, table_in
 
 __all__ = ["ImpulseResponses"]
 

@@ -1,0 +1,747 @@
+"""Sonar images in the one form that everything downstream reads, simulated or real; ``frames.npz`` holds exactly it."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import IO, Any, Literal, Self, TypeAlias, cast
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.levels import decoded
+from mitsonar.errors import MitsonarError, shortened
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.io.files import (
+    FileArray,
+    PlainValue,
+    finite_number,
+    parse_json,
+    read_json,
+    read_npz,
+    refuse_beyond_memory,
+    whole_number,
+)
+
+__all__ = [
+    "FEW_ROWS",
+    "LABELS",
+    "LEVELS",
+    "LONGEST_NPZ",
+    "Column",
+    "FrameStore",
+    "SonarFrames",
+    "StoredArray",
+    "ViewFrames",
+    "arrays_in",
+    "check_column",
+    "number_of",
+    "open_group",
+    "rows_that_fit",
+    "table_in",
+    "text_of",
+    "to_float32",
+    "to_uint8",
+]
+
+
+# ---------------- Frames of several views of the same pings, or their vectors: the portions of a downward-looking
+# sonar's field of view
+
+
+@dataclass(frozen=True)
+class ViewFrames:
+    """Consecutive pings.
+
+    Attributes:
+        kind: ``image``, or ``vector``: sums over the beams.
+        values: by view; images ``(n, bins, beams)`` uint8 or float 0..1, vectors ``(n, bins)`` in pixels' maxima.
+        sonars: of the views.
+        bearing_rad: of the beams of each view.
+        time_s: of the pings ``(n,)``.
+        poses: of the sonar ``(n, 6)``, where known.
+        height_m: over the ground ``(n,)``, where known.
+
+    Raises:
+        MitsonarError: shapes that do not fit.
+    """
+
+    kind: str
+    values: dict[str, FileArray]
+    sonars: dict[str, Sonar]
+    bearing_rad: dict[str, NDArray[np.float64]]
+    time_s: NDArray[np.float64]
+    poses: NDArray[np.float64] | None = None
+    height_m: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        for view, values in self.values.items():
+            shape = (len(self.time_s), self.sonars[view].range_bins)
+            wanted = shape if self.kind == "vector" else (*shape, len(self.bearing_rad[view]))
+            if values.shape != wanted:
+                raise MitsonarError(f"{self.kind}s of view {view} must have the shape {wanted}: got {values.shape}")
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def select(self, which: slice) -> Self:
+        """Select some of the pings."""
+        return replace(
+            self,
+            values={view: values[which] for view, values in self.values.items()},
+            time_s=self.time_s[which],
+            poses=None if self.poses is None else self.poses[which],
+            height_m=None if self.height_m is None else self.height_m[which],
+        )
+
+    def profiles(self) -> NDArray[np.float32]:
+        """Sum the images over the beams: ``(views, n, bins)`` float32, in pixels' maxima."""
+        scale = {np.dtype(np.uint8): np.float32(1 / 255)}
+        whole = [values * scale.get(values.dtype, np.float32(1)) for values in self.values.values()]
+        return np.stack([one if self.kind == "vector" else one.sum(axis=-1) for one in whole]).astype(np.float32)
+
+
+# ---------------- Checks of the arrays of a file: type, shape and values, before anything is computed from them
+
+
+StoredArray: TypeAlias = Any
+"""An array of NumPy or Zarr, with dtype, shape and ndim."""
+
+MOST_DIMENSIONS = 4
+PIECES_A_ROW = 64
+"""Chunks of a row of an array, at most."""
+
+ROWS_A_BYTE = 200
+"""Rows of a byte of a compressed array, at most: times and poses differ from row to row."""
+
+FEW_ROWS = 100_000
+"""Rows that a file of any size may have."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """Required type, shape and values of an array.
+
+    Attributes:
+        dims: names of its dimensions; the same name has the same length everywhere.
+        kinds: NumPy's letters of its types: f float, u and i integers, c complex.
+        low: least value.
+        high: greatest value.
+        nan: whether it may hold nan.
+        order: along its first dimension: ``strict`` grows, ``same`` does not fall, ``any``.
+    """
+
+    dims: tuple[str, ...]
+    kinds: str = "f"
+    low: float = -math.inf
+    high: float = math.inf
+    nan: bool = False
+    order: Literal["strict", "same", "any"] = "any"
+
+
+def check_column(values: StoredArray, name: str, column: Column, sizes: Mapping[str, int], source: str) -> None:
+    """Check an array.
+
+    Args:
+        values: the array. Of an array of Zarr only type and shape are checked.
+        name: of the array, for errors.
+        column: requirements on it.
+        sizes: known lengths of dimensions.
+        source: is named in errors.
+
+    Raises:
+        MitsonarError: it does not meet them.
+    """
+    wanted = tuple(sizes.get(dim, length) for dim, length in zip(column.dims, values.shape, strict=False))
+    if values.dtype.kind not in column.kinds or values.ndim != len(column.dims) or values.shape != wanted:
+        shape = ", ".join(f"{dim} {sizes[dim]:,}" if dim in sizes else dim for dim in column.dims)
+        kinds = " or ".join({"f": "float", "i": "int", "u": "uint", "c": "complex"}[kind] for kind in column.kinds)
+        raise MitsonarError(
+            f"{source}: {name} must be {kinds} of the shape ({shape}): got {str(values.dtype)[:20]} {str(values.shape)[:60]}"
+        )
+    if isinstance(values, np.ndarray) and values.size:
+        _check_column_values(values, name, column, source)
+
+
+def _check_column_values(values: FileArray, name: str, column: Column, source: str) -> None:
+    if values.dtype.kind in "fc" and not np.isfinite(values).all():
+        if not column.nan or np.isinf(values).any():
+            raise MitsonarError(f"{source}: {name} holds nan or inf; the file is damaged, or was written by something else")
+        if np.isnan(values).all():
+            return
+    if values.dtype.kind != "c":
+        low, high = np.nanmin(values), np.nanmax(values)
+        if low < column.low or high > column.high:
+            raise MitsonarError(f"{source}: {name} must lie in {column.low:g}..{column.high:g}: got {low:.6g}..{high:.6g}")
+    if column.order != "any" and len(values) > 1:
+        steps = np.diff(values, axis=0)
+        if (steps < 0).any() or (column.order == "strict" and not (steps > 0).all()):
+            wanted = "grow" if column.order == "strict" else "not fall"
+            raise MitsonarError(f"{source}: {name} must {wanted} from row to row")
+
+
+def text_of(table: Mapping[str, StoredArray], name: str, default: str | None = None) -> str:
+    """Return a text of a table of arrays.
+
+    Raises:
+        MitsonarError: it is no text.
+    """
+    value = np.asarray(table[name]) if name in table else np.asarray(default)
+    if value.ndim or value.dtype.kind != "U":
+        raise MitsonarError(f"{name} must be one text: got {str(value.dtype)[:20]} {str(value.shape)[:40]}")
+    return str(value)
+
+
+def number_of(table: Mapping[str, StoredArray], name: str, default: float) -> float:
+    """Return a finite number above 0 of a table of arrays.
+
+    Raises:
+        MitsonarError: it is something else.
+    """
+    value = np.asarray(table.get(name, default))
+    single = value.ndim == 0 and value.dtype.kind in "fiu"
+    return finite_number(float(value) if single else str(value), name, above=0)
+
+
+def table_in(table: Mapping[str, StoredArray], name: str, source: str, default: str | None = None) -> dict[str, PlainValue]:
+    """Parse the JSON object in a text of a table of arrays.
+
+    Raises:
+        MitsonarError: the text is no JSON object.
+    """
+    try:
+        value = parse_json(text_of(table, name, default), f"the field {name}")
+    except MitsonarError as error:
+        raise MitsonarError(f"{source}: the field {name} is not JSON ({error}); the file is damaged") from None
+    if not isinstance(value, dict):
+        raise MitsonarError(f"{source}: the field {name} is not JSON of a table; the file is damaged")
+    return value
+
+
+# ---------------------------------------------------------------- Zarr
+
+
+def open_group(
+    path: Path, columns: Mapping[str, Column], rows: str, done: str | None = None
+) -> tuple[dict[str, StoredArray], int]:
+    """Open the arrays and attributes of a Zarr group. Their values are not read yet.
+
+    Types, shapes and chunks of all arrays are checked against each other and against the bytes of the array ``rows``.
+
+    Args:
+        path: of the group.
+        columns: requirements on its arrays; other arrays may be present.
+        rows: name of the array that has a number for each row.
+        done: name of the attribute with the number of rows that are written, if there is one.
+
+    Returns:
+        Arrays of Zarr and attributes (as arrays of NumPy) by name, and the number of rows that are written.
+
+    Raises:
+        Exception: a damaged group raises errors of many kinds. The caller puts them into words.
+    """
+    group, arrays = arrays_in(path, "r")
+    if rows not in arrays or arrays[rows].ndim not in (1, 2) or arrays[rows].dtype.kind != "f":
+        raise ValueError(f"it lacks {rows}, a number for each row")
+    count = int(arrays[rows].shape[0])
+    stored = sum(one.stat().st_size for one in (path / rows).rglob("*") if one.is_file() and one.name != "zarr.json")
+    if count > rows_that_fit(stored):
+        raise ValueError(f"{count:,} rows are more than the {stored:,} bytes of {rows} can hold")
+    for name, array in arrays.items():
+        _check_pieces(name, array)
+        if name in columns and name != rows:
+            check_column(array, name, columns[name], {columns[rows].dims[0]: count}, "it")
+    attributes = dict(group.attrs)
+    written = count if done is None else attributes.pop(done, count)
+    written = whole_number(written, str(done), 0, count)
+    return {**arrays, **{name: np.array(value) for name, value in attributes.items()}}, written
+
+
+def arrays_in(path: Path, mode: Literal["r", "r+"]) -> tuple[zarr.Group, dict[str, StoredArray]]:
+    """Open a Zarr group in a folder, and its arrays by name. Their metadata are checked before Zarr reads them.
+
+    Arrays are opened one by one: of several at once Zarr would print the errors of all.
+
+    Raises:
+        Exception: a damaged group raises errors of many kinds. The caller puts them into words.
+    """
+    import zarr
+
+    from mitsonar.io.storage import refuse_codecs
+
+    names = sorted(one.parent.name for one in path.glob("*/zarr.json"))
+    for name in ("", *names):
+        metadata = read_json(path / name / "zarr.json")
+        for length in metadata["shape"] if name else ():
+            whole_number(length, f"a length of {name}")
+    group = zarr.open_group(path, mode=mode, zarr_format=3)
+    arrays = {name: group[name] for name in names}
+    if not all(isinstance(array, zarr.Array) for array in arrays.values()):
+        raise ValueError("it holds groups where arrays should be")
+    for array in arrays.values():
+        refuse_codecs(cast("zarr.Array[Any]", array))
+    return group, arrays
+
+
+def rows_that_fit(stored: int) -> int:
+    """Return the largest number of rows that so many compressed bytes may hold."""
+    return max(FEW_ROWS, ROWS_A_BYTE * stored)
+
+
+def _check_pieces(name: str, array: StoredArray) -> None:
+    """Check that an array can be read in finite time and memory."""
+    if array.ndim > MOST_DIMENSIONS or array.dtype.kind not in "biufc":
+        raise ValueError(f"{name} holds no numbers, or has more than {MOST_DIMENSIONS} dimensions")
+    if any(piece < 1 for piece in array.chunks):
+        raise ValueError(f"{name} is cut into pieces of nothing")
+    pieces = math.prod(-(-length // piece) for length, piece in zip(array.shape, array.chunks, strict=True))
+    if pieces > PIECES_A_ROW * max(1, array.shape[0] if array.ndim else 1):
+        raise ValueError(f"{name} is cut into {pieces:,} pieces")
+    refuse_beyond_memory(math.prod(array.chunks) * array.dtype.itemsize, name)
+
+
+# ---------------- sonar frames
+
+
+LEVELS = ("linear", "dB", "gamma", "contrast")
+"""How image values stand for level; ``contrast`` is :class:`~mitsonar.acoustics.levels.LocalContrast`'s."""
+
+FLOOR_DB = -100.0
+"""Least level over full scale [dB]: an image has zeros."""
+
+LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int32, "shadow": np.uint8}
+"""Per-pixel truth: name and type. Where a pixel holds no echo: nan, -1; ``shadow`` is said in :class:`SonarFrames`."""
+
+BODIES = ("body_poses", "body_velocities")
+
+PER_FRAME = ("image", "time_s", "poses", "beam_poses", *BODIES, "attitude_rad", "height_m", *LABELS)
+
+IMAGE = ("frames", "bins", "beams")
+
+COLUMNS = {
+    "image": Column(IMAGE, "fu", low=0, high=255),
+    "range_m": Column(("bins",), low=0, high=1e6, order="strict"),
+    "bearing_rad": Column(("beams",), low=-math.pi, high=math.pi, order="strict"),
+    "time_s": Column(("frames",), order="same"),
+    "poses": Column(("frames", "six"), low=-1e9, high=1e9),
+    "beam_poses": Column(("frames", "beams", "six"), low=-1e9, high=1e9),
+    "body_poses": Column(("frames", "bodies", "six"), low=-1e9, high=1e9),
+    "body_velocities": Column(("frames", "bodies", "six"), low=-1e9, high=1e9),
+    "attitude_rad": Column(("frames", "three"), low=-7, high=7, nan=True),
+    "height_m": Column(("frames",), low=0, nan=True),
+    "elevation_rad": Column(IMAGE, low=-math.pi, high=math.pi, nan=True),
+    "shape_id": Column(IMAGE, "i", low=-1),
+    "object_id": Column(IMAGE, "i"),
+    "shadow": Column(IMAGE, "u", low=0, high=2),
+}
+"""What the arrays of a file must be."""
+
+
+@dataclass
+class SonarFrames:
+    """Frames of one sonar.
+
+    Attributes:
+        image: ``(frames, bins, beams)`` float32 in 0..1 (or uint8 in 0..255); row 0 nearest, column 0 most to port;
+            zero means no echo.
+        range_m: centres of the bins ``(bins,)`` [m].
+        bearing_rad: axes of the beams ``(beams,)`` [rad], starboard positive, not necessarily even.
+        time_s: time of each frame ``(frames,)``, or of each beam ``(frames, beams)`` [s].
+        poses: x, y, z [m], pitch, roll, heading [rad] of the sonar ``(frames, 6)``, where known.
+        beam_poses: poses of the sonar at the time of each beam ``(frames, beams, 6)``, where beams ping one after another.
+        body_poses: poses of the scene's bodies that move ``(frames, bodies, 6)`` [m, rad], by ``body_names``.
+        body_velocities: of these in the world's axes: of the origin [m/s], turn a second [rad/s] ``(frames, bodies, 6)``.
+        height_m: height over the ground below, measured straight down ``(frames,)``; nan where nothing is below.
+        level: how image values stand for level: ``linear`` (level = value * level_scale), ``dB``, ``gamma`` or ``contrast``.
+        level_scale: what undoes the constant gain.
+        sonar: the instrument.
+        elevation_rad: elevation of the strongest echo of each pixel, like ``image``, float32.
+        shape_id: the shape of that echo (its place in the scene), int32.
+        object_id: the object of that echo, as its mesh numbers them (attribute ``face_id``; 0 without it), int32.
+        shape_names: name of each shape by its ``shape_id``; empty where they are not known.
+        object_names: name of each object by its ``object_id``, the shape that it is part of and its number: ``cubes 12``;
+            empty where they are not known.
+        shadow: 0 not in shadow; 1 no echo here, but echoes before and sound or echoes beyond; 2 no echo here and all
+            sound of the beam was intercepted before (an object's shadow that nothing ends, or past the lit floor).
+        attitude_rad: pitch, roll, heading [rad] of the sonar by its own sensors ``(frames, 3)``; nan where unknown.
+    """
+
+    image: NDArray[Any]
+    range_m: NDArray[np.float64]
+    bearing_rad: NDArray[np.float64]
+    time_s: NDArray[np.float64]
+    sonar: Sonar
+    poses: NDArray[np.float64] | None = None
+    height_m: NDArray[np.float64] | None = None
+    level: str = "linear"
+    level_scale: float = 1.0
+    elevation_rad: NDArray[np.float32] | None = None
+    shape_id: NDArray[np.int32] | None = None
+    object_id: NDArray[np.int32] | None = None
+    shadow: NDArray[np.uint8] | None = None
+    shape_names: tuple[str, ...] = ()
+    object_names: tuple[str, ...] = ()
+    attitude_rad: NDArray[np.float64] | None = None
+    beam_poses: NDArray[np.float64] | None = None
+    body_poses: NDArray[np.float64] | None = None
+    body_velocities: NDArray[np.float64] | None = None
+    body_names: tuple[str, ...] = ()
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        frames, bins, beams = self.image.shape if self.image.ndim == 3 else (0, 0, 0)
+        if (bins, beams) != (len(self.range_m), len(self.bearing_rad)) or len(self.time_s) != frames:
+            raise MitsonarError(
+                f"image must be (frames, bins, beams) = ({len(self.time_s)}, {len(self.range_m)}, "
+                f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
+            )
+        if self.level not in LEVELS:
+            raise MitsonarError(f"level must be one of {', '.join(LEVELS)}: got {shortened(self.level)}")
+        for name in PER_FRAME:
+            values = getattr(self, name)
+            if values is not None and len(values) != frames:
+                raise MitsonarError(f"{name} must hold {frames} frames: got {len(values)}")
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    def __repr__(self) -> str:
+        known = [name for name in ("poses", "height_m", *LABELS) if getattr(self, name) is not None]
+        near, far = (self.range_m[0], self.range_m[-1]) if len(self.range_m) else (0.0, 0.0)
+        return (
+            f"SonarFrames({len(self)} frames of {len(self.range_m)} bins x {len(self.bearing_rad)} beams, "
+            f"{near:.4g}..{far:.4g} m, {self.image.dtype}, level {self.level}, sonar {self.sonar.name}; "
+            f"{', '.join(known) or 'no poses'})"
+        )
+
+    @property
+    def pitch_rad(self) -> NDArray[np.float64] | None:
+        """Pitch of each frame ``(frames,)`` [rad], where poses are known."""
+        return None if self.poses is None else self.poses[:, 3]
+
+    def decibels_of(self, value: float) -> float:
+        """Return the level that a value 0..1 of the image stands for [dB re 1 uPa], with the gain of the sonar.
+
+        Relative to the source where the sonar has no ``source_level_db``. A value of 0 of a linear image is -inf.
+        """
+        with np.errstate(divide="ignore"):
+            level = 10 * np.log10(decoded(value, self.sonar, self.level) * self.level_scale)
+        return float(level) + self.sonar.source_level_db
+
+    def to_linear(self) -> SonarFrames:
+        """Return the same frames with images that are levels: float32 in 0..1, relative to full scale.
+
+        Codings ``dB`` and ``gamma`` are undone with the numbers of the sonar. A value 0 of the coding dB becomes its least
+        level.
+
+        Raises:
+            MitsonarError: images of contrast, of which levels cannot be had back.
+        """
+        return replace(self, image=self.linear_values(), level="linear")
+
+    def linear_values(self) -> NDArray[np.float32]:
+        """Return the levels of the images as float32, as parts of full scale, like ``image``.
+
+        Raises:
+            MitsonarError: images of contrast, of which levels cannot be had back.
+        """
+        if self.level == "contrast":
+            raise MitsonarError("images of contrast hold no levels: take the frames before their contrast")
+        values = to_float32(self.image)
+        if self.level == "linear":
+            return values
+        return np.asarray(decoded(np.clip(values, 0, 1), self.sonar, self.level), dtype=np.float32)
+
+    def in_decibels(self) -> NDArray[np.float32]:
+        """Return levels relative to full scale, like ``image`` [dB], -100 at least.
+
+        Raises:
+            MitsonarError: as :meth:`linear_values`.
+        """
+        level = np.maximum(self.linear_values(), np.float32(10 ** (FLOOR_DB / 10)))
+        return np.asarray(10 * np.log10(level), dtype=np.float32)
+
+    def matching_values(self) -> NDArray[np.float32]:
+        """Return the images as float32 in 0..1, as estimators and mosaics match them, like ``image``.
+
+        Linear images and those of contrast are as they are. Of images in the codings ``dB`` and ``gamma`` the root of the
+        amplitude is returned: of level, amplitude, its root and dB it made the smallest errors on speckle, with all
+        estimators.
+        """
+        if self.level == "contrast":
+            return to_float32(self.image)
+        return self.linear_values() if self.level == "linear" else self.linear_values() ** np.float32(0.25)
+
+    def select(self, index: slice | NDArray[Any]) -> SonarFrames:
+        """Return some of the frames."""
+        picked = {name: getattr(self, name)[index] for name in PER_FRAME if getattr(self, name) is not None}
+        rest = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in picked}
+        return SonarFrames(**picked, **rest)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what ``frames.npz`` holds, by name; ``sonar``, ``about`` and ``names`` are JSON texts."""
+        table = {
+            "image": self.image,
+            "range_m": self.range_m,
+            "bearing_rad": self.bearing_rad,
+            "time_s": self.time_s,
+            "level": np.array(self.level),
+            "level_scale": np.array(self.level_scale),
+            "sonar": np.array(self.sonar.model_dump_json()),
+            "about": np.array(json.dumps(self.about)),
+        }
+        optional = ("poses", "beam_poses", *BODIES, "attitude_rad", "height_m", *LABELS)
+        table |= {name: getattr(self, name) for name in optional if getattr(self, name) is not None}
+        names = {"shapes": self.shape_names, "objects": self.object_names}
+        names |= {"bodies": self.body_names} if self.body_names else {}
+        if any(names.values()):
+            table["names"] = np.array(json.dumps(names))
+        return table | ({} if self.poses is None else {"pitch_rad": self.poses[:, 3]})
+
+    @classmethod
+    def from_arrays(cls, table: dict[str, NDArray[Any]], source: str = "frames") -> SonarFrames:
+        """Frames from what :meth:`arrays` gave; ``source`` is named in errors."""
+        needed = ("image", "range_m", "bearing_rad", "time_s", "sonar")
+        missing = [name for name in needed if name not in table]
+        if missing:
+            raise MitsonarError(f"{source} lacks {', '.join(missing)}: it is not a frames file of mitsonar")
+        sonar = Sonar.create(**table_in(table, "sonar", source))
+        about = table_in(table, "about", source, "{}")
+        names = table_in(table, "names", source, "{}")
+        try:
+            level, scale = text_of(table, "level", "linear"), number_of(table, "level_scale", 1.0)
+        except MitsonarError as error:
+            raise MitsonarError(f"{source}: {error}") from None
+        values = {name: table[name] for name in COLUMNS if name in table}
+        _check_values(values, source)
+        shapes, objects, bodies = (_texts(names, key, source) for key in ("shapes", "objects", "bodies"))
+        return cls(
+            **values,
+            sonar=sonar,
+            level=level,
+            level_scale=scale,
+            about=about,
+            shape_names=shapes,
+            object_names=objects,
+            body_names=bodies,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write ``frames.npz``."""
+        table: dict[str, Any] = self.arrays()
+        np.savez_compressed(Path(path), **table)
+
+    @classmethod
+    def load(cls, path: str | Path) -> SonarFrames:
+        """Read ``frames.npz``, or the ``frames.zarr`` of a long run, or the folder of a run that holds either.
+
+        Raises:
+            MitsonarError: no such file, or not frames.
+        """
+        path = Path(path)
+        if os.path.isdir(path) and path.suffix != ".zarr":
+            found = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
+            if not found:
+                raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
+            path = found[0]
+        if not os.path.exists(path):
+            raise MitsonarError(f"there are no frames at {path}: give frames.npz or a run's folder")
+        try:
+            if os.path.isdir(path):
+                table, done = open_group(path, COLUMNS, "time_s", "frames_done")
+                refuse_beyond_memory(sum(getattr(values, "nbytes", 0) for values in table.values()), str(path))
+                arrays = {name: values for name, values in table.items() if not isinstance(values, np.ndarray)}
+                table |= {name: one[:done] if name in PER_FRAME else one[...] for name, one in arrays.items()}
+            else:
+                table = read_npz(path)
+        except Exception as error:  # a damaged zip or Zarr raises whatever its bytes lead to
+            reason = " ".join(str(error).split())[:300] or type(error).__name__
+            raise MitsonarError(f"cannot read frames {path}: {reason}; give frames.npz or a run's folder") from None
+        return cls.from_arrays(table, str(path))
+
+
+def _texts(names: dict[str, Any], key: str, source: str) -> tuple[str, ...]:
+    """Return the texts of a list in the field ``names``.
+
+    Raises:
+        MitsonarError: it is no list of texts.
+    """
+    found = names.get(key, [])
+    if not (isinstance(found, list) and all(isinstance(one, str) for one in found)):
+        raise MitsonarError(f"{source}: {key} of the field names must be a list of texts; the file is damaged")
+    return tuple(found)
+
+
+def _check_values(values: dict[str, NDArray[Any]], source: str) -> None:
+    """Check the arrays of frames against each other and against what they may be.
+
+    Raises:
+        MitsonarError: types, shapes or values that cannot be.
+    """
+    sizes: dict[str, int] = {}
+    for name in ("range_m", "bearing_rad"):
+        check_column(values[name], name, COLUMNS[name], sizes, source)
+        sizes[COLUMNS[name].dims[0]] = len(values[name])
+    time = values["time_s"]
+    column = COLUMNS["time_s"] if time.ndim != 2 else replace(COLUMNS["time_s"], dims=("frames", "beams"))
+    check_column(time, "time_s", column, sizes, source)
+    sizes["frames"] = len(time)
+    sizes |= {"six": 6, "three": 3}
+    for name in [name for name in values if name not in ("range_m", "bearing_rad", "time_s")]:
+        check_column(values[name], name, COLUMNS[name], sizes, source)
+    image = values["image"]
+    if image.dtype.kind == "f" and image.size and image.max() > 1 + 1e-5:
+        raise MitsonarError(f"{source}: image must lie in 0..1, or be uint8: got up to {image.max():.6g}")
+
+
+def to_float32(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Return 0..255 of uint8, or 0..1, as float32 in 0..1: always a copy."""
+    return np.asarray(image, dtype=np.float32) * np.float32(1 / 255 if image.dtype == np.uint8 else 1)
+
+
+def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """0..1 to 0..255, a non-zero echo at least 1, so that zero means no echo."""
+    values = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return np.where((image > 0) & (values == 0), np.uint8(1), values)
+
+
+# ---------------- Frames on disk, written as they are made, in constant memory: a Zarr group, at the end of a short
+# run ``frames.npz``
+
+
+LONGEST_NPZ = 1000
+"""Most frames of a run that ends as one ``frames.npz``. Longer runs keep ``frames.zarr``."""
+
+
+class FrameStore:
+    """The frames of one run, on disk as ``frames.zarr`` (Zarr v3, one chunk a frame).
+
+    The group holds the arrays of ``frames.npz`` by the same names. ``sonar``, ``level``, ``level_scale``, ``about`` and
+    ``names`` are attributes. So is ``frames_done``, the number of frames that are written.
+    """
+
+    def __init__(self, group: zarr.Group, path: Path) -> None:
+        self.group, self.path = group, path
+
+    @classmethod
+    def create(cls, path: Path, frames: int, like: SonarFrames) -> FrameStore:
+        """Create an empty store for ``frames`` frames with the arrays and attributes of ``like``."""
+        group = zarr.open_group(path, mode="w", zarr_format=3)
+        table = like.arrays()
+        for name in ("level", "level_scale", "sonar", "about", "names"):
+            if name in table:
+                group.attrs[name] = table.pop(name).item()
+        for name, values in table.items():
+            each = name in PER_FRAME or name == "pitch_rad"
+            shape = (frames, *values.shape[1:]) if each else values.shape
+            chunks = (1, *shape[1:]) if len(shape) == 3 else shape
+            array = group.create_array(name, shape=shape, chunks=chunks, dtype=values.dtype, fill_value=0)
+            if not each:
+                array[...] = values
+        group.attrs["frames_done"] = 0
+        return cls(group, path)
+
+    @classmethod
+    def open(cls, path: Path) -> FrameStore:
+        """Open a store that was begun, and remove what a kill left half written.
+
+        Raises:
+            MitsonarError: there is none, or it is damaged.
+        """
+        try:
+            store = cls(arrays_in(path, "r+")[0], path)
+            store.frames, store.done  # noqa: B018
+            for left in path.rglob("*.partial"):  # Zarr writes a file under such a name, then renames it
+                left.unlink()
+        except Exception as error:  # a damaged Zarr raises errors of many kinds
+            raise MitsonarError(f"cannot go on with {path}: {error}; render again with --overwrite") from None
+        return store
+
+    def check(self, frames: int, sonar: Sonar, done: int) -> None:
+        """Check that the store is that of a run.
+
+        Args:
+            frames: of the whole run.
+            sonar: its instrument.
+            done: frames that are written, according to the run.
+
+        Raises:
+            MitsonarError: arrays are missing, have other shapes or chunks, or fewer frames are written.
+        """
+        cells = (sonar.range_bins, sonar.beams)
+        sizes = {"frames": frames, "bins": cells[0], "beams": cells[1], "six": 6}
+        try:
+            whole_number(self.group.attrs["frames_done"], "frames_done")
+            if not done <= self.done <= frames:
+                raise ValueError(f"it holds {self.done:,} frames, run.json says {done:,} of {frames:,}")
+            _, arrays = arrays_in(self.path, "r+")
+            for name, array in arrays.items():
+                if name in COLUMNS and not (name == "time_s" and array.shape == (frames, cells[1])):
+                    check_column(array, name, COLUMNS[name], sizes, "it")
+                wanted = (1, *array.shape[1:]) if array.ndim == 3 else array.shape
+                if array.chunks != wanted:
+                    raise ValueError(f"{name} is cut into pieces of {array.chunks}, not {wanted}")
+            lacking = {"image", "range_m", "bearing_rad", "time_s"} - set(arrays)
+            if lacking:
+                raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
+        except Exception as error:
+            raise MitsonarError(f"cannot go on with {self.path}: {error}; render again with --overwrite") from None
+
+    @property
+    def frames(self) -> int:
+        """Return the number of frames of the whole run."""
+        return int(self.group["image"].shape[0])  # type: ignore[union-attr]
+
+    @property
+    def done(self) -> int:
+        """Return the number of frames that are written."""
+        return int(self.group.attrs["frames_done"])  # type: ignore[arg-type]
+
+    def write(self, first: int, frames: SonarFrames) -> None:
+        """Write consecutive frames. They count as done once all of them are on disk."""
+        table = frames.arrays()
+        for name in [*PER_FRAME, "pitch_rad"]:
+            if name in table:
+                self.group[name][first : first + len(frames)] = table[name]  # type: ignore[index]
+        self.group.attrs["frames_done"] = first + len(frames)
+
+    def pack(self, path: Path) -> None:
+        """Turn a finished store into ``frames.npz``, frame by frame, and remove it. Equal frames become equal bytes."""
+        part = path.with_name(f".{path.name}.part")
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1, allowZip64=True) as file:
+            for name, array in sorted(self.group.arrays()):  # which lists a folder
+                with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    _write_npy(entry, array)
+            for name, value in sorted(self.group.attrs.items()):
+                if name != "frames_done":
+                    buffer = io.BytesIO()
+                    np.save(buffer, np.array(value))
+                    with file.open(f"{name}.npy", "w") as entry:  # writestr would add the time of the clock
+                        entry.write(buffer.getvalue())
+        part.replace(path)
+        shutil.rmtree(self.path)
+
+
+def _write_npy(entry: IO[bytes], array: StoredArray) -> None:
+    """Write an array as .npy, one frame at a time."""
+    header = {"descr": np.lib.format.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
+    np.lib.format.write_array_header_2_0(entry, header)
+    for piece in _pieces(array):
+        entry.write(np.ascontiguousarray(piece).tobytes())
+
+
+def _pieces(array: StoredArray) -> Iterator[FileArray]:
+    """Yield an array frame by frame, or whole where it has no frames."""
+    if array.ndim < 3:
+        yield np.asarray(array[...])
+        return
+    for index in range(array.shape[0]):
+        yield np.asarray(array[index])
