@@ -27,7 +27,7 @@ from mitsonar.acoustics import statistics
 from mitsonar.acoustics.levels import decoded
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.sonar_fit import SonarFit, fit_sonar
-from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.geometry.fan import to_cartesian
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.variant import ensure_variant

@@ -24,7 +24,7 @@ from scipy import ndimage
 
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry

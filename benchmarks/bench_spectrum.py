@@ -34,7 +34,7 @@ from mitsonar.datasets.store import DataStore
 from mitsonar.datasets.torch_pairs import SonarPairs
 from mitsonar.estimation.crlb.fisher_bound import overall
 from mitsonar.estimation.crlb.image_crlb import bound
-from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.errors import in_units
 from mitsonar.motion.pose import Pose

@@ -21,7 +21,7 @@ from PIL import Image
 
 import mitsonar
 from mitsonar.acoustics.levels import decoded
-from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.geometry.fan import to_cartesian
 from mitsonar.simulation.scene import sonar_in
 
 SPAN_DB = 50.0

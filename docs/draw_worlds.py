@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 import mitsonar
-from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.geometry.fan import to_cartesian
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.scene import sonar_in
 from mitsonar.simulation.variant import ensure_variant

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mitsonar.estimation.crlb.image_crlb import cramer_rao_bound
     from mitsonar.estimation.estimator import Estimate
     from mitsonar.estimation.named_estimators import create_estimator, load_checkpoint
-    from mitsonar.geometry.scan_conversion import to_cartesian
+    from mitsonar.geometry.fan import to_cartesian
     from mitsonar.instruments.hydrophones import ChannelSonar
     from mitsonar.instruments.sonar import Sonar
     from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder
@@ -196,7 +196,7 @@ _MODULES = {
     "shipped_trajectory": "simulation.scene",
     "simulated_sensors": "mapping.simulated_sensors",
     "sonar_in": "simulation.scene",
-    "to_cartesian": "geometry.scan_conversion",
+    "to_cartesian": "geometry.fan",
     "write_mcap": "recordings.mcap_writer",
 }
 

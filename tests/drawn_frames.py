@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.motion_series import path_of
 from mitsonar.motion.pose import Pose

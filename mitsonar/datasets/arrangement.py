@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.noise import NoiseModel, load_noise, uniform
 from mitsonar.config.data_recipe import Recipe
 from mitsonar.errors import MitsonarError, nearest_names
-from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
+from mitsonar.geometry.fan import CartesianMap, cartesian_map
 
 __all__ = ["LABELS", "Arrangement", "ArrayOfAnyLibrary", "Labels", "arrangement_of"]
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mitsonar.geometry.attitude import Attitude
-from mitsonar.geometry.ground_plane import GroundGeometry, nearest_known
-from mitsonar.geometry.lit_ground import margin_of_light
+from mitsonar.geometry.ground import Attitude, GroundGeometry, margin_of_light, nearest_known
 from mitsonar.instruments.sonar import Bearing
 from mitsonar.records.frames import SonarFrames
 
@@ -84,7 +82,7 @@ def ground_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.f
 def light_of(frames: SonarFrames, attitude: Attitude) -> dict[str, NDArray[np.float32]]:
     """Compute how far inside the light the ground of each node lies, as ``lit (R, C)``; empty where its outline is left in.
 
-    See :func:`mitsonar.geometry.lit_ground.margin_of_light`. It stays in where
+    See :func:`mitsonar.geometry.ground.margin_of_light`. It stays in where
     little of the window is lit, as in training, which does without this table.
     """
     range_m, bearing_rad = (

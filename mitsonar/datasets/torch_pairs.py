@@ -21,7 +21,7 @@ from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.sample_index import AnySplit, Part
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError, refuse_unknown
-from mitsonar.geometry.attitude import attitude_of
+from mitsonar.geometry.ground import attitude_of
 from mitsonar.motion.composition import motions
 from mitsonar.records.frames import SonarFrames
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.environments.sonar_fleet import SonarFleet
 from mitsonar.environments.sonar_task import Table
-from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
+from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.sonar import Sonar
 
 __all__ = ["Array", "Observation", "action_space", "fan_of", "fan_picture", "observation_space", "observed"]

@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 INPUTS = "pitch; height where no first echoes show"
-"""Inputs of methods that know the geometry, beside the images; see :mod:`mitsonar.geometry.attitude`."""
+"""Inputs of methods that know the geometry, beside the images; see :mod:`mitsonar.geometry.ground`."""
 
 FEWEST_CELLS = 8
 """Fewest bins and beams of an image that can be registered."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from mitsonar.geometry.sonar_projection import Views, projection_of
+from mitsonar.geometry.fan import Views, projection_of
 from mitsonar.instruments.sonar import Bearing
 
 __all__ = ["PLANAR", "Adjusted", "Observations", "adjusted", "cauchy", "track_weight"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument
-from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import Pose
 from mitsonar.records.frames import SonarFrames

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.estimation.image.patches import COLUMNS, ROWS, Patches, PatchImage, align, corners, cut
-from mitsonar.geometry.sonar_projection import Views, points_at, polar_of, projection_of
+from mitsonar.geometry.fan import Views, points_at, polar_of, projection_of
 from mitsonar.instruments.sonar import Bearing
 from mitsonar.mapping.bundle_adjustment import Observations
 

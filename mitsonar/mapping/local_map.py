@@ -19,8 +19,8 @@ from scipy.ndimage import percentile_filter
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.patches import PatchImage, patch_image
-from mitsonar.geometry.attitude import attitude_of
-from mitsonar.geometry.sonar_projection import Views, polar_of
+from mitsonar.geometry.fan import Views, polar_of
+from mitsonar.geometry.ground import attitude_of
 from mitsonar.mapping.bundle_adjustment import adjusted
 from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.landmarks import ImageAxes, Landmarks

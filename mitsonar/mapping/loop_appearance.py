@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.ground_view import GroundView, fan_places
-from mitsonar.geometry.attitude import attitude_of
+from mitsonar.geometry.ground import attitude_of
 from mitsonar.motion.composition import Motion
 from mitsonar.records.frames import SonarFrames
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.estimation.image.patches import PatchImage
-from mitsonar.geometry.sonar_projection import Views, projection_of
+from mitsonar.geometry.fan import Views, projection_of
 from mitsonar.mapping.bundle_adjustment import PLANAR, cauchy, track_weight
 from mitsonar.mapping.landmarks import Found, Landmarks
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, counted, nearest_names
-from mitsonar.geometry.ground_plane import moved
+from mitsonar.geometry.ground import moved
 from mitsonar.mapping.frame_footprint import (
     LONGEST_SIDE,
     RAYS,
@@ -62,7 +62,7 @@ class Mosaic:
 
     Cells are squares. Their edges lie on whole multiples of ``cell_m`` in the world, so that maps of one cell size fit
     together. A cell takes the value of each frame at its own (range, bearing), bilinear between the centres of bins and
-    beams, with the exact geometry over level ground (:class:`mitsonar.geometry.ground_plane.GroundGeometry`). Only ground
+    beams, with the exact geometry over level ground (:class:`mitsonar.geometry.ground.GroundGeometry`). Only ground
     within the window, the beams and the elevation field of view is updated. There a pixel of 0 counts: a shadow is dark.
     Relief is not modelled: objects that rise from the ground are mapped too near.
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mitsonar.datasets.ground_nodes import NODES
-from mitsonar.geometry.ground_plane import moved
+from mitsonar.geometry.ground import moved
 
 __all__ = ["Ground", "WarpGrid", "displacement"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map, nearest_cells
+from mitsonar.geometry.fan import CartesianMap, cartesian_map, nearest_cells
 from mitsonar.io.files import write_json, write_whole
 from mitsonar.records.frames import SonarFrames, to_float32, to_uint8
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, explain_missing
-from mitsonar.geometry.scan_conversion import cartesian_map
+from mitsonar.geometry.fan import cartesian_map
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.plotting.decibel_frames import coded_in_decibels
 from mitsonar.records.frames import SonarFrames

@@ -21,7 +21,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.scan_conversion import CartesianMap, cartesian_map
+from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.views import directions
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS

@@ -21,7 +21,7 @@ from helpers import Command, essence, refused, run_python
 
 from mitsonar.cli.console import OPTIONS, answered, command_line, say_json
 from mitsonar.errors import MitsonarError, argument, meant
-from mitsonar.geometry.attitude import attitude_of
+from mitsonar.geometry.ground import attitude_of
 
 AMPHORA = Path(__file__).parents[1] / "scenes" / "meshes" / "amphora.ply"
 

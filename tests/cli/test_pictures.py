@@ -11,7 +11,7 @@ from drawn_frames import over_ground, sway
 from helpers import Command, refused
 from PIL import Image
 
-from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.geometry.fan import to_cartesian
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.config.data_recipe import Split, load_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.geometry.fan import to_cartesian
 from mitsonar.motion.pose import Pose
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")

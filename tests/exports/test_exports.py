@@ -23,7 +23,7 @@ from mitsonar.exports.export_source import open_export
 from mitsonar.exports.labelled_pictures import LabelledPictures, class_rules
 from mitsonar.exports.named_exports import export_to
 from mitsonar.exports.run_length import compressed, runs_of
-from mitsonar.geometry.scan_conversion import nearest_cells
+from mitsonar.geometry.fan import nearest_cells
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation

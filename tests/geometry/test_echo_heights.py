@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import lit_plane
 
-from mitsonar.geometry.echo_heights import TOPS, echo_heights
+from mitsonar.geometry.ground import TOPS, echo_heights
 from mitsonar.instruments.beams import half_power
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.frames import SonarFrames

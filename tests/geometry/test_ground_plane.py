@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.attitude import attitude_of
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
-from mitsonar.geometry.scan_conversion import cartesian_map, to_cartesian
+from mitsonar.geometry.fan import cartesian_map, to_cartesian
+from mitsonar.geometry.ground import GroundGeometry, attitude_of, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose, vehicle_rotation

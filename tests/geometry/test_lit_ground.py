@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.geometry.attitude import Attitude
-from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.geometry.lit_ground import margin_of_light
+from mitsonar.geometry.ground import Attitude, GroundGeometry, margin_of_light
 
 FOV_DEG = 14.0
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mitsonar.geometry.ground_plane import GroundGeometry
-from mitsonar.geometry.sonar_projection import Views, points_at, polar_of, projection_of
+from mitsonar.geometry.fan import Views, points_at, polar_of, projection_of
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Bearing
 
 POSE = np.array([1.2, -0.7, 2.5, np.radians(35), np.radians(4), np.radians(70)])

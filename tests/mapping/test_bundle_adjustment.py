@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mitsonar.geometry.sonar_projection import Views, polar_of
+from mitsonar.geometry.fan import Views, polar_of
 from mitsonar.instruments.sonar import Bearing
 from mitsonar.mapping.bundle_adjustment import Adjusted, Observations, adjusted
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.zero import Zero
-from mitsonar.geometry.sonar_projection import Views, polar_of
+from mitsonar.geometry.fan import Views, polar_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping import local_map
 from mitsonar.mapping.frame_source import FrameSource

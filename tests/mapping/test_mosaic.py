@@ -16,7 +16,7 @@ from PIL import Image
 from scipy import ndimage
 
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions
 from mitsonar.mapping.geotiff import save_geotiff

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.datasets.ground_nodes import NODES, ground_at
 from mitsonar.errors import MitsonarError
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Bearing
 from mitsonar.motion.composition import Motion, compose, inverse
 from mitsonar.motion.pose import Pose

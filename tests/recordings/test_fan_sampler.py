@@ -10,7 +10,7 @@ from fans import FAN, drawn
 from numpy.typing import NDArray
 
 from mitsonar import MitsonarError
-from mitsonar.geometry.scan_conversion import to_cartesian
+from mitsonar.geometry.fan import to_cartesian
 from mitsonar.recordings.fan_sampler import FanSampler
 from mitsonar.recordings.geometry_file import PictureGeometry
 

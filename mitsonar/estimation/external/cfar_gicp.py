@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import INPUTS, Estimate, rejected, two_frames
 from mitsonar.estimation.external.ground_pair import package
-from mitsonar.geometry.attitude import Attitude, attitude_of
+from mitsonar.geometry.ground import Attitude, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 

@@ -36,7 +36,7 @@ from mitsonar.estimation.image.direct_registration import Fit, Held, is_resolved
 from mitsonar.estimation.image.direct_relief import registered_over_relief
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.prior_gate import prior_rejection
-from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
+from mitsonar.geometry.ground import STD_MEASURED, Attitude, attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import LABELS, SonarFrames
 

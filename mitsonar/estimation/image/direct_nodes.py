@@ -8,9 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.geometry.attitude import Attitude
-from mitsonar.geometry.ground_plane import GroundGeometry, moved, nearest_known
-from mitsonar.geometry.lit_ground import margin_of_light
+from mitsonar.geometry.ground import Attitude, GroundGeometry, margin_of_light, moved, nearest_known
 from mitsonar.motion.composition import Motion, inverse
 from mitsonar.records.frames import SonarFrames
 
@@ -84,7 +82,7 @@ class GroundNodes:
     def shown(self) -> tuple[NDArray[np.bool_], bool]:
         """Return which nodes show ground to be matched ``(nodes, nodes)``, and whether the outline of the light is masked.
 
-        See :func:`mitsonar.geometry.lit_ground.margin_of_light`.
+        See :func:`mitsonar.geometry.ground.margin_of_light`.
         """
         margin = margin_of_light(self.ground, self.attitude, self.frames.sonar.elevation_fov_deg)
         return (self.known, False) if margin is None else (self.known & (margin >= 0), True)

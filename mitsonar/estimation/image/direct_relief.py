@@ -28,7 +28,7 @@ from mitsonar.estimation.image.direct_registration import (
     smoothed,
 )
 from mitsonar.estimation.image.image_slopes import blurred, sampled, slopes_of
-from mitsonar.geometry.attitude import Attitude
+from mitsonar.geometry.ground import Attitude
 from mitsonar.records.frames import SonarFrames
 
 __all__ = ["registered_over_relief"]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.sonar import Bearing
 
 __all__ = ["FlowLevel", "WindowGrid", "window_grid"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, blank, matching_rejection, rejected, two_frames
 from mitsonar.estimation.image.ground_view import GroundView
-from mitsonar.geometry.attitude import attitude_of
+from mitsonar.geometry.ground import attitude_of
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 

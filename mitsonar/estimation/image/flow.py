@@ -33,8 +33,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
 from mitsonar.estimation.image.displacement_map import FlowLevel, WindowGrid, window_grid
 from mitsonar.estimation.image.displacement_match import STILL, TINY, WindowFlow, in_blocks, match_map, match_vector
-from mitsonar.geometry.attitude import attitude_of
-from mitsonar.geometry.ground_plane import moved
+from mitsonar.geometry.ground import attitude_of, moved
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
 
@@ -86,7 +85,7 @@ class Flow:
         relief_m: mean height over the ground of what is seen; default: from the first echoes, where the window shows them.
         match: ``map``, each window by what it knows; or ``vector``, three means and slopes of all windows.
         height_std: how well the height over what is seen is known, as part of it; 0: exactly; default: as
-            :func:`~mitsonar.geometry.attitude.attitude_of` says. Only for ``map``.
+            :func:`~mitsonar.geometry.ground.attitude_of` says. Only for ``map``.
         levels: coarse to fine.
 
     Raises:

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.geometry.attitude import Attitude
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.geometry.ground import Attitude, GroundGeometry, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 from mitsonar.records.frames import SonarFrames

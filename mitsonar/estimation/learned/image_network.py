@@ -31,7 +31,7 @@ from mitsonar.estimation.estimator import (
 from mitsonar.estimation.image.phase import Phase
 from mitsonar.estimation.learned.trained_network import BEYOND, Trained, TrainedInstrument, answer_of, one_thread
 from mitsonar.estimation.prior_gate import prior_rejection
-from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
+from mitsonar.geometry.ground import STD_MEASURED, Attitude, attitude_of
 from mitsonar.instruments.sounder import sonar_from
 from mitsonar.motion.composition import Motion, MotionPrior, inverse
 from mitsonar.networks.checkpoint import Checkpoint

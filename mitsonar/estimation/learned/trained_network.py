@@ -17,7 +17,7 @@ from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.datasets.arrangement import Arrangement
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS
-from mitsonar.geometry.scan_conversion import cartesian_map
+from mitsonar.geometry.fan import cartesian_map
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.errors import AXES

@@ -25,7 +25,7 @@ from mitsonar.estimation.crlb.image_crlb import (
     floor_ranges,
     varied,
 )
-from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose

@@ -20,7 +20,7 @@ from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.external.cfar_gicp import CfarGicp
 from mitsonar.estimation.external.ground_pair import ground_pair
 from mitsonar.estimation.named_estimators import EXTERNAL, create_estimator
-from mitsonar.geometry.ground_plane import GroundGeometry, moved
+from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.mapping.odometry import odometry
 from mitsonar.motion.composition import Motion, MotionPrior, compose
 from mitsonar.motion.pose import Pose

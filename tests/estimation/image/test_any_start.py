@@ -15,8 +15,7 @@ from mitsonar.estimation.image.direct import Direct, is_far
 from mitsonar.estimation.image.direct_blocks import by_block, cell_blocks, on_cells
 from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.estimation.prior_gate import prior_rejection
-from mitsonar.geometry.attitude import attitude_of
-from mitsonar.geometry.echo_heights import FirstEchoes
+from mitsonar.geometry.ground import FirstEchoes, attitude_of
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, MotionPrior, compose, motions
 from mitsonar.motion.pose import Pose

@@ -17,7 +17,7 @@ from mitsonar.estimation.image.direct_relief import registered_over_relief
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.estimation.image.image_slopes import blurred
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.geometry.attitude import Attitude
+from mitsonar.geometry.ground import Attitude
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames

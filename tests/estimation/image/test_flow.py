@@ -13,7 +13,7 @@ from scipy import ndimage, special
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.flow import Flow
-from mitsonar.geometry.ground_plane import GroundGeometry
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose

@@ -16,8 +16,7 @@ from mitsonar.estimation.image.ecc import Ecc
 from mitsonar.estimation.image.ground_view import GroundView
 from mitsonar.estimation.named_estimators import create_estimator, estimators_for
 from mitsonar.estimation.zero import Zero
-from mitsonar.geometry.attitude import STD_MEASURED, Attitude, attitude_of
-from mitsonar.geometry.ground_plane import moved
+from mitsonar.geometry.ground import STD_MEASURED, Attitude, attitude_of, moved
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.composition import Motion, compose

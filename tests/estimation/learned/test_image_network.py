@@ -11,7 +11,7 @@ from helpers import lit_plane
 
 from mitsonar.datasets.ground_nodes import ground_at
 from mitsonar.estimation.named_estimators import create_estimator
-from mitsonar.geometry.attitude import STD_MEASURED, Attitude
+from mitsonar.geometry.ground import STD_MEASURED, Attitude
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion
 
