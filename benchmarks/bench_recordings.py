@@ -30,7 +30,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry import odometry
 from mitsonar.mapping.open_frames import open_frames
 from mitsonar.mapping.open_source import LOOP, with_assumed_plane
-from mitsonar.recordings.aris_writer import write_aris
+from mitsonar.recordings.write_aris import write_aris
 from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.plotting.data_sheet import sheet_figure
     from mitsonar.plotting.map_figure import mosaic_figure, path_figure
-    from mitsonar.recordings.mcap_writer import write_mcap
-    from mitsonar.recordings.open_recording import open_recording
+    from mitsonar.recordings.open import open_recording
+    from mitsonar.recordings.write_mcap import write_mcap
     from mitsonar.records.frames import SonarFrames
     from mitsonar.records.responses import ImpulseResponses
     from mitsonar.records.soundings import Echogram, Soundings, range_rates
@@ -185,7 +185,7 @@ _MODULES = {
     "make_dataset": "datasets.generation",
     "mosaic_figure": "plotting.map_figure",
     "odometry": "mapping.odometry",
-    "open_recording": "recordings.open_recording",
+    "open_recording": "recordings.open",
     "particle_mesh": "worlds.water_bodies",
     "path_figure": "plotting.map_figure",
     "path_of": "mapping.motion_series",
@@ -197,7 +197,7 @@ _MODULES = {
     "simulated_sensors": "mapping.simulated_sensors",
     "sonar_in": "simulation.scene",
     "to_cartesian": "geometry.fan",
-    "write_mcap": "recordings.mcap_writer",
+    "write_mcap": "recordings.write_mcap",
 }
 
 plugins.install()

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mitsonar.recordings.aris import FRAME
-from mitsonar.recordings.didson import FILE, FRAME_HEADER
 from mitsonar.recordings.oculus import LATER, OLDER
+from mitsonar.recordings.sound_metrics import FILE, FRAME, FRAME_HEADER
 
 Values = np.ndarray[Any, Any]
 

@@ -61,7 +61,7 @@ def info(
 ) -> None:
     """Print what a recording holds: frames, parts, window, beams, rate, times, gaps, attitude, facts and notes."""
     from mitsonar.recordings.handedness import handedness_of
-    from mitsonar.recordings.recording_summary import summary_lines, summary_of
+    from mitsonar.recordings.open import summary_lines, summary_of
 
     recording = _opened(file, topic, geometry)
     summary = summary_of(recording)
@@ -153,8 +153,8 @@ def convert(
     resume: Annotated[bool, typer.Option("--resume", help="Resume a stopped conversion to a folder.")] = False,
 ) -> None:
     """Convert frames to the folder of a run (frames.npz, or frames.zarr of more than 1,000), to ROS (.mcap) or to .aris."""
-    from mitsonar.recordings.frame_folder import write_frames
-    from mitsonar.recordings.mcap_writer import write_mcap
+    from mitsonar.recordings.pictures import write_frames
+    from mitsonar.recordings.write_mcap import write_mcap
 
     if out.suffix and out.suffix not in (".mcap", ".aris") and not out.is_dir():
         raise MitsonarError(f"{out}: unknown ending; {nearest_names(out.suffix, ['.mcap', '.aris', 'none for a folder'])}")
@@ -211,7 +211,7 @@ def _say_notes(recording: Recording) -> None:
 
 def _to_aris(part: Part, out: Path, *, beams: int | None, overwrite: bool, progress: Callable[[int], None]) -> None:
     """Write a part as an ARIS file; what had to be changed is warned of."""
-    from mitsonar.recordings.aris_writer import write_aris
+    from mitsonar.recordings.write_aris import write_aris
 
     refuse_to_replace(out, overwrite=overwrite)
     part_file = out.with_name(f".{out.stem}.new.aris")  # the writer replaces nothing

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.mapping.open_frames import is_data_set, is_recording, open_frames
-from mitsonar.recordings.open_recording import open_recording
+from mitsonar.recordings.open import open_recording
 from mitsonar.recordings.recording import Part, Recording
 from mitsonar.records.frames import COLUMNS, LABELS, SonarFrames, open_group
 

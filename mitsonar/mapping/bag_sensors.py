@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.sensors import Readings, VehicleSensors, load_sensors
-from mitsonar.recordings.bag_file import BagFile, Message, Topic, is_ros_bag
+from mitsonar.recordings.ros_messages import BagFile, Message, Topic, is_ros_bag
 
 __all__ = ["open_sensors", "sensors_in_bag"]
 

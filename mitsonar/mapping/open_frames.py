@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, counted, nearest_names
 from mitsonar.mapping.frame_source import FrameSource
-from mitsonar.recordings.open_recording import format_of, known_formats, open_recording
+from mitsonar.recordings.open import format_of, known_formats, open_recording
 from mitsonar.recordings.recording import Pixels
 from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group
 

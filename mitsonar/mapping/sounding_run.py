@@ -19,7 +19,7 @@ from mitsonar.mapping.dvl_sensors import dvl_sensors
 from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plotting import sounding_figures
-from mitsonar.recordings.xtf_writer import write_xtf
+from mitsonar.recordings.write_xtf import write_xtf
 from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.dvl import dvl_readings
 from mitsonar.simulation.render_run import SIMULATORS

@@ -1,24 +1,182 @@
-"""Definitions of the ROS messages of sonars, for bags that lack them and for files that are written.
-
-Names, types and order of the fields are those of the public definitions. ``tests/recordings/test_ros_bag.py`` compares their
-MD5 sums with the published ones. Sources:
-
-- ``marine_acoustic_msgs``: apl-ocean-engineering/marine_msgs (BSD-3-Clause), ``ProjectedSonarImage``, ``PingInfo``,
-  ``SonarImageData``. The older package ``acoustic_msgs`` has the same messages.
-- ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, as the pings of BlueROVs with an Oculus
-  are recorded. Older versions hold a ``sensor_msgs/Image``; their bags bring the definition along.
-- ``tf2_msgs``: ros/geometry2 (BSD-3-Clause), ``TFMessage``, which ``rosbags`` lacks for ROS 1.
-"""
+"""ROS bags: topics and raw messages of ROS 1 bags, ROS 2 bags and MCAP files, read on demand (by ``rosbags``)."""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.io.files import finite_number, parse_json
+from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
-__all__ = ["DTYPES", "FANS", "OCULUS", "PROJECTED", "ros1_types", "ros2_types", "short"]
+__all__ = [
+    "DTYPES",
+    "FANS",
+    "OCULUS",
+    "PROJECTED",
+    "RECORD",
+    "WRITTEN",
+    "BagFile",
+    "Message",
+    "Topic",
+    "frames_like",
+    "is_ros_bag",
+    "metadata_of",
+    "ros1_types",
+    "ros2_types",
+    "short",
+]
+
+
+Message: TypeAlias = Any
+"""A decoded message; its definition, which stands in the bag, says which fields it has."""
+
+ROS1 = b"#ROSBAG V"
+MCAP = b"\x89MCAP0\r\n"
+SQLITE = b"SQLite format 3\x00"
+
+ENDS = {ROS1: ".bag", MCAP: ".mcap", SQLITE: ".db3"}
+"""First bytes of bags of one file, and how their names end."""
+
+
+REPAIRS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
+"""What makes a bag whole that a recorder has not closed, by the end of its name."""
+
+
+class Topic(NamedTuple):
+    """A topic: its name, its type (``sensor_msgs/msg/Image``) and its number of messages."""
+
+    name: str
+    kind: str
+    messages: int
+
+
+def is_ros_bag(path: Path, first: bytes) -> bool:
+    """Return whether a file with these first bytes, or a folder, is a ROS bag."""
+    if not first and path.is_dir():
+        return _is_ros2_folder(path)
+    return first.startswith((ROS1, MCAP)) or (first.startswith(SQLITE) and path.suffix == ".db3")
+
+
+def _is_ros2_folder(path: Path) -> bool:
+    try:
+        with (path / "metadata.yaml").open("rb") as file:
+            return b"rosbag2_bagfile_information" in file.read(4096)
+    except OSError:
+        return False
+
+
+class BagFile:
+    """A bag. It is opened when it is first read, also in another process that it is sent to.
+
+    Raises:
+        MitsonarError: it is damaged, or its name does not end as its format demands.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._reader: AnyReader | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the path only: an open file stays in its process."""
+        return {"path": self.path, "_reader": None}
+
+    @property
+    def is_ros1(self) -> bool:
+        """Return whether it is a bag of ROS 1."""
+        return self.path.suffix == ".bag"
+
+    def topics(self) -> list[Topic]:
+        """Return all topics."""
+        with self._readable():
+            found = self._open().topics
+            return [Topic(name, one.msgtype or "several types", one.msgcount) for name, one in sorted(found.items())]
+
+    def messages(self, topic: str, start: int | None = None, stop: int | None = None) -> Iterator[tuple[int, bytes]]:
+        """Read the raw messages of a topic in the order in which they were received.
+
+        Args:
+            topic: its name.
+            start: time of reception from which they are read [ns].
+            stop: time of reception before which they are read [ns].
+
+        Yields:
+            Time of reception [ns] and bytes of each message.
+        """
+        with self._readable():
+            reader = self._open()
+            for _, time, raw in reader.messages(self._connections(topic), start=start, stop=stop):
+                yield time, bytes(raw)
+
+    def decode(self, raw: bytes, kind: str) -> Message:
+        """Decode a message of a type."""
+        with self._readable():
+            return self._open().deserialize(raw, kind)
+
+    def _connections(self, topic: str) -> list[Connection]:
+        return [one for one in self._open().connections if one.topic == topic]
+
+    def _open(self) -> AnyReader:
+        if self._reader is not None:
+            return self._reader
+        try:
+            from rosbags.highlevel import AnyReader
+        except ModuleNotFoundError as error:
+            raise explain_missing(error) from None
+        self._check_name()
+        reader = AnyReader([self.path], default_typestore=ros1_types() if self.is_ros1 else ros2_types())
+        reader.open()
+        self._reader = reader
+        return reader
+
+    def _check_name(self) -> None:
+        """Check that the name ends as the content demands: ``rosbags`` tells formats by the name."""
+        if self.path.is_dir():
+            return
+        with self.path.open("rb") as file:
+            first = file.read(len(SQLITE))
+        for begin, end in ENDS.items():
+            if first.startswith(begin) and self.path.suffix != end:
+                raise MitsonarError(f"{self.path} is a bag whose name must end with {end}: rename it")
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
+        """Turn whatever a damaged bag leads to into one sentence."""
+        try:
+            yield
+        except (MitsonarError, GeneratorExit):
+            raise
+        except Exception as error:  # a damaged bag raises errors of many kinds
+            reason = " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+            repair = REPAIRS.get(self.path.suffix)
+            raise MitsonarError(
+                f"cannot read the bag {self.path}: {reason}; the file is cut off, damaged or of another kind"
+                + (f": `{repair}` may repair it" if repair else "")
+            ) from None
+
+
+# ---------------- Definitions of the ROS messages of sonars, for bags that lack them and for files that are written
+# Names, types and order of the fields are those of the public definitions. ``tests/recordings/test_ros_bag.py``
+# compares their MD5 sums with the published ones. Sources:
+#
+# - ``marine_acoustic_msgs``: apl-ocean-engineering/marine_msgs (BSD-3-Clause), ``ProjectedSonarImage``, ``PingInfo``,
+#   ``SonarImageData``. The older package ``acoustic_msgs`` has the same messages.
+# - ``sonar_oculus``: MarineRoboticsGroup/sonar_oculus, ``OculusPing``, ``OculusFire``, as the pings of BlueROVs with an
+#   Oculus
+#   are recorded. Older versions hold a ``sensor_msgs/Image``; their bags bring the definition along.
+# - ``tf2_msgs``: ros/geometry2 (BSD-3-Clause), ``TFMessage``, which ``rosbags`` lacks for ROS 1.
+
 
 PROJECTED = ("marine_acoustic_msgs/msg/ProjectedSonarImage", "acoustic_msgs/msg/ProjectedSonarImage")
 """Types of polar images with directions of beams and ranges of bins."""
@@ -137,3 +295,96 @@ def _with_sonars(store: object) -> Typestore:
 def short(kind: str) -> str:
     """Return the name of a type as ROS 1 writes it: ``sensor_msgs/Image``."""
     return kind.replace("/msg/", "/")
+
+
+# ---------------- What ROS messages cannot tell of frames, as a metadata record of an MCAP file: sonar, axes and coding
+
+
+RECORD = "mitsonar"
+"""Name of the record."""
+
+WRITTEN = "/sonar/image"
+"""Topic of the images that it describes."""
+
+FIELDS = ("sonar", "level", "level_scale", "range_m", "bearing_rad")
+
+
+def metadata_of(frames: SonarFrames, span_db: float | None = None) -> dict[str, str]:
+    """Return the record of frames: JSON texts by name.
+
+    Args:
+        frames: of the file.
+        span_db: over which samples are dB of linear levels; None: samples are values in the coding of the frames.
+    """
+    table = {
+        "sonar": frames.sonar.model_dump(),
+        "level": frames.level,
+        "level_scale": frames.level_scale,
+        "range_m": frames.range_m.tolist(),
+        "bearing_rad": frames.bearing_rad.tolist(),
+        "samples": _in_words(frames, span_db),
+    }
+    table |= {} if span_db is None else {"span_db": span_db}
+    return {name: json.dumps(value) for name, value in table.items()}
+
+
+def _in_words(frames: SonarFrames, span_db: float | None) -> str:
+    """Return how samples become levels relative to full scale."""
+    value, sonar = "sample / 255" if frames.image.dtype == np.uint8 else "sample", frames.sonar
+    zero = "0 is no echo; "
+    if span_db is not None or frames.level == "dB":
+        text = f"{zero if span_db else ''}level in dB = {span_db or sonar.coding_db:g} * ({value} - 1)"
+    elif frames.level == "gamma":
+        text = f"level in dB = {20 / sonar.coding_gamma:g} * log10({value})"
+    elif frames.level == "linear":
+        text = f"{zero}level in dB = 10 * log10({value})"
+    else:
+        return "contrast: there are no levels"
+    return f"{text}, relative to full scale, which is {10 * np.log10(frames.level_scale) + sonar.source_level_db:.6g} dB"
+
+
+def frames_like(path: Path, images: np.dtype[np.generic]) -> tuple[SonarFrames, float | None] | None:
+    """Return frames without images as the record of a file describes them, and the span of their samples.
+
+    The span [dB] is None where samples are the values of the images. Without a record the answer is None.
+
+    Args:
+        path: of an ``.mcap``.
+        images: type of the images.
+
+    Raises:
+        MitsonarError: a damaged record.
+    """
+    record = _record_in(path)
+    if record is None:
+        return None
+    source = f"the metadata of {path}"
+    missing = [name for name in FIELDS if name not in record]
+    if missing:
+        raise MitsonarError(f"{source} lack {', '.join(missing)}: the file is damaged")
+    value = {name: parse_json(record[name], f"{name} in {source}") for name in FIELDS}
+    try:
+        axes = {name: np.array(value[name], dtype=np.float64).reshape(-1) for name in ("range_m", "bearing_rad")}
+        table = {name: np.array(value[name]) for name in ("level", "level_scale")} | {"sonar": np.array(record["sonar"])}
+        nothing = {"image": np.zeros((0, *(len(one) for one in axes.values())), images), "time_s": np.zeros(0)}
+    except (TypeError, ValueError) as error:
+        raise MitsonarError(f"{source} are damaged: {error}") from None
+    span_db = None
+    if "span_db" in record:
+        span_db = finite_number(parse_json(record["span_db"], f"span_db in {source}"), f"span_db in {source}", above=0)
+        nothing["image"] = nothing["image"].astype(np.float32)
+    return SonarFrames.from_arrays({**axes, **table, **nothing}, source), span_db
+
+
+def _record_in(path: Path) -> dict[str, str] | None:
+    """Return mitsonar's metadata record of a file."""
+    try:
+        from mcap.reader import make_reader
+    except ModuleNotFoundError as error:
+        raise explain_missing(error) from None
+    try:
+        with path.open("rb") as file:
+            return next((one.metadata for one in make_reader(file).iter_metadata() if one.name == RECORD), None)
+    except Exception as error:  # a damaged file raises errors of many kinds
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise MitsonarError(f"cannot read the metadata of {path}: {reason}; the file is damaged") from None

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.recordings.bag_file import Message
-from mitsonar.recordings.ros_messages import DTYPES, PROJECTED
+from mitsonar.recordings.ros_messages import DTYPES, PROJECTED, Message
 
 __all__ = ["FORWARD_LEFT_UP", "PingLayout", "is_beam_major", "layout_of", "picture_of", "samples_of"]
 

@@ -13,7 +13,7 @@ from helpers import Command, refused
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import motions
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.recordings.aris_writer import write_aris
+from mitsonar.recordings.write_aris import write_aris
 
 SONAR = Sonar(
     bearing="azimuth", beams=96, range_bins=256, range_min=3.6, range_max=5.4, azimuth_fov_deg=28, elevation_fov_deg=14,

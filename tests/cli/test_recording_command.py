@@ -16,7 +16,7 @@ from PIL import Image
 from mitsonar import SonarFrames
 from mitsonar.mapping.any_recording import recording_at
 from mitsonar.mapping.motion_series import path_of
-from mitsonar.recordings.mcap_writer import write_mcap
+from mitsonar.recordings.write_mcap import write_mcap
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,8 @@ from mitsonar.mapping.known_poses import poses_at, stretches
 from mitsonar.mapping.open_frames import load_frames, open_frames
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import in_units
-from mitsonar.recordings.aris_writer import write_aris
-from mitsonar.recordings.open_recording import open_recording
+from mitsonar.recordings.open import open_recording
+from mitsonar.recordings.write_aris import write_aris
 from mitsonar.records.frames import to_uint8
 
 Array = NDArray[np.float64]

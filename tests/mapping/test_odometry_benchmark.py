@@ -26,7 +26,7 @@ from mitsonar.mapping.frame_source import FrameSource
 from mitsonar.mapping.odometry_benchmark import Wanted, benchmark_odometry
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import path_length
-from mitsonar.recordings.aris_writer import write_aris
+from mitsonar.recordings.write_aris import write_aris
 from mitsonar.records.frames import SonarFrames
 from mitsonar.worlds.ship_hull import ShipHull
 from mitsonar.worlds.slope import sloped

@@ -11,8 +11,8 @@ from recording_files import aris_file
 
 from mitsonar import MitsonarError, open_recording
 from mitsonar.mapping.open_frames import open_frames
-from mitsonar.recordings.aris import in_beam_order
 from mitsonar.recordings.recording import in_time_order, runs_of
+from mitsonar.recordings.sound_metrics import in_beam_order
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
 SAMPLE = REAL / "aris1200-sdk-sample/sample.aris"

@@ -13,9 +13,8 @@ from drawn_frames import over_ground, sway
 from mitsonar import MitsonarError, SonarFrames, open_recording
 from mitsonar.estimation.image.direct import Direct
 from mitsonar.instruments.sounder import preset
-from mitsonar.recordings.aris import FRAME
-from mitsonar.recordings.aris_writer import write_aris
-from mitsonar.recordings.beam_table import TABLES, aris_bearings
+from mitsonar.recordings.sound_metrics import FRAME, TABLES, aris_bearings
+from mitsonar.recordings.write_aris import write_aris
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
 ARIS = REAL / "aris1200-sdk-sample/sample.aris"

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.recordings.canoe import bearings_in
+from mitsonar.recordings.public_sets import bearings_in
 
 Array = NDArray[np.float64]
 

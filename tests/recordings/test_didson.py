@@ -10,9 +10,8 @@ import pytest
 from recording_files import didson_file
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.recordings.beam_table import aris_bearings
-from mitsonar.recordings.didson import didson_bearings, nominal_window
 from mitsonar.recordings.recording import Recording
+from mitsonar.recordings.sound_metrics import aris_bearings, didson_bearings, nominal_window
 
 IMAGES = np.random.default_rng(2).integers(0, 256, (6, 32, 96))
 

@@ -9,8 +9,7 @@ import pytest
 from fans import FAN, drawn
 from numpy.typing import NDArray
 
-from mitsonar.recordings.fan_outline import doubts, outline_of
-from mitsonar.recordings.geometry_file import PictureGeometry, load_geometry
+from mitsonar.recordings.picture_geometry import PictureGeometry, doubts, load_geometry, outline_of
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared/data/real"
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mitsonar import MitsonarError
 from mitsonar.geometry.fan import to_cartesian
-from mitsonar.recordings.fan_sampler import FanSampler
-from mitsonar.recordings.geometry_file import PictureGeometry
+from mitsonar.recordings.picture_geometry import PictureGeometry
+from mitsonar.recordings.pictures import FanSampler
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError, SonarFrames
 from mitsonar.mapping.open_frames import load_frames
-from mitsonar.recordings import frame_folder
-from mitsonar.recordings.frame_folder import write_frames
+from mitsonar.recordings import pictures
+from mitsonar.recordings.pictures import write_frames
 from mitsonar.recordings.recording import Part, Recording
 
 COUNT = 7
@@ -61,8 +61,8 @@ def test_a_short_recording_becomes_frames_npz(frames: SonarFrames, tmp_path: Pat
 def test_a_stopped_copy_goes_on_and_gives_the_same(
     frames: SonarFrames, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, longest_npz: int
 ) -> None:
-    monkeypatch.setattr(frame_folder, "CHUNK_BYTES", 2 * frames.image[0].nbytes)
-    monkeypatch.setattr(frame_folder, "LONGEST_NPZ", longest_npz)
+    monkeypatch.setattr(pictures, "CHUNK_BYTES", 2 * frames.image[0].nbytes)
+    monkeypatch.setattr(pictures, "LONGEST_NPZ", longest_npz)
     folder = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         write_frames(of(frames, stops_at=5), None, folder)

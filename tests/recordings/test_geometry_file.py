@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mitsonar import MitsonarError
-from mitsonar.recordings.geometry_file import PictureGeometry, geometry_beside, load_geometry
+from mitsonar.recordings.picture_geometry import PictureGeometry, geometry_beside, load_geometry
 
 FAN: dict[str, Any] = {"layout": "fan", "apex_px": [10, 99], "near_px": 20, "far_px": 80, "half_angle_deg": 15}
 POLAR: dict[str, Any] = {"layout": "polar", "range_min": 1, "range_max": 9, "azimuth_fov_deg": 60}

@@ -22,7 +22,7 @@ from recording_files import aris_file, didson_file, oculus_log, oculus_ping, som
 
 from mitsonar import MitsonarError, open_recording
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.recordings.mcap_writer import write_mcap
+from mitsonar.recordings.write_mcap import write_mcap
 
 USUAL, FEWER, MANY = 100, 10, 10_000
 """Mutants of each format in the test that is always run, of bags, which take 0.1 s each, and in the slow one."""

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from mitsonar import MitsonarError, Simulator, SonarFrames, open_recording
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.recordings.mcap_writer import SPAN_DB, write_mcap
 from mitsonar.recordings.ros_pings import is_beam_major
+from mitsonar.recordings.write_mcap import SPAN_DB, write_mcap
 from mitsonar.records.frames import to_uint8
 
 SONAR = Sonar(beams=24, range_bins=60, range_min=3.0, range_max=6.0, frequency_hz=1.8e6)

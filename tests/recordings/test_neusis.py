@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar import MitsonarError, open_recording
-from mitsonar.recordings.safe_pickle import read_pickled_arrays
+from mitsonar.recordings.public_sets import read_pickled_arrays
 
 CONFIG = {"Azimuth": 60, "Elevation": 12, "RangeMin": 0.5, "RangeMax": 4.5}
 

@@ -10,7 +10,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sounder import load_sounder
-from mitsonar.recordings.xtf_writer import write_xtf
+from mitsonar.recordings.write_xtf import write_xtf
 from mitsonar.records.soundings import Echogram
 
 

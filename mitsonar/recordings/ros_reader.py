@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.recordings.bag_file import BagFile, Topic
-from mitsonar.recordings.mcap_metadata import WRITTEN, frames_like
 from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order, runs_of
-from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, short
-from mitsonar.recordings.ros_pictures import read_ros_pictures
+from mitsonar.recordings.ros_messages import FANS, OCULUS, PROJECTED, WRITTEN, BagFile, Topic, frames_like, short
 from mitsonar.recordings.ros_pings import PingLayout, is_beam_major, samples_of
-from mitsonar.recordings.ros_poses import motion_in, with_motion
-from mitsonar.recordings.ros_scan import TopicScan
+from mitsonar.recordings.ros_topics import TopicScan, motion_in, read_ros_pictures, with_motion
 from mitsonar.records.frames import SonarFrames
 
 __all__ = ["read_ros_bag", "sonar_topic"]
@@ -44,8 +40,8 @@ def read_ros_bag(path: str | Path, geometry: str | Path | None = None, topic: st
     """Open the recording of a sonar in a ROS bag; pixels are read on demand.
 
     Times are those in the headers of the messages; where they are all 0, or all the same, those of reception. Values count
-    as amplitudes. Poses are those of the bag, where they are unambiguous (:mod:`mitsonar.recordings.ros_poses`). A file that
-    mitsonar wrote tells its sonar and coding (:mod:`mitsonar.recordings.mcap_metadata`).
+    as amplitudes. Poses are those of the bag, where they are unambiguous (:mod:`mitsonar.recordings.ros_topics`). A file that
+    mitsonar wrote tells its sonar and coding (:mod:`mitsonar.recordings.ros_messages`).
 
     Args:
         path: of a ``.bag``, ``.mcap`` or ``.db3``, or of the folder of a ROS 2 bag.

@@ -14,7 +14,7 @@ import numpy as np
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import write_whole
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.recordings.ping_file import Header, layout
+from mitsonar.recordings.recording import Header, layout
 from mitsonar.records.soundings import Echogram
 
 __all__ = ["CHANNEL", "FILE", "FULL_COUNT", "PING", "PING_CHANNEL", "write_xtf"]

@@ -1,0 +1,946 @@
+"""One picture file (PNG, JPEG, PGM): its size before anything is decoded, and its grey values."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import warnings
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.sparse import csr_array, vstack
+
+from mitsonar.errors import MitsonarError, counted, explain_missing
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.io.files import FileArray, read_bytes, read_npz
+from mitsonar.io.runs import RunDirectory, RunKind
+from mitsonar.recordings.picture_geometry import (
+    ANY_ELEVATION_DEG,
+    ANY_RATE_HZ,
+    SEE,
+    PictureGeometry,
+    doubts,
+    geometry_beside,
+    load_geometry,
+)
+from mitsonar.recordings.recording import Facts, Part, Pixels, Recording, in_time_order
+from mitsonar.records.frames import LONGEST_NPZ, FrameStore, SonarFrames
+
+__all__ = [
+    "CONVERSION",
+    "SUFFIXES",
+    "FanSampler",
+    "Grey",
+    "Pictures",
+    "geometry_for",
+    "holds_pictures",
+    "is_picture_stack",
+    "is_video",
+    "is_whole",
+    "naturally",
+    "picture_paths",
+    "picture_size",
+    "polar_frames",
+    "read_picture",
+    "read_picture_folder",
+    "read_picture_stack",
+    "read_picture_video",
+    "recording_of",
+    "refuse_size",
+    "times_in_names",
+    "write_frames",
+]
+
+
+Grey = NDArray[np.generic]
+"""Values ``(rows, columns)``: uint8 in 0..255, or float32 in 0..1."""
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
+"""Endings of picture files."""
+
+FORMATS = ("PNG", "JPEG", "PPM")
+"""What Pillow may take a file for, whatever its ending."""
+
+MOST_PIXELS = 2**25
+"""Pixels of a picture, at most."""
+
+PNG, END_OF_PNG = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+"""First and last bytes of a PNG file."""
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Return rows and columns of a picture, by its header; nothing is decoded.
+
+    Raises:
+        MitsonarError: no picture, or larger than any of a sonar.
+    """
+    with _opened(path) as picture:
+        columns, rows = picture.size
+    refuse_size(rows, columns, str(path))
+    return rows, columns
+
+
+def refuse_size(rows: int, columns: int, source: str) -> None:
+    """Refuse pictures that are larger than any of a sonar, or have a single row or column.
+
+    Raises:
+        MitsonarError: they are.
+    """
+    if rows * columns > MOST_PIXELS or min(rows, columns) < 2:
+        raise MitsonarError(
+            f"{source} has {columns:,} x {rows:,} pixels; pictures of sonars have 2 x 2 to {MOST_PIXELS:,} in all: it is "
+            "damaged, or something else"
+        )
+
+
+def is_whole(path: Path) -> bool:
+    """Return whether a path is a file that is not visibly cut off: a PNG file ends as one, any other has bytes."""
+    if not os.path.isfile(path):  # a pipe would never end
+        return False
+    try:
+        with path.open("rb") as file:
+            if file.read(len(PNG)) != PNG:
+                return path.stat().st_size > 0
+            file.seek(0, 2)
+            file.seek(max(0, file.tell() - 64))
+            return END_OF_PNG in file.read()
+    except OSError:
+        return False
+
+
+def read_picture(path: Path, shape: tuple[int, int]) -> Grey:
+    """Read the grey values of a picture; of colours the luminance.
+
+    Args:
+        path: of the file.
+        shape: rows and columns that it must have.
+
+    Returns:
+        ``(rows, columns)`` uint8 in 0..255, or of 16 bits a value float32 in 0..1.
+
+    Raises:
+        MitsonarError: not a whole picture, or one of another size.
+    """
+    rows, columns = picture_size(path)
+    if (rows, columns) != shape:
+        raise MitsonarError(f"{path} has {columns:,} x {rows:,} pixels, the others {shape[1]:,} x {shape[0]:,}: remove it")
+    with _opened(path) as picture:
+        try:
+            if picture.mode.startswith("I"):
+                return np.asarray(np.clip(np.asarray(picture, dtype=np.float32) / 65535, 0, 1), dtype=np.float32)
+            return np.array(picture.convert("L"), dtype=np.uint8)
+        except Exception as error:  # damaged bytes raise errors of many kinds
+            raise MitsonarError(
+                f"cannot read the picture {path}: {' '.join(str(error).split())[:160]}; it is damaged: remove it"
+            ) from None
+
+
+def _opened(path: Path) -> Image.Image:
+    """Open a picture; only its header is read."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            return Image.open(path, formats=FORMATS)
+    except FileNotFoundError:
+        raise MitsonarError(f"no such file: {path}") from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise MitsonarError(
+            f"{path} says that it has more pixels than any picture of a sonar, {MOST_PIXELS:,}: it is damaged"
+        ) from None
+    except Exception as error:  # damaged bytes raise errors of many kinds
+        reason = " ".join(str(error).split())[:160]
+        raise MitsonarError(f"cannot read the picture {path}: {reason}; give PNG, JPEG or PGM") from None
+
+
+# ---------------- Folders of pictures (PNG, JPEG, PGM): sorted naturally, with times from their names where these
+# look like times
+
+
+Array = NDArray[np.float64]
+
+EPOCH_S = (946_684_800, 4_102_444_800)
+"""Times that names may tell: 2000 to 2100 [s since 1970]."""
+
+TIMES_IN_NAMES = (
+    (re.compile(r"(?<!\d)(\d{19})(?!\d)"), 1e-9),
+    (re.compile(r"(?<!\d)(\d{16})(?!\d)"), 1e-6),
+    (re.compile(r"(?<!\d)(\d{13})(?!\d)"), 1e-3),
+    (re.compile(r"(?<!\d)(\d{10})(?!\d)"), 1.0),
+)
+"""Whole numbers that look like times, and their unit [s]."""
+
+PARTED = re.compile(r"(?<!\d)(\d{10})[._](\d{1,9})(?!\d)")
+"""Seconds, and what follows their decimal point; with `_` nanoseconds, as ROS writes them."""
+
+MOST_PICTURES = 2_000_000
+"""Files of a folder, at most."""
+
+
+def holds_pictures(path: Path, first: bytes) -> bool:
+    """Return whether a path is a folder of pictures, and no folder of a run."""
+    if first or not path.is_dir() or any((path / name).exists() for name in ("run.json", "zarr.json", "frames.npz")):
+        return False
+    try:
+        return any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+    except OSError:
+        return False
+
+
+def read_picture_folder(path: Path, geometry: Path | None = None) -> Recording:
+    """Open a folder of pictures of one size; they are read on demand.
+
+    Args:
+        path: of the folder.
+        geometry: a geometry file; default: ``geometry.yaml`` in the folder or beside it.
+
+    Raises:
+        MitsonarError: no geometry, no picture that can be read, or a geometry that does not fit the pictures.
+    """
+    told, told_by = geometry_for(path, geometry)
+    files, shape, notes = _of_one_size(picture_paths(path), path)
+    names = tuple(file.name for file in files)
+    first = read_picture(files[0], shape)
+    if _has_colours(files[0]):
+        notes.append("the pictures have colours: their luminance is read, which is no level where the colours are a scale")
+    bits = 8 if first.dtype == np.uint8 else 16
+
+    def read(place: int) -> Grey:
+        return read_picture(files[place], shape)
+
+    pictures = Pictures(
+        path,
+        "folder of pictures",
+        shape,
+        names,
+        read,
+        times_in_names(names),
+        numbers=_numbers(names),
+        facts={"bits": bits},
+        notes=tuple(notes),
+    )
+    return recording_of(pictures, told, told_by)
+
+
+def picture_paths(folder: Path) -> list[Path]:
+    """Return the picture files of a folder, sorted naturally.
+
+    Raises:
+        MitsonarError: it cannot be read, or holds too many.
+    """
+    try:
+        found = [one for one in folder.iterdir() if one.suffix.lower() in SUFFIXES and not one.name.startswith(".")]
+    except OSError as error:
+        raise MitsonarError(f"cannot read the folder {folder}: {error.strerror}") from None
+    if len(found) > MOST_PICTURES:
+        raise MitsonarError(f"{folder} holds {len(found):,} pictures, more than {MOST_PICTURES:,}: divide it")
+    return sorted(found, key=lambda one: naturally(one.name))
+
+
+def naturally(name: str) -> tuple[tuple[int, int | str], ...]:
+    """Return the key by which names sort naturally: ``f2`` before ``f10``."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((0, int(part)) if place % 2 else (1, part.lower()) for place, part in enumerate(parts))
+
+
+def times_in_names(names: Sequence[str]) -> Array | None:
+    """Return the times ``(names,)`` [s since 1970] that all names tell; None where one does not.
+
+    Nanoseconds, microseconds, milliseconds or seconds since 1970 by their number of digits, also seconds with decimals, or
+    with ``_`` and nanoseconds. Only times from 2000 to 2100 count.
+    """
+    if not names:
+        return None
+    parted = [PARTED.search(name) for name in names]
+    if all(parted):
+        found = [one.groups() for one in parted if one is not None]
+        decimals = [name[one.end(1)] == "." for name, one in zip(names, parted, strict=True) if one is not None]
+        times = [
+            float(f"{whole}.{rest}") if point else int(whole) + int(rest) * 1e-9
+            for (whole, rest), point in zip(found, decimals, strict=True)
+        ]
+        return _plausible(np.array(times))
+    for pattern, unit in TIMES_IN_NAMES:
+        hits = [pattern.search(name) for name in names]
+        if all(hits):
+            return _plausible(np.array([int(one[1]) for one in hits if one is not None]) * unit)
+    return None
+
+
+def _plausible(times: Array) -> Array | None:
+    return times if ((times >= EPOCH_S[0]) & (times <= EPOCH_S[1])).all() else None
+
+
+def _numbers(names: Sequence[str]) -> Array | None:
+    """Return the last number in each name, in steps of the smallest one ``(names,)``; None where they do not rise."""
+    found = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
+    if not all(found):
+        return None
+    numbers = np.array([float(one[-1]) for one in found])
+    steps = np.diff(numbers)
+    return numbers / steps.min() if len(steps) and steps.min() > 0 else None
+
+
+def _of_one_size(files: list[Path], folder: Path) -> tuple[list[Path], tuple[int, int], list[str]]:
+    """Return the whole pictures of the most frequent size, that size, and sentences on the others."""
+    whole = [file for file in files if is_whole(file)]
+    sizes: dict[Path, tuple[int, int]] = {}
+    reason = ""
+    for file in whole:
+        try:
+            sizes[file] = picture_size(file)
+        except MitsonarError as error:
+            reason = reason or str(error)
+    if not sizes:
+        raise MitsonarError(reason or f"{folder} holds no whole picture: all are empty or cut off")
+    shape = Counter(sizes.values()).most_common(1)[0][0]
+    kept = [file for file, size in sizes.items() if size == shape]
+    notes = []
+    if len(sizes) < len(files):
+        notes.append(f"left out: {counted(len(files) - len(sizes), 'picture')} cut off or damaged")
+    if len(kept) < len(sizes):
+        others = len(sizes) - len(kept)
+        notes.append(f"left out: {counted(others, 'picture')} of another size than {shape[1]:,} x {shape[0]:,} pixels")
+    return kept, shape, notes
+
+
+def _has_colours(path: Path) -> bool:
+    """Return whether a picture has colours that differ from grey."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        if picture.mode not in ("RGB", "RGBA", "P"):
+            return False
+        red, green, blue = (np.asarray(one, dtype=int) for one in picture.convert("RGB").split())
+    return bool(max(abs(red - green).max(), abs(green - blue).max()) > 8)
+
+
+# ---------------- Stacks of pictures in one ``.npz`` file: arrays ``frames`` or ``images``, times, and often the
+# fan's own geometry
+
+
+NAMES = ("frames", "images")
+"""Names of the array of pictures."""
+
+TIME_ARRAYS = ("time_s", "times", "timestamps")
+RATES = ("fps", "frame_rate_hz")
+"""Names of the arrays of times [s] and of the rate [Hz]."""
+
+FAN = {"apex_xy": "apex_px", "rmin_px": "near_px", "rmax_px": "far_px", "half_fov_deg": "half_angle_deg", "kx": "stretch"}
+"""Arrays that tell a fan's geometry, and the keys of a geometry file that they are."""
+
+
+def is_picture_stack(path: Path, first: bytes) -> bool:
+    """Return whether a file is an npz file of pictures, and not frames of mitsonar."""
+    if not first.startswith(b"PK") or path.suffix.lower() != ".npz":
+        return False
+    try:
+        with zipfile.ZipFile(path) as file:
+            names = {name.removesuffix(".npy") for name in file.namelist()}
+    except Exception:  # damaged bytes raise errors of many kinds
+        return False
+    return bool(names & set(NAMES)) and not {"image", "sonar"} <= names
+
+
+def read_picture_stack(path: Path, geometry: Path | None = None) -> Recording:
+    """Open an npz file of pictures ``(pictures, rows, columns)``: uint8, or floats in 0..1.
+
+    Args:
+        path: of the file. Its arrays ``apex_xy``, ``rmin_px``, ``rmax_px``, ``half_fov_deg`` and ``kx`` (optional) tell the
+            geometry of a fan whose metres are not known, where no geometry file does; ``fps`` or ``time_s`` the times.
+        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` beside the file.
+
+    Raises:
+        MitsonarError: damaged, no pictures, or no geometry.
+    """
+    try:
+        table = read_npz(path)
+    except MitsonarError:
+        raise
+    except Exception as error:  # damaged bytes raise errors of many kinds
+        raise MitsonarError(f"cannot read {path}: {' '.join(str(error).split())[:200]}; it is damaged") from None
+    name = next(one for one in NAMES if one in table)
+    stack = _stack(table[name], f"{name} of {path}")
+    told, told_by = geometry_for(path, geometry, _fan_in(table, path))
+    times = next((table[one] for one in TIME_ARRAYS if one in table and table[one].shape == (len(stack),)), None)
+    rate = next((_number(table[one], one, path) for one in RATES if one in table), None)
+
+    def read(place: int) -> Grey:
+        return np.asarray(stack[place])
+
+    pictures = Pictures(
+        path,
+        "stack of pictures (.npz)",
+        (stack.shape[1], stack.shape[2]),
+        tuple(str(number) for number in range(len(stack))),
+        read,
+        None if times is None else np.asarray(times, dtype=float),
+        rate_hz=rate,
+        facts={"values": str(stack.dtype)},
+    )
+    return recording_of(pictures, told, told_by)
+
+
+def _stack(values: FileArray, what: str) -> Grey:
+    """Check pictures and return them: uint8, or float32 in 0..1."""
+    if values.ndim != 3 or not len(values) or values.dtype.kind not in "uf":
+        raise MitsonarError(f"{what} must be pictures (pictures, rows, columns), uint8 or floats: got {values.shape}")
+    refuse_size(values.shape[1], values.shape[2], what)
+    if values.dtype == np.uint8:
+        return values
+    if values.dtype == np.uint16:
+        return np.asarray(values / np.float32(65535), dtype=np.float32)
+    if values.dtype.kind == "u" or not np.isfinite(values).all() or values.min() < 0 or values.max() > 1 + 1e-5:
+        raise MitsonarError(f"{what} must be uint8, uint16, or floats in 0..1: divide them by their largest value")
+    return values.astype(np.float32)
+
+
+def _fan_in(table: dict[str, FileArray], path: Path) -> PictureGeometry | None:
+    """Return the geometry that the file's own arrays tell; None where they do not."""
+    if not set(FAN) - {"kx"} <= set(table):
+        return None
+    apex = np.asarray(table["apex_xy"])
+    if apex.shape != (2,) or apex.dtype.kind not in "iuf" or not np.isfinite(apex).all():
+        raise MitsonarError(f"apex_xy of {path} must be two numbers: column and row of the apex")
+    numbers = {key: _number(table[name], name, path) for name, key in FAN.items() if name in table and name != "apex_xy"}
+    return PictureGeometry.create(
+        layout="fan", apex_px=(float(apex[0]), float(apex[1])), scale_known=False, name=path.stem[:200], **numbers
+    )
+
+
+def _number(values: FileArray, name: str, path: Path) -> float:
+    """Return the one finite number of an array."""
+    if values.size != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise MitsonarError(f"{name} of {path} must be one number: got shape {values.shape}")
+    return float(values.reshape(()))
+
+
+# ---------------- Videos of fans or polar pictures (``.avi``, ``.mp4``), read by OpenCV frame by frame
+
+
+def is_video(path: Path, first: bytes) -> bool:
+    """Return whether a file is an AVI or MP4 video, by its first bytes."""
+    return (first[:4] == b"RIFF" and first[8:12] == b"AVI ") or first[4:8] == b"ftyp"
+
+
+def read_picture_video(path: Path, geometry: Path | None = None) -> Recording:
+    """Open a video; its frames are decoded on demand, and counted once.
+
+    Args:
+        path: of the video. Its nominal frame rate counts where the geometry tells none.
+        geometry: a geometry file; default: ``FILE.yaml`` or ``geometry.yaml`` beside the video.
+
+    Raises:
+        MitsonarError: OpenCV is not there, damaged, or no geometry.
+    """
+    told, told_by = geometry_for(path, geometry)
+    video = _Video(path)
+    count, rate = video.count(), video.rate_hz
+    pictures = Pictures(
+        path,
+        f"video ({path.suffix.lower() or 'no ending'})",
+        video.shape,
+        tuple(str(number) for number in range(count)),
+        video.read,
+        rate_hz=rate,
+        facts={} if rate is None else {"nominal_rate_hz": rate},
+    )
+    return recording_of(pictures, told, told_by)
+
+
+class _Video:
+    """A video that is decoded forward; going back begins anew."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import cv2
+        except ModuleNotFoundError as error:
+            raise explain_missing(error) from None
+        self.cv2, self.path = cv2, path
+        self.capture: Any = None
+        self.at = 0
+        self._begin()
+        opened: Any = self.capture
+        rows, columns = (int(opened.get(one)) for one in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
+        refuse_size(rows, columns, str(path))
+        rate = float(opened.get(cv2.CAP_PROP_FPS))
+        self.shape, self.rate_hz = (rows, columns), rate if np.isfinite(rate) and 0 < rate < 1e4 else None
+
+    def _begin(self) -> None:
+        """Open the video at its first frame."""
+        if self.capture is not None:
+            self.capture.release()
+        self.capture = self.cv2.VideoCapture(str(self.path))
+        self.at = 0
+        if not self.capture.isOpened():
+            raise MitsonarError(f"OpenCV cannot open the video {self.path}: it is damaged, or of a codec that is not there")
+
+    def count(self) -> int:
+        """Count the frames that can be decoded; the number in the header is a guess."""
+        while self.capture.grab():
+            self.at += 1
+            if self.at > MOST_PICTURES:
+                raise MitsonarError(f"{self.path} holds more than {MOST_PICTURES:,} frames: cut it")
+        count = self.at
+        self._begin()
+        if not count:
+            raise MitsonarError(f"{self.path} holds no frame that can be decoded: it is damaged")
+        return count
+
+    def read(self, place: int) -> Grey:
+        """Decode a frame by its number: ``(rows, columns)`` uint8, the luminance of colours."""
+        if place < self.at:
+            self._begin()
+        while self.at < place:
+            if not self.capture.grab():
+                break
+            self.at += 1
+        there, picture = self.capture.read()
+        self.at += 1
+        if not there or picture.shape[:2] != self.shape:
+            raise MitsonarError(f"frame {place:,} of {self.path} cannot be decoded: the video is damaged")
+        grey: Grey = self.cv2.cvtColor(picture, self.cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture
+        return np.asarray(grey, dtype=np.uint8)
+
+
+# ---------------- Fan pictures back to beams and bins: each cell is the mean of its own area in the picture
+
+
+Doubles = NDArray[np.float64]
+
+MOST_WEIGHTS = 2**25
+"""Weights of a sampler, at most: a quarter of a GiB."""
+
+MOST_BEAMS = 1024
+"""Beams that are made where their number is not told, at most."""
+
+AT_A_TIME = 2**20
+"""Weights that are computed at a time."""
+
+
+@dataclass(frozen=True)
+class FanSampler:
+    """The linear map from a fan picture to beams and bins.
+
+    Attributes:
+        weights: of the picture's pixels in each cell ``(bins * beams, rows * columns)`` float32; rows of cells that lie in
+            the picture add up to 1, the others hold nothing.
+        bins: range bins.
+        beams: beams.
+    """
+
+    weights: csr_array
+    bins: int
+    beams: int
+
+    @classmethod
+    def of(cls, geometry: PictureGeometry, rows: int, columns: int) -> FanSampler:
+        """Make the map for pictures ``(rows, columns)``.
+
+        A cell is covered by as many points, evenly, as it is wide in pixels. Each point reads the picture bilinearly. So a
+        cell smaller than a pixel is interpolated, and a larger one is averaged. Averages are of picture values: of dB where
+        the picture shows dB.
+
+        Raises:
+            MitsonarError: a fan outside the picture, or one that takes too much memory.
+        """
+        bins, beams = cell_counts(geometry)
+        half = math.radians(float(geometry.half_angle_deg or 0.0))
+        step = (geometry.far - geometry.near) / bins
+        width = 2 * half / beams * geometry.far / max(1.0, geometry.stretch)
+        across, along = (max(1, math.ceil(size - 1e-6)) for size in (width, step))
+        count = bins * beams * across * along * 4
+        if count > MOST_WEIGHTS:
+            raise MitsonarError(
+                f"a fan of {bins:,} bins and {beams:,} beams takes {count:,} weights: {MOST_WEIGHTS:,} at most; give "
+                "smaller bins and beams in the geometry"
+            )
+        radius = geometry.near + (np.arange(bins * along) + 0.5) * (step / along)
+        angle = -half + (np.arange(beams * across) + 0.5) * (2 * half / (beams * across))
+        made = []
+        at_once = max(1, AT_A_TIME // (beams * across * along * 4))
+        for first in range(0, bins, at_once):
+            some = radius[first * along : (first + at_once) * along].astype(float)
+            made.append(_weights(geometry, some, angle.astype(float), (along, across), (rows, columns)))
+        weights = vstack(made, format="csr")
+        if not weights.nnz:
+            raise MitsonarError(
+                f"the fan of the geometry lies outside the pictures of {columns:,} x {rows:,} pixels: check apex_px, "
+                "near_px, far_px and forward"
+            )
+        return cls(weights, bins, beams)
+
+    def apply(self, picture: NDArray[np.generic]) -> NDArray[np.float32]:
+        """Return the beams and bins ``(bins, beams)`` of a picture ``(rows, columns)``, float32 in 0..1; 0 outside it.
+
+        Pictures are uint8 in 0..255, or float32 in 0..1.
+        """
+        values = np.ravel(picture).astype(np.float32)
+        if picture.dtype == np.uint8:
+            values *= np.float32(1 / 255)
+        sampled = np.minimum(self.weights @ values, np.float32(1))  # weights of 1 in all are rounded
+        return np.asarray(sampled, dtype=np.float32).reshape(self.bins, self.beams)
+
+
+def cell_counts(geometry: PictureGeometry) -> tuple[int, int]:
+    """Return the numbers of bins and beams of a fan: as told, or about one a pixel (beams: at mid range)."""
+    bins = geometry.bins or max(2, round(geometry.far - geometry.near))
+    half = math.radians(float(geometry.half_angle_deg or 0.0))
+    arc = (geometry.near + geometry.far) / 2 * 2 * half / max(1.0, geometry.stretch)
+    return bins, geometry.beams or int(np.clip(round(arc), 2, MOST_BEAMS))
+
+
+def _weights(
+    geometry: PictureGeometry, radius: Doubles, angle: Doubles, points: tuple[int, int], shape: tuple[int, int]
+) -> csr_array:
+    """Return the weights of some bins.
+
+    Args:
+        geometry: of the fan.
+        radius: of the points ``(bins * points[0],)`` [px].
+        angle: of the points ``(beams * points[1],)`` [rad], most to port first.
+        points: of a cell along range and across.
+        shape: rows and columns of the picture.
+    """
+    rows, columns = shape
+    column, row = geometry.apex_px or (0.0, 0.0)
+    sideways = (-1.0 if geometry.mirror else 1.0) / geometry.stretch
+    u = column + sideways * radius[:, None] * np.sin(angle)
+    v = row - (1.0 if geometry.forward == "up" else -1.0) * radius[:, None] * np.cos(angle)
+    cell = np.arange(len(radius))[:, None] // points[0] * (len(angle) // points[1]) + np.arange(len(angle)) // points[1]
+    inside = ((u >= -0.5) & (u <= columns - 0.5) & (v >= -0.5) & (v <= rows - 0.5)).ravel()
+    u, v = (np.clip(axis.ravel()[inside], 0, most) for axis, most in ((u, columns - 1), (v, rows - 1)))
+    left, top = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    over, below = u - left, v - top
+    pixels, parts = [], []
+    for down in (0, 1):
+        for right in (0, 1):
+            pixels.append(np.minimum(top + down, rows - 1) * columns + np.minimum(left + right, columns - 1))
+            parts.append((below if down else 1 - below) * (over if right else 1 - over))
+    cells = len(radius) // points[0] * (len(angle) // points[1])
+    index = np.tile(cell.ravel()[inside], 4)
+    found = csr_array((np.concatenate(parts), (index, np.concatenate(pixels))), shape=(cells, rows * columns))
+    total = found.sum(axis=1)
+    scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
+    found.data *= np.repeat(scale, np.diff(found.indptr))
+    found.eliminate_zeros()
+    return found.astype(np.float32)
+
+
+# ---------------- A sequence of pictures with a geometry becomes a recording: polar pictures are put in order, fans
+# are resampled
+
+
+OUTLINE_PICTURES = 16
+"""Pictures that the outline of a fan is taken from, at most."""
+
+LARGEST_TIMES = 2**26
+"""Bytes of a file of times, at most."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures of one size, in their own order.
+
+    Attributes:
+        source: path of the file or folder.
+        format: in words.
+        shape: rows and columns of each.
+        names: of the pictures, for messages and files of times.
+        read: reads one by its place.
+        time_s: of each ``(pictures,)`` [s], where known.
+        rate_hz: of the pictures, where the file tells it.
+        numbers: that each has in its name ``(pictures,)``, where known.
+        facts: what the file tells, by name.
+        notes: sentences on what was left out.
+    """
+
+    source: Path
+    format: str
+    shape: tuple[int, int]
+    names: tuple[str, ...]
+    read: Callable[[int], Grey]
+    time_s: Array | None = None
+    rate_hz: float | None = None
+    numbers: Array | None = None
+    facts: Facts = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def geometry_for(source: Path, geometry: Path | None, inside: PictureGeometry | None = None) -> tuple[PictureGeometry, Path]:
+    """Return the geometry of pictures and the file that tells it: the given one, the one beside them, or the one inside.
+
+    Raises:
+        MitsonarError: there is none, or it is damaged.
+    """
+    found = geometry or geometry_beside(source)
+    if found is not None:
+        return load_geometry(found), found
+    if inside is None:
+        raise MitsonarError(
+            f"{source} holds pictures, which do not tell their geometry: give a geometry file (--geometry FILE), or lay "
+            f"geometry.yaml beside them{SEE}"
+        )
+    return inside, source
+
+
+def recording_of(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> Recording:
+    """Make a recording of pictures.
+
+    Args:
+        pictures: in their own order.
+        geometry: of each of them.
+        told_by: file of the geometry, from which the path of a file of times counts.
+
+    Raises:
+        MitsonarError: a geometry that does not fit the pictures; times that cannot be read.
+    """
+    times, notes = _times(pictures, geometry, told_by)
+    kept, sorting = in_time_order(times, pictures.numbers)
+    rate = _rate(times[kept], geometry)
+    notes = [*pictures.notes, *notes, *sorting, *geometry.notes()]
+    images: _Polar | _Fan
+    if geometry.layout == "polar":
+        shape = pictures.shape[::-1] if geometry.transposed else pictures.shape
+        images, like = _Polar(pictures, kept, geometry), polar_frames(geometry, *shape, rate)
+    else:
+        sampler = FanSampler.of(geometry, *pictures.shape)
+        images = _Fan(pictures, kept, sampler)
+        like = _fan_frames(geometry, sampler, rate)
+        some = np.unique(np.linspace(0, len(kept) - 1, OUTLINE_PICTURES).astype(np.intp)) if len(kept) else kept
+        if len(some):
+            notes += doubts(geometry, np.max([_bytes(pictures.read(int(place))) for place in kept[some]], axis=0))
+    part = Part(
+        like, times[kept], images, attitude_rad=_attitude(geometry, len(kept)), height_m=_height(geometry, len(kept))
+    )
+    facts: Facts = {"pictures": len(pictures.names), "rows": pictures.shape[0], "columns": pictures.shape[1]}
+    facts |= {"layout": geometry.layout, "geometry": str(told_by)} | pictures.facts
+    return Recording(str(pictures.source), pictures.format, (part,), facts, tuple(notes))
+
+
+def polar_frames(geometry: PictureGeometry, bins: int, beams: int, rate_hz: float) -> SonarFrames:
+    """Return frames without images for polar pictures: sonar, ranges [m] and bearings [rad], most to port first.
+
+    Raises:
+        MitsonarError: bearings that are not one a beam, or a sonar that cannot be.
+    """
+    if geometry.bearings_deg is None:
+        sonar = _sonar(geometry, bins, beams, float(geometry.azimuth_fov_deg or 0.0), rate_hz)
+        return _like(geometry, sonar, sonar.bearing_rad)
+    if len(geometry.bearings_deg) != beams:
+        raise MitsonarError(
+            f"the geometry has {len(geometry.bearings_deg):,} bearings_deg, and the pictures have {beams:,} beams: give "
+            "one a beam"
+        )
+    bearings = np.sort(np.radians(geometry.bearings_deg))
+    fov = min(360.0, math.degrees(bearings[-1] - bearings[0]) * beams / (beams - 1))
+    return _like(geometry, _sonar(geometry, bins, beams, fov, rate_hz), bearings)
+
+
+def _fan_frames(geometry: PictureGeometry, sampler: FanSampler, rate_hz: float) -> SonarFrames:
+    """Return frames without images for fans that are resampled."""
+    sonar = _sonar(geometry, sampler.bins, sampler.beams, 2 * float(geometry.half_angle_deg or 0.0), rate_hz)
+    return _like(geometry, sonar, sonar.bearing_rad)
+
+
+def _sonar(geometry: PictureGeometry, bins: int, beams: int, fov_deg: float, rate_hz: float) -> Sonar:
+    near, far = geometry.window_m
+    return Sonar.create(
+        name=geometry.name,
+        azimuth_fov_deg=fov_deg,
+        elevation_fov_deg=geometry.elevation_fov_deg or ANY_ELEVATION_DEG,
+        beams=beams,
+        range_min=near,
+        range_max=far,
+        range_bins=bins,
+        sound_speed=geometry.sound_speed,
+        bearing=geometry.bearing_of(fov_deg / 2),
+        beam_layout=geometry.beam_layout,
+        frequency_hz=geometry.frequency_hz,
+        frame_rate_hz=rate_hz,
+        coding=geometry.level or "linear",
+        coding_db=geometry.coding_db,
+        coding_gamma=geometry.coding_gamma,
+    )
+
+
+def _like(geometry: PictureGeometry, sonar: Sonar, bearing_rad: Array) -> SonarFrames:
+    return SonarFrames(
+        image=np.zeros((0, sonar.range_bins, sonar.beams), np.uint8),
+        range_m=sonar.range_m,
+        bearing_rad=bearing_rad,
+        time_s=np.zeros(0),
+        sonar=sonar,
+        level=geometry.level or "linear",
+    )
+
+
+@dataclass(frozen=True)
+class _Polar:
+    """Polar pictures as images."""
+
+    pictures: Pictures
+    places: NDArray[np.intp]
+    geometry: PictureGeometry
+
+    def __call__(self, index: NDArray[np.intp]) -> Pixels:
+        """Return ``(n, bins, beams)``, row 0 nearest, column 0 most to port."""
+        turned = self.geometry.transposed
+        shape = self.pictures.shape[::-1] if turned else self.pictures.shape
+        read = [self.pictures.read(int(place)) for place in self.places[index]]
+        stacked = np.stack([one.T if turned else one for one in read]) if read else np.zeros((0, *shape), np.uint8)
+        rows = slice(None, None, 1 if self.geometry.rows == "near-to-far" else -1)
+        told = self.geometry.bearings_deg
+        falls = self.geometry.mirror if told is None else told[0] > told[-1]
+        return stacked[:, rows, :: -1 if falls else 1]
+
+
+@dataclass(frozen=True)
+class _Fan:
+    """Fans as images of beams and bins."""
+
+    pictures: Pictures
+    places: NDArray[np.intp]
+    sampler: FanSampler
+
+    def __call__(self, index: NDArray[np.intp]) -> Pixels:
+        """Return ``(n, bins, beams)`` float32, resampled when they are read."""
+        made = np.zeros((len(index), self.sampler.bins, self.sampler.beams), np.float32)
+        for place, number in enumerate(self.places[index]):
+            made[place] = self.sampler.apply(self.pictures.read(int(number)))
+        return made
+
+
+def _bytes(picture: Grey) -> Grey:
+    """Return a picture in 0..255."""
+    return picture if picture.dtype == np.uint8 else np.asarray(np.clip(picture, 0, 1) * 255, dtype=np.uint8)
+
+
+def _times(pictures: Pictures, geometry: PictureGeometry, told_by: Path) -> tuple[Array, list[str]]:
+    """Return the times ``(pictures,)`` [s] of the pictures, and sentences on what is assumed."""
+    if geometry.times is not None:
+        return _times_in(told_by.parent / geometry.times, pictures.names), []
+    if pictures.time_s is not None:
+        return pictures.time_s, []
+    rate = geometry.frame_rate_hz or pictures.rate_hz
+    assumed = [] if rate else [f"nothing tells the times of the pictures: {ANY_RATE_HZ:g} a second are assumed"]
+    steps = (
+        np.arange(len(pictures.names), dtype=float) if pictures.numbers is None else pictures.numbers - pictures.numbers[0]
+    )
+    return steps / (rate or ANY_RATE_HZ), assumed
+
+
+def _times_in(path: Path, names: tuple[str, ...]) -> Array:
+    """Read a file of times: a line ``TIME`` for each picture in order, or lines ``NAME, TIME``; # begins a comment."""
+    text = read_bytes(path, "file of times", LARGEST_TIMES).decode("utf-8", "replace")
+    rows = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    rows = [row for row in rows if row]
+    try:
+        times = [float(row[-1]) for row in rows]
+    except ValueError:
+        raise MitsonarError(f"{path} must hold lines `TIME` or `NAME, TIME` with times [s]{SEE}") from None
+    if rows and all(len(row) == 2 for row in rows):
+        by_name = {row[0]: time for row, time in zip(rows, times, strict=True)}
+        found = np.array([by_name.get(name, np.nan) for name in names])
+        if not np.isfinite(found).any():
+            raise MitsonarError(f"{path} names none of the pictures, such as {names[0] if names else '-'}")
+        return found
+    if len(times) != len(names) or any(len(row) != 1 for row in rows):
+        raise MitsonarError(f"{path} must hold a time for each of {len(names):,} pictures: it holds {len(times):,} lines")
+    return np.array(times)
+
+
+def _rate(times: Array, geometry: PictureGeometry) -> float:
+    """Return the frames a second: as told, or by the times."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    return geometry.frame_rate_hz or (min(1e6, 1 / step) if step > 0 else ANY_RATE_HZ)
+
+
+def _attitude(geometry: PictureGeometry, frames: int) -> Array | None:
+    """Return pitch, roll, heading ``(frames, 3)`` [rad] where the geometry tells the pitch."""
+    if geometry.pitch_deg is None:
+        return None
+    return np.tile([math.radians(geometry.pitch_deg), math.radians(geometry.roll_deg), np.nan], (frames, 1))
+
+
+def _height(geometry: PictureGeometry, frames: int) -> Array | None:
+    """Return the heights ``(frames,)`` [m] where the geometry tells one."""
+    return None if geometry.height_m is None else np.full(frames, geometry.height_m)
+
+
+# ---------------- A part of a recording as the folder of a run, ``frames.zarr`` or ``frames.npz``, that can be resumed
+
+
+CONVERSION = RunKind("recording", ("frames.npz", "frames.zarr"), {"frames": int, "frames_done": int})
+
+CHUNK_BYTES = 32 * 2**20
+"""Approximate size of the pixels that are copied at a time [bytes]."""
+
+
+def write_frames(
+    recording: Recording,
+    number: int | None,
+    folder: str | Path,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Path:
+    """Copy a part of a recording into the folder of a run, in constant memory; a stopped copy can be resumed.
+
+    Args:
+        recording: any.
+        number: of the part; None: the longest.
+        folder: to make.
+        overwrite: replace a copy that is there.
+        resume: go on with one.
+        progress: called with how many more frames are copied.
+
+    Returns:
+        ``frames.npz`` of at most 1,000 frames, or ``frames.zarr`` of more.
+
+    Raises:
+        MitsonarError: the folder holds other things, or a copy that is neither resumed nor replaced.
+    """
+    part = recording.part(number)
+    chosen = recording.longest if number is None else number
+    asked = {"of": recording.name, "format": recording.format, "part": chosen, "frames": len(part)}
+    run = RunDirectory.begin(folder, CONVERSION, asked, resume=resume, overwrite=overwrite)
+    run.start(frames=len(part), frames_done=0)
+    told = progress or (lambda done: None)
+    packed, path = run.path / "frames.npz", run.path / "frames.zarr"
+    if run.finished and (packed.exists() or path.exists()):
+        told(len(part))
+        return packed if packed.exists() else path
+    store, done = _store(run, recording, part, path)
+    told(done)
+    step = max(1, CHUNK_BYTES // (part.like.image.dtype.itemsize * len(part.like.range_m) * len(part.like.bearing_rad)))
+    for start in range(done, len(part), step):
+        frames = part.read(np.arange(start, min(start + step, len(part))))
+        store.write(start, frames)
+        run.note(frames_done=start + len(frames))
+        told(len(frames))
+    if len(part) <= LONGEST_NPZ:
+        store.pack(packed)
+    run.finish()
+    return packed if packed.exists() else path
+
+
+def _store(run: RunDirectory, recording: Recording, part: Part, path: Path) -> tuple[FrameStore, int]:
+    """Return the store that is there, or a new one, and how many frames it holds."""
+    if run.resumed and path.exists():
+        store = FrameStore.open(path)
+        done = min(run.count("frames_done", len(part)), store.done)
+        store.check(len(part), part.like.sonar, done)
+        return store, done
+    if run.resumed and run.count("frames_done", len(part)):
+        raise MitsonarError(f"{path} is gone, though run.json says that it was begun: copy again with --overwrite")
+    about = {"recording": recording.name, "format": recording.format, "notes": list(recording.notes)}
+    return FrameStore.create(path, len(part), replace(part.read([]), about=about)), 0

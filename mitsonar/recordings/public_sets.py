@@ -1,0 +1,712 @@
+"""Sequences of the CANOE data set: polar PNG of an Oculus M3000d with the bearings in two rows, poses as CSV.
+
+Source of the layout: the data set's reference, github.com/utiasASRL/pycanoe (``DATA_REFERENCE.md``, ``pycanoe/data``). No
+recording was at hand when this was written.
+
+| file | content |
+|---|---|
+| ``sonar/<microseconds since 1970>.png`` | two rows: the bearing of each column, int16 in 0.01 deg; then a row a range bin |
+| ``novatel/sonar_poses.csv`` | a row a picture: ``t, x, y, z, r, p, y, vx, vy, vz, wx, wy, wz, vx_bod, vy_bod, vz_bod`` |
+
+What the reference does not tell, and what is done:
+
+- The order of the bytes of a bearing. Every order is tried; the one that gives bearings which rise or fall evenly is taken.
+- The window: 0 to 30 m, as the reference says of the sonar; the first range bin is the nearest.
+- The side: negative bearings are to port, as in the messages of an Oculus. Check it by the rotation of the pictures.
+- The axes of the poses' sensor frame. Up is the axis that stays upright, forward the level one along which the boat sails.
+- The coding: amplitude^0.5, the usual one of an Oculus.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mitsonar.errors import MitsonarError, argument, counted
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.io.csv_table import CsvTable
+from mitsonar.io.files import FileArray, PlainValue, finite_number, read_bytes, read_json
+from mitsonar.motion.pose import poses_from
+from mitsonar.recordings.pictures import Grey, is_whole, naturally, picture_size, read_picture
+from mitsonar.recordings.recording import Facts, Header, Part, Pixels, Recording, in_time_order, runs_of
+from mitsonar.recordings.sound_metrics import (
+    BEAMS,
+    FRAME,
+    KINDS,
+    attitude_of,
+    facts_of,
+    height_of,
+    like_of,
+    notes_of,
+    windows_of,
+)
+from mitsonar.records.frames import SonarFrames
+
+__all__ = ["is_canoe", "is_neusis", "is_uxo", "read_canoe", "read_neusis", "read_pickled_arrays", "read_uxo"]
+
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+POSES = "novatel/sonar_poses.csv"
+
+RANGE_MAX = 30.0
+CARRIER_HZ, ELEVATION_DEG = 1.2e6, 20.0
+"""Window [m] and carrier [Hz] by the reference; opening over elevation by the sonar's data sheet (not seen)."""
+
+HEAD_ROWS = 2
+"""Rows of bearings above the range bins."""
+
+STEP_DEG = (0.01, 5.0)
+"""Steps from beam to beam that can be [deg]."""
+
+WIDEST_DEG = 90.0
+"""Largest bearing [deg]."""
+
+POSE_COLUMNS = 16
+
+SAME_VELOCITY = 0.2
+"""Largest difference of the velocity in the world and the turned one of the sensor, as part of it, in the median."""
+
+UPRIGHT = 0.7
+SAILS = 3.0
+"""Least vertical part of the axis that is up; least ratio of the mean velocities along and across the sonar."""
+
+
+def is_canoe(path: Path, first: bytes) -> bool:
+    """Return whether a path is a sequence's folder of CANOE, with its poses or without."""
+    if first or not (path / "sonar").is_dir() or not ((path / "novatel").is_dir() or (path / "calib").is_dir()):
+        return False
+    return any(_time_us(one) for one in (path / "sonar").glob("*.png"))
+
+
+def read_canoe(path: Path) -> Recording:
+    """Open a sequence of CANOE; pictures are read on demand. A change of the bearings makes a new part.
+
+    Raises:
+        MitsonarError: no picture that can be read, or bearings that cannot be.
+    """
+    found = sorted((time, one) for one in (path / "sonar").glob("*.png") if (time := _time_us(one)))
+    whole = [(time, one) for time, one in found if is_whole(one)]
+    notes = [f"left out: {counted(len(found) - len(whole), 'picture')} cut off"] if len(whole) < len(found) else []
+    if not whole:
+        raise MitsonarError(f"{path / 'sonar'} holds no whole picture")
+    stamps, files = np.array([time for time, _ in whole], dtype=np.int64), [one for _, one in whole]
+    poses, told = _canoe_poses(path / POSES, stamps)
+    if poses is not None and not np.isfinite(poses).all():
+        posed = np.flatnonzero(np.isfinite(poses).all(axis=1))
+        notes.append(f"left out: {counted(len(files) - len(posed), 'picture')} without a pose")
+        stamps, files, poses = stamps[posed], [files[place] for place in posed], poses[posed]
+    times = np.asarray(stamps * 1e-6, dtype=float)
+    kept, sorting = in_time_order(times)
+    sizes = [picture_size(files[place]) for place in kept]
+    parts = []
+    for size, run in runs_of(sizes):
+        assert isinstance(size, tuple)  # as they were given
+        parts.append(_canoe_part([files[place] for place in kept[run]], size, times[kept[run]], poses, kept[run]))
+    facts: Facts = {"pictures": len(files), "rows": sizes[0][0], "columns": sizes[0][1]}
+    assumed = f"the window 0..{RANGE_MAX:g} m and the coding amplitude^0.5 are assumed: the files do not tell them"
+    return Recording(str(path), "CANOE data set (Oculus as PNG)", tuple(parts), facts, (*notes, *sorting, *told, assumed))
+
+
+def _time_us(path: Path) -> int:
+    """Return the time that a picture's name tells [us since 1970]; 0 where it tells none."""
+    return int(path.stem) if len(path.stem) == 16 and path.stem.isascii() and path.stem.isdigit() else 0
+
+
+def _canoe_part(files: list[Path], size: tuple[int, int], times: Array, poses: Array | None, places: Index) -> Part:
+    """Return the pictures of one size; their bearings are those of the first."""
+    if size[0] < HEAD_ROWS + 2:
+        raise MitsonarError(f"{files[0]} has {size[0]:,} rows: {HEAD_ROWS} of bearings and range bins are needed")
+    head = read_picture(files[0], size)[:HEAD_ROWS]
+    degrees = bearings_in(head, str(files[0]))
+    rises = bool(degrees[-1] > degrees[0])
+    bearings = np.radians(degrees if rises else degrees[::-1])
+    bins, beams = size[0] - HEAD_ROWS, size[1]
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.1
+    sonar = Sonar.create(
+        name="oculus-m3000d",
+        azimuth_fov_deg=min(180.0, float(np.degrees(bearings[-1] - bearings[0])) * beams / (beams - 1)),
+        elevation_fov_deg=ELEVATION_DEG,
+        beams=beams,
+        range_min=0.0,
+        range_max=RANGE_MAX,
+        range_bins=bins,
+        bearing="cone",
+        frequency_hz=CARRIER_HZ,
+        frame_rate_hz=min(1e6, 1 / step),
+        coding="gamma",
+        coding_gamma=0.5,
+    )
+    like = SonarFrames(np.zeros((0, bins, beams), np.uint8), sonar.range_m, bearings, np.zeros(0), sonar, level="gamma")
+    return Part(like, times, _Png(tuple(files), size, head, rises), poses=None if poses is None else poses[places])
+
+
+@dataclass(frozen=True)
+class _Png:
+    """Pictures below their rows of bearings, as images."""
+
+    files: tuple[Path, ...]
+    size: tuple[int, int]
+    head: Grey
+    rises: bool
+
+    def __call__(self, index: Index) -> Pixels:
+        """Return ``(n, bins, beams)`` uint8, column 0 most to port."""
+        images = np.zeros((len(index), self.size[0] - HEAD_ROWS, self.size[1]), np.uint8)
+        for place, number in enumerate(index):
+            picture = read_picture(self.files[number], self.size)
+            if picture.dtype != np.uint8 or not (picture[:HEAD_ROWS] == self.head).all():
+                raise MitsonarError(f"{self.files[number]} has other bearings than the pictures before it: remove it")
+            images[place] = picture[HEAD_ROWS:, :: 1 if self.rises else -1]
+        return images
+
+
+def bearings_in(head: Grey, source: str) -> Array:
+    """Return the bearings ``(columns,)`` [deg] in two rows of bytes, in whichever order of bytes they rise or fall.
+
+    Raises:
+        MitsonarError: no order gives bearings that can be.
+    """
+    if head.dtype != np.uint8:
+        raise MitsonarError(f"{source} has more than 8 bits a pixel: its bearings are bytes")
+    columns = np.ascontiguousarray(head.T).astype(np.uint8)  # low and high byte of each column, one above the other
+    along = np.ascontiguousarray(head).reshape(-1, 2)  # one beside the other, the first half of the columns first
+    for pairs in (columns, along):
+        for order in ("<i2", ">i2"):
+            degrees = np.ascontiguousarray(pairs).view(order).ravel() * 0.01
+            steps = np.diff(degrees) * np.sign(degrees[-1] - degrees[0])
+            if steps.min() >= STEP_DEG[0] - 1e-9 and steps.max() <= STEP_DEG[1] and np.abs(degrees).max() <= WIDEST_DEG:
+                return np.asarray(degrees, dtype=float)
+    raise MitsonarError(f"the first two rows of {source} are no bearings that rise or fall: it is no picture of CANOE")
+
+
+def _canoe_poses(path: Path, stamps: NDArray[np.int64]) -> tuple[Array | None, list[str]]:
+    """Return the poses ``(pictures, 6)``, nan where a picture has none, and sentences on what was found."""
+    if not path.is_file():
+        return None, [f"there is no {POSES}: poses are not known"]
+    table = CsvTable(path)
+    if len(table.names) < POSE_COLUMNS:
+        raise MitsonarError(f"{path} has {len(table.names)} columns: {POSE_COLUMNS} are needed")
+    rows = {int(time): row for row, time in enumerate(table.whole_at(0))}
+    values = table.columns_at(range(1, POSE_COLUMNS))
+    fine = np.isfinite(values).all(axis=1) & (np.abs(values).max(axis=1) < 1e9)
+    found = np.array([row if (row := rows.get(int(time), -1)) >= 0 and fine[row] else -1 for time in stamps], dtype=np.intp)
+    if (found >= 0).sum() < max(2, len(stamps) // 2):
+        return None, [f"left out: {POSES}, which has poses of {(found >= 0).sum():,} of {counted(len(stamps), 'picture')}"]
+    values = values[found[found >= 0]]
+    rotation = _to_world(values)
+    body = None if rotation is None else _body(rotation, values[:, 12:15])
+    if rotation is None or body is None:
+        why = "angles and velocities disagree" if rotation is None else "the boat does not sail along an axis of the sonar"
+        return None, [f"the axes of {POSES} could not be found, since {why}: poses are left out"]
+    poses = np.full((len(stamps), 6), np.nan)
+    poses[found >= 0] = poses_from(values[:, :3], rotation * body)
+    return poses, []
+
+
+def _to_world(values: Array) -> Rotation | None:
+    """Return the rotations from sensor to world; None where the velocities in both contradict them.
+
+    The reference multiplies passive rotations, C1(r) C2(p) C3(y). Whether its product or the inverse turns the sensor's
+    velocity into the world's is tested.
+    """
+    world, own = values[:, 6:9], values[:, 12:15]
+    product = Rotation.from_euler("XYZ", -values[:, 3:6])
+    speed = np.linalg.norm(world, axis=1)
+    moving = speed > 0.1 * max(float(speed.max()), 1e-9)
+    if not speed.max() > 0:
+        return None
+    found = []
+    for rotation in (product, product.inv()):
+        off = np.linalg.norm(rotation.apply(own) - world, axis=1)[moving] / speed[moving]
+        found.append((float(np.median(off)), rotation))
+    least, best = min(found, key=lambda one: one[0])
+    return best if least < SAME_VELOCITY else None
+
+
+def _body(rotation: Rotation, velocity: Array) -> Rotation | None:
+    """Return starboard, forward and up in the sensor's axes; None where they cannot be told.
+
+    Args:
+        rotation: from sensor to world.
+        velocity: in the sensor's axes ``(pictures, 3)`` [m/s].
+    """
+    upright = rotation.as_matrix()[:, 2, :].mean(axis=0)
+    vertical = int(np.abs(upright).argmax())
+    level = [axis for axis in range(3) if axis != vertical]
+    mean = velocity.mean(axis=0)
+    ahead, across = sorted(level, key=lambda axis: -abs(mean[axis]))
+    if abs(upright[vertical]) < UPRIGHT or abs(mean[ahead]) < SAILS * abs(mean[across]):
+        return None
+    up, forward = np.zeros(3), np.zeros(3)
+    up[vertical], forward[ahead] = np.sign(upright[vertical]), np.sign(mean[ahead])
+    return Rotation.from_matrix(np.column_stack([np.cross(forward, up), forward, up]))
+
+
+# ---------------- Folders of the UXO data set (DFKI): raw ARIS samples as PGM, headers and poses of the rotator as CSV
+# Source of the layout: scripts of the data set, github.com/dfki-ric/uxo-dataset2024 (``scripts/release_1_export.py``,
+# ``common/aris_definitions.py``, ``common/tf_statics.yaml``). No recording was at hand when this was written.
+#
+# | file | content | |---|---| | ``aris_raw/NNNN.pgm`` | samples x beams as the sonar recorded them, beam 0 most to
+# starboard; NNNN is the frame's number | | ``aris_frame_meta.csv`` | the header of each frame, columns by the names of
+# the ARIS SDK | | ``ar3.csv`` | pose of the rotator that carries the sonar: ``aris_frame_idx``, ``pos.x`` .., ``rot.x``
+# .. ``rot.w`` | | ``gantry.csv`` | position of the crane, ``aris_frame_idx, x, y, z``; not used beside ``ar3.csv`` | |
+# ``aris_file_meta.yaml`` | the header of the file; not used, since the headers of the frames tell all of it |
+#
+# Axes of the rotator are forward, starboard, down, by the place of the camera on it; the world's third axis is up. The
+# sonar is 0.109 m behind the rotator's axis.
+
+
+TABLE, IMAGES, ROTATOR = "aris_frame_meta.csv", "aris_raw", "ar3.csv"
+
+NEEDED = {
+    "index": "FrameIndex",
+    "time_us": "FrameTime",
+    "ping_mode": "PingMode",
+    "sample_period_us": "SamplePeriod",
+    "start_delay_us": "SampleStartDelay",
+    "sound_speed": "SoundSpeed",
+    "samples": "SamplesPerBeam",
+}
+"""Fields of a header and their columns, which must be there."""
+
+OPTIONAL = {
+    "gain_db": ("ReceiverGain", 0.0),
+    "depth_m": ("Depth", 0.0),
+    "altitude_m": ("Altitude", 0.0),
+    "heading_deg": ("CompassHeading", np.nan),
+    "pitch_deg": ("CompassPitch", np.nan),
+    "roll_deg": ("CompassRoll", np.nan),
+    "temperature_c": ("WaterTemp", np.nan),
+    "high_frequency": ("FrequencyHiLow", 1.0),
+    "pulse_us": ("PulseWidth", 0.0),
+    "frame_rate_hz": ("FrameRate", 0.0),
+    "large_lens": ("LargeLens", 0.0),
+    "system": ("TheSystemType", 1.0),
+    "serial": ("SonarSerialNumber", 0.0),
+}
+"""Fields of a header, their columns, and what counts where a column is missing: an ARIS 3000 with its small lens."""
+
+LIMITS = {"samples": (1, 65_536), "sample_period_us": (1, 1e6), "start_delay_us": (0, 1e8), "sound_speed": (1000, 2000)}
+"""What a header may say, as in ARIS files."""
+
+SONAR_AT = (-0.108725, 0.0, 0.0)
+"""Place of the sonar in the rotator's axes [m]."""
+
+FORWARD_STARBOARD_DOWN = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+"""Starboard, forward and up in the rotator's axes, as columns."""
+
+
+def is_uxo(path: Path, first: bytes) -> bool:
+    """Return whether a path is a recording's folder of the UXO data set."""
+    return not first and (path / TABLE).is_file() and (path / IMAGES).is_dir()
+
+
+def read_uxo(path: Path) -> Recording:
+    """Open a recording of the UXO data set; its PGM files are read on demand.
+
+    Ranges and beams are those of an ARIS file with the same headers. Poses are of the sonar, in the world of the tank, where
+    ``ar3.csv`` has one for each frame. Pictures without a header, and headers without a picture, are left out.
+
+    Raises:
+        MitsonarError: a table that lacks a column, no frame that can be read.
+    """
+    table = CsvTable(path / TABLE)
+    headers = _headers(table)
+    files = {int(one.stem): one for one in (path / IMAGES).glob("*.pgm") if one.stem.isascii() and one.stem.isdigit()}
+    whole = _whole(headers)
+    there = np.array([int(index) in files and is_whole(files[int(index)]) for index in headers["index"]])
+    notes = []
+    if not whole.all():
+        notes.append(f"left out: {counted(int((~whole).sum()), 'row')} of {TABLE} with numbers that cannot be")
+    if not there.all():
+        notes.append(f"left out: {counted(int((~there).sum()), 'frame')} of {TABLE} without a picture")
+    extra = len(files) - len(set(files) & {int(index) for index in headers["index"]})
+    if extra:
+        notes.append(f"left out: {counted(extra, 'picture')} without a row in {TABLE}")
+    usable = whole & there
+    kept, sorting = in_time_order(np.where(usable, headers["time_us"] * 1e-6, np.nan), headers["index"])
+    sorting = [note for note in sorting if "no valid time" not in note]
+    poses, told = _uxo_poses(path / ROTATOR, headers["index"][kept])
+    keys = [(int(headers["ping_mode"][k]), int(headers["samples"][k]), *key) for k, key in _keys(headers, kept)]
+    parts = tuple(_uxo_part(headers[kept[run]], files, None if poses is None else poses[run]) for _, run in runs_of(keys))
+    facts: Facts = facts_of(headers[kept], BEAMS[int(headers["ping_mode"][kept[0]])]) if len(kept) else {}
+    return Recording(
+        str(path), "UXO data set (ARIS as PGM)", parts, facts, (*notes, *sorting, *told, *notes_of(headers[kept]))
+    )
+
+
+def _headers(table: CsvTable) -> Header:
+    """Return the rows of the table as headers of ARIS frames; numbers that are none become 0."""
+    headers: Header = np.zeros(len(table), dtype=[(name, FRAME[name]) for name in FRAME.names or ()])
+    for name, column in NEEDED.items():
+        if headers.dtype[name].kind == "f":
+            headers[name] = table.numbers(column)
+        else:
+            values = table.whole(column)
+            most = min(int(np.iinfo(headers.dtype[name]).max), 2**62)
+            headers[name] = np.where((values >= 0) & (values <= most), values, 0)
+    for name, (column, default) in OPTIONAL.items():
+        numbers = table.numbers(column, default)
+        if headers.dtype[name].kind != "f":
+            numbers = np.where((numbers >= 0) & (numbers < 2**31), numbers, 0)
+        headers[name] = np.where(np.abs(numbers) < 1e12, numbers, np.nan if headers.dtype[name].kind == "f" else 0)
+    return headers
+
+
+def _whole(headers: Header) -> NDArray[np.bool_]:
+    """Return which headers can be ``(frames,)``."""
+    whole = np.isin(headers["ping_mode"], list(BEAMS)) & np.isin(headers["system"], list(KINDS)) & (headers["time_us"] > 0)
+    for name, (low, high) in LIMITS.items():
+        whole &= (headers[name] >= low) & (headers[name] <= high)
+    return whole
+
+
+def _keys(headers: Header, kept: Index) -> list[tuple[int, tuple[float, ...]]]:
+    """Return the places of the kept frames with what their geometry follows from."""
+    return list(zip(map(int, kept), windows_of(headers[kept]), strict=True))
+
+
+def _uxo_part(mine: Header, files: dict[int, Path], poses: Array | None) -> Part:
+    samples, beams = int(mine["samples"][0]), BEAMS[int(mine["ping_mode"][0])]
+    paths = tuple(files[int(index)] for index in mine["index"])
+    return Part(
+        like=like_of(mine, samples, beams),
+        time_s=mine["time_us"] * 1e-6,
+        images=_Pgm(paths, (samples, beams)),
+        poses=poses,
+        attitude_rad=attitude_of(mine),
+        height_m=height_of(mine),
+        gain_db=mine["gain_db"].astype(float),
+    )
+
+
+@dataclass(frozen=True)
+class _Pgm:
+    """PGM files of samples as images."""
+
+    paths: tuple[Path, ...]
+    shape: tuple[int, int]
+
+    def __call__(self, index: Index) -> Pixels:
+        """Return ``(n, bins, beams)`` uint8, column 0 most to port."""
+        images = np.zeros((len(index), *self.shape), np.uint8)
+        for place, number in enumerate(index):
+            picture = read_picture(self.paths[number], self.shape)
+            if picture.dtype != np.uint8:
+                raise MitsonarError(f"{self.paths[number]} has more than 8 bits a sample: ARIS samples have 8")
+            images[place] = picture[:, ::-1]
+        return images
+
+
+def _uxo_poses(path: Path, index: NDArray[np.integer]) -> tuple[Array | None, list[str]]:
+    """Return the poses ``(frames, 6)`` of the sonar by the rotator's, and a sentence where they are not known."""
+    if not path.is_file():
+        return None, [f"there is no {ROTATOR}: poses are not known"]
+    table = CsvTable(path)
+    rows = {int(number): row for row, number in enumerate(table.whole("aris_frame_idx"))}
+    position = np.column_stack([table.numbers(f"pos.{axis}") for axis in "xyz"])
+    turn = np.column_stack([table.numbers(f"rot.{axis}") for axis in "xyzw"])
+    fine = np.isfinite(position).all(axis=1) & np.isfinite(turn).all(axis=1) & (np.abs(position).max(axis=1) < 1e6)
+    fine &= np.abs(np.linalg.norm(np.where(np.isfinite(turn), turn, 0), axis=1) - 1) < 0.01
+    found = np.array([rows.get(int(number), -1) for number in index], dtype=np.intp)
+    if (found < 0).any() or not fine[found].all():
+        lacking = int(((found < 0) | ~fine[found]).sum())
+        return None, [f"left out: the poses, for {ROTATOR} has no valid one for {counted(lacking, 'frame')}"]
+    rotation = Rotation.from_quat(turn[found])
+    return poses_from(position[found] + rotation.apply(SONAR_AT), rotation * FORWARD_STARBOARD_DOWN), []
+
+
+# ---------------- Views as neusis and other acoustic radiance fields store them: a pickle a view, and a JSON file of
+# the sonar
+# Source of the layout: github.com/rpl-cmu/neusis (``load_data.py``, ``helpers.py``), whose views HoloOcean made.
+#
+# | file | content |
+# |---|---|
+# | ``Data/*.pkl`` | a table with ``ImagingSonar`` (bins x beams) and ``PoseSensor`` (4 x 4, sensor to world) |
+# | ``Config.json`` | of a sensor ``ImagingSonar``: ``Azimuth``, ``Elevation`` [deg], ``RangeMin``, ``RangeMax`` [m] |
+#
+# Row 0 is the nearest range. Column 0 has the bearing -Azimuth / 2 about the sensor's third axis. That axis is up, and the
+# first one forward, so column 0 is the one most to starboard. Views have no times: they follow one another by name, ten a
+# second. Levels are taken as linear; where a value exceeds 1, all are divided by the largest one.
+
+
+IMAGE, POSE = "ImagingSonar", "PoseSensor"
+
+RATE_HZ = 10.0
+"""Views a second: they have no times."""
+
+SHAPE_LIMIT = 2**25
+"""Cells of a view, at most."""
+
+FORWARD_PORT_UP = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+"""Starboard, forward and up in the sensor's axes, as columns."""
+
+ORTHOGONAL = 1e-3
+"""Largest error of a rotation matrix."""
+
+
+def is_neusis(path: Path, first: bytes) -> bool:
+    """Return whether a path is a folder of views with their configuration."""
+    return not first and (path / "Config.json").is_file() and (path / "Data").is_dir()
+
+
+def read_neusis(path: Path) -> Recording:
+    """Open a folder of views. Each is read once for its pose and largest value, and again when it is asked for.
+
+    Raises:
+        MitsonarError: no configuration, no view that can be read, views of several sizes, or a pose that is none.
+    """
+    setting = _setting(path / "Config.json")
+    files = sorted((path / "Data").glob("*.pkl"), key=lambda one: naturally(one.name))
+    if not files:
+        raise MitsonarError(f"{path / 'Data'} holds no .pkl file")
+    shape, largest, matrices = None, 0.0, []
+    for file in files:
+        image, matrix = _view(file)
+        if shape is not None and image.shape != shape:
+            raise MitsonarError(f"{file} has {image.shape} cells, the others {shape}: remove it")
+        shape = image.shape
+        largest = max(largest, float(image.max()))
+        matrices.append(matrix)
+    assert shape is not None  # there is a file
+    poses = np.array(matrices)
+    rotation = Rotation.from_matrix(poses[:, :3, :3])
+    sonar = Sonar.create(
+        name="imaging-sonar",
+        azimuth_fov_deg=setting["Azimuth"],
+        elevation_fov_deg=setting["Elevation"],
+        range_min=setting["RangeMin"],
+        range_max=setting["RangeMax"],
+        beams=shape[1],
+        range_bins=shape[0],
+        frame_rate_hz=RATE_HZ,
+    )
+    part = Part(
+        SonarFrames(np.zeros((0, *shape), np.float32), sonar.range_m, sonar.bearing_rad, np.zeros(0), sonar),
+        np.arange(len(files)) / RATE_HZ,
+        _Views(tuple(files), (shape[0], shape[1]), max(1.0, largest)),
+        poses=poses_from(poses[:, :3, 3], rotation * FORWARD_PORT_UP),
+    )
+    facts: Facts = {"views": len(files), "largest_value": largest}
+    notes = ["views have no times: they follow one another by name, ten a second"]
+    if largest > 1:
+        notes.append(f"values reach {largest:.4g}: they are divided by it")
+    return Recording(str(path), "views (neusis)", (part,), facts, tuple(notes))
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Views as images."""
+
+    files: tuple[Path, ...]
+    shape: tuple[int, int]
+    largest: float
+
+    def __call__(self, index: NDArray[np.intp]) -> Pixels:
+        """Return ``(n, bins, beams)`` float32 in 0..1, column 0 most to port."""
+        images = np.zeros((len(index), *self.shape), np.float32)
+        for place, number in enumerate(index):
+            image, _ = _view(self.files[number])
+            if image.shape != self.shape:
+                raise MitsonarError(f"{self.files[number]} has changed while it was read")
+            images[place] = np.clip(image[:, ::-1] / self.largest, 0, 1)
+        return images
+
+
+def _view(path: Path) -> tuple[FileArray, Array]:
+    """Return the image ``(bins, beams)`` and the pose ``(4, 4)`` of a view."""
+    table = read_pickled_arrays(path)
+    missing = [name for name in (IMAGE, POSE) if name not in table]
+    if missing:
+        raise MitsonarError(f"{path} lacks {' and '.join(missing)}: it is no view of a sonar")
+    image, matrix = table[IMAGE], np.asarray(table[POSE], dtype=float)
+    if (
+        image.ndim != 2
+        or min(image.shape) < 2
+        or image.size > SHAPE_LIMIT
+        or not np.isfinite(image).all()
+        or image.min() < 0
+    ):
+        raise MitsonarError(f"{IMAGE} of {path} must be an image (bins, beams) of finite values from 0: got {image.shape}")
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.abs(matrix[:3, 3]).max() > 1e6:
+        raise MitsonarError(f"{POSE} of {path} must be a matrix (4, 4) of finite numbers: got shape {matrix.shape}")
+    turn = matrix[:3, :3]
+    if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(turn) < 0:
+        raise MitsonarError(f"{POSE} of {path} holds no rotation: its columns must be unit vectors, at right angles")
+    return image, matrix
+
+
+def _setting(path: Path) -> dict[str, float]:
+    """Return field of view [deg] and window [m] of the imaging sonar in a configuration of HoloOcean."""
+    table = read_json(path)
+    agents = table.get("agents")
+    first: PlainValue = agents[0] if isinstance(agents, list) and agents and isinstance(agents[0], dict) else {}
+    sensors = first.get("sensors")
+    for sensor in sensors if isinstance(sensors, list) else []:
+        if isinstance(sensor, dict) and sensor.get("sensor_type") == IMAGE and isinstance(sensor.get("configuration"), dict):
+            values = sensor["configuration"]
+            keys = ("Azimuth", "Elevation", "RangeMin", "RangeMax")
+            return {key: finite_number(values.get(key), argument(f"{key} of {path}"), -1, 1e5) for key in keys}
+    raise MitsonarError(f"{path} holds no sensor of type {IMAGE} with a configuration: give a Config.json of HoloOcean")
+
+
+# ---------------- Pickles that hold tables of NumPy arrays, read without running anything that they name
+# Pickles are programs. This reader knows the few names that an array consists of, and answers each with an object that
+# only remembers what it is given. Any other name is refused. Arrays are made of the remembered bytes after a check of
+# their sizes.
+
+
+LARGEST = 2**30
+"""Bytes of a pickle, at most."""
+
+MOST_DIMENSIONS = 8
+
+NUMBERS = "biuf"
+"""Kinds of NumPy's types that are read."""
+
+Remembered = Any
+"""What a pickle gives: numbers, texts, bytes, tuples, lists, tables, and the objects of this module."""
+
+
+class _Remembers:
+    """An object of a pickle: what it was made with, and the state that it was given."""
+
+    def __init__(self, *made_with: Remembered) -> None:
+        self.made_with = made_with
+        self.state: Remembered = None
+
+    def __setstate__(self, state: Remembered) -> None:
+        self.state = state
+
+
+class _Array(_Remembers):
+    """An array: its state is version, shape, type, Fortran order, bytes."""
+
+
+class _Kind(_Remembers):
+    """A type: made with its name; its state begins with version and order of bytes."""
+
+
+class _Scalar(_Remembers):
+    """A number of NumPy: made with its type and bytes."""
+
+
+class _Class(_Remembers):
+    """A class that is only named."""
+
+
+def _encode(text: Remembered, coding: Remembered) -> bytes:
+    """Return bytes that old pickles write as text of Latin 1."""
+    if not isinstance(text, str) or coding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError("bytes that are no text of Latin 1")
+    return text.encode("latin1")
+
+
+KNOWN: dict[tuple[str, str], Any] = {
+    **{
+        (f"numpy.{core}.{module}", name): made
+        for core in ("core", "_core")
+        for module, name, made in (
+            ("multiarray", "_reconstruct", _Array),
+            ("multiarray", "scalar", _Scalar),
+            ("numeric", "_frombuffer", _Array),
+        )
+    },
+    ("numpy", "ndarray"): _Class,
+    ("numpy", "dtype"): _Kind,
+    ("_codecs", "encode"): _encode,
+}
+"""Names that a pickle may say, and what answers them."""
+
+
+class _Reader(pickle._Unpickler):  # the one in Python, whose memory follows the file's size
+    """Unpickles known names only, and gives states to the objects of this module only."""
+
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+    stack: list[Any]
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what answers a name.
+
+        Raises:
+            UnpicklingError: another name.
+        """
+        if (module, name) not in KNOWN:
+            raise pickle.UnpicklingError(f"it names {module[:60]}.{name[:60]}, which is no part of an array")
+        return KNOWN[module, name]
+
+    def persistent_load(self, pid: Any) -> Any:
+        """Refuse what lies outside of the file."""
+        raise pickle.UnpicklingError("it refers to another file")
+
+    def load_build(self) -> None:
+        """Give a state to the object on the stack."""
+        if not isinstance(self.stack[-2], _Remembers):
+            raise pickle.UnpicklingError("it changes something that is no array")
+        state = self.stack.pop()
+        self.stack[-1].__setstate__(state)
+
+    dispatch[pickle.BUILD[0]] = load_build
+
+
+def read_pickled_arrays(path: Path) -> dict[str, FileArray]:
+    """Read the arrays and numbers of the table in a pickle, by name; what is neither is left out.
+
+    Raises:
+        MitsonarError: no such file, no table, or a pickle that names anything but NumPy's arrays.
+    """
+    content = read_bytes(path, "pickle", LARGEST)
+    try:
+        found = _Reader(io.BytesIO(content)).load()
+        if not isinstance(found, dict):
+            raise pickle.UnpicklingError("it holds no table")
+        return {str(name): array for name, value in found.items() if (array := _array(value)) is not None}
+    except Exception as error:  # damaged bytes raise errors of many kinds
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MitsonarError(f"cannot read the pickle {path}: {reason}; only arrays of NumPy are read from pickles") from None
+
+
+def _array(value: Remembered) -> FileArray | None:
+    """Return the array that a value stands for; None where it is none."""
+    if isinstance(value, bool | int | float):
+        return np.asarray(value, dtype=float) if abs(value) < 1e300 or value != value else None
+    if isinstance(value, _Scalar):
+        kind, content = (*value.made_with, None, None)[:2]
+        return _from_bytes(content, kind, (), "C")
+    if not isinstance(value, _Array):
+        return None
+    if value.state is None:  # _frombuffer: bytes, type, shape, order
+        content, kind, shape, order = (*value.made_with, None, None, None, None)[:4]
+        return _from_bytes(content, kind, shape, order)
+    if not isinstance(value.state, tuple) or len(value.state) != 5:
+        raise ValueError("an array has a state that cannot be")
+    _, shape, kind, fortran, content = value.state
+    return _from_bytes(content, kind, shape, "F" if fortran else "C")
+
+
+def _from_bytes(content: Remembered, kind: Remembered, shape: Remembered, order: Remembered) -> FileArray:
+    """Make an array of bytes, after its type and shape are checked against their number."""
+    if not isinstance(kind, _Kind) or not kind.made_with or not isinstance(kind.made_with[0], str):
+        raise ValueError("an array has a type that cannot be")
+    name = kind.made_with[0]
+    swapped = isinstance(kind.state, tuple) and len(kind.state) > 1 and kind.state[1] == ">"
+    if name[:1] not in NUMBERS or not name[1:].isdigit() or len(name) > 3:
+        raise ValueError(f"an array of type {name[:20]} holds no numbers")
+    made = np.dtype(name).newbyteorder(">" if swapped else "<")
+    if not isinstance(shape, tuple) or len(shape) > MOST_DIMENSIONS or order not in ("C", "F"):
+        raise ValueError("an array has a shape that cannot be")
+    if not all(type(length) is int and 0 <= length < 2**40 for length in shape):
+        raise ValueError("an array has a shape that cannot be")
+    if not isinstance(content, bytes | bytearray) or math.prod(shape) * made.itemsize != len(content):
+        raise ValueError("an array has another number of bytes than its shape says")
+    return np.frombuffer(bytes(content), made).reshape(shape, order=order).astype(made.newbyteorder("="))

@@ -1,0 +1,767 @@
+"""ARIS files (``.aris``, DDF 5) of Sound Metrics: header, frames, range axis by delay and period, beams by table.
+
+Source of the layout: Sound Metrics, aris-file-sdk and aris-integration-sdk (MIT).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mitsonar.errors import MitsonarError, counted
+from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sounder import preset
+from mitsonar.recordings.recording import (
+    Bytes,
+    EqualFrames,
+    Facts,
+    Header,
+    Part,
+    Recording,
+    in_time_order,
+    layout,
+    mapped,
+    runs_of,
+)
+from mitsonar.records.frames import SonarFrames
+
+__all__ = [
+    "BEAMS",
+    "CHANNELS",
+    "EARTH_M",
+    "FILE",
+    "FRAME",
+    "FRAME_HEADER",
+    "KINDS",
+    "MOTION",
+    "PINGS",
+    "SIGNATURE",
+    "SIGNATURES",
+    "aris_bearings",
+    "attitude_of",
+    "didson_bearings",
+    "facts_of",
+    "height_of",
+    "in_beam_order",
+    "like_of",
+    "nominal_window",
+    "notes_of",
+    "poses_of",
+    "read_aris",
+    "read_didson",
+    "windows_of",
+]
+
+
+# ---------------- What the headers of Sound Metrics' sonars tell of their motion: attitude by the compass, height,
+# place on the earth
+
+
+Array = NDArray[np.float64]
+
+MOTION = {
+    "depth_m": (128, "<f4"), "altitude_m": (132, "<f4"), "heading_deg": (160, "<f4"), "pitch_deg": (164, "<f4"),
+    "roll_deg": (168, "<f4"), "latitude_deg": (172, "<f8"), "longitude_deg": (180, "<f8"),
+}  # fmt: skip
+"""Fields of a frame's header in DIDSON and ARIS files alike: offset [bytes] and type."""
+
+EARTH_M = 6_371_008.8
+"""Mean radius of the earth [m]."""
+
+DEEPEST_M = 1.2e4
+HIGHEST_M = 1e4
+"""What is believed of a depth and of a height over the ground [m]."""
+
+
+def attitude_of(headers: Header) -> Array | None:
+    """Return pitch, roll, heading ``(frames, 3)`` [rad] by the compass; None where it tells nothing, nan where it cannot be.
+
+    The compass counts upward pitch as positive, poses count downward pitch so.
+    """
+    degrees = np.stack([-headers["pitch_deg"], headers["roll_deg"], headers["heading_deg"]], axis=1).astype(float)
+    attitude = np.radians(np.where(np.abs(degrees) <= 360, degrees, np.nan))
+    return attitude if np.any(attitude) else None
+
+
+def height_of(headers: Header) -> Array | None:
+    """Return the height over the ground ``(frames,)`` [m] where the vehicle filled it in; None where it did not."""
+    altitude_m = headers["altitude_m"].astype(float)
+    known = np.isfinite(altitude_m) & (altitude_m > 0) & (altitude_m < HIGHEST_M)
+    return np.where(known, altitude_m, np.nan) if known.any() else None
+
+
+def poses_of(headers: Header, attitude_rad: Array | None) -> Array | None:
+    """Return poses ``(frames, 6)`` by latitude and longitude; None where a frame lacks them, or its attitude."""
+    latitude, longitude = np.radians(headers["latitude_deg"]), np.radians(headers["longitude_deg"])
+    known = (np.abs(latitude) < np.pi / 2) & (np.abs(longitude) <= np.pi) & ((latitude != 0) | (longitude != 0))
+    if attitude_rad is None or not known.all() or not np.isfinite(attitude_rad).all():
+        return None
+    depth = headers["depth_m"].astype(float)
+    east = (longitude - longitude[0]) * np.cos(latitude[0]) * EARTH_M
+    north = (latitude - latitude[0]) * EARTH_M
+    return np.column_stack([east, north, -np.where(np.abs(depth) < DEEPEST_M, depth, 0.0), attitude_rad])
+
+
+# ---------------- aris
+
+
+SIGNATURE = b"DDF\x05"
+
+FILE_HEADER = 1024
+
+FRAME = layout(
+    MOTION
+    | {
+        "index": (0, "<u4"), "time_us": (4, "<u8"), "signature": (12, "S4"), "sonar_time_us": (20, "<u8"),
+        "window_start_m": (52, "<f4"), "window_length_m": (56, "<f4"), "gain_db": (68, "<u4"), "temperature_c": (224, "<f4"),
+        "ping_mode": (436, "<u4"), "high_frequency": (440, "<u4"), "pulse_us": (444, "<u4"),
+        "sample_period_us": (452, "<u4"), "transmits": (456, "<u4"),
+        "frame_rate_hz": (460, "<f4"), "sound_speed": (464, "<f4"), "samples": (468, "<u4"), "start_delay_us": (476, "<u4"),
+        "large_lens": (480, "<u4"), "system": (484, "<u4"), "serial": (488, "<u4"), "reordered": (516, "<u4"),
+        "salinity": (520, "<u4"),
+    },
+    1024,
+)  # fmt: skip
+"""Fields of a frame's header: offset [bytes] and type."""
+
+BEAMS = (
+    dict.fromkeys((1, 2), 48)
+    | dict.fromkeys((3, 4, 5), 96)
+    | dict.fromkeys((6, 7, 8), 64)
+    | dict.fromkeys(range(9, 13), 128)
+)
+"""Beams of each ping mode."""
+
+PINGS = {1: 3, 3: 6, 6: 4, 9: 8}
+"""Pings of a frame in transmission order, by ping mode."""
+
+CHANNELS = (10, 2, 14, 6, 8, 0, 12, 4, 11, 3, 15, 7, 9, 1, 13, 5)
+"""Group of beams that each channel of the receiver belongs to, in transmission order."""
+
+ARIS_CODING_DB = 80.0
+"""Span of the values 0..255 [dB]."""
+
+MOST_SAMPLES = 65_536
+ARIS_LEAST_SPEED, ARIS_MOST_SPEED = 1000.0, 2000.0
+LONGEST_M = 1e4
+"""What a header may say: samples of a beam, sound speed [m/s], end of the window [m]."""
+
+SAME_SPEED = 0.002
+"""Relative change of the sound speed up to which a window counts as the same."""
+
+
+class Kind(NamedTuple):
+    """A type of ARIS: its name, carriers low and high [Hz], and opening over elevation [deg] (data sheets)."""
+
+    name: str
+    low_hz: float
+    high_hz: float
+    elevation_deg: float
+
+
+KINDS = {
+    0: Kind("1800", 1.1e6, 1.8e6, 14.0),
+    1: Kind("3000", 1.8e6, 3.0e6, 15.0),
+    2: Kind("1200", 0.7e6, 1.2e6, 14.0),
+}
+"""By the number in the header."""
+
+TELEPHOTO_ELEVATION_DEG = 3.0
+"""Opening over elevation with the large lens [deg]; ours, no source was seen."""
+
+
+def read_aris(path: str | Path) -> Recording:
+    """Open an ARIS recording; pixels are read on demand.
+
+    Ranges are ``start delay`` and ``sample period`` times half the sound speed: sample i lies at r0 + i dr. Values 0..255
+    stand for 0..80 dB. Attitude is that of the sonar's compass; pitch > 0 points down. Where the file holds latitudes and
+    longitudes, poses are metres east and north of the first frame.
+
+    Raises:
+        MitsonarError: no such file, another format, or no frame that can be read.
+    """
+    data = mapped(path, "an ARIS file", FILE_HEADER + FRAME.itemsize)
+    name = str(path)
+    if bytes(data[:4]) != SIGNATURE:
+        raise MitsonarError(f"{name} is no ARIS file: it begins with {bytes(data[:4])!r}, not with {SIGNATURE!r}")
+    frames, beams = _aris_frames(data, name)
+    headers = frames.table()
+    whole, notes = _whole(headers, frames)
+    kept, sorting = in_time_order(np.where(whole, headers["time_us"] * 1e-6, np.nan), headers["index"])
+    parts = tuple(_aris_part(frames, headers, kept[run], beams) for _, run in runs_of(windows_of(headers[kept])))
+    return Recording(
+        name, "ARIS 5 (.aris)", parts, facts_of(headers[kept], beams), (*notes, *sorting, *notes_of(headers[kept]))
+    )
+
+
+def _aris_frames(data: Bytes, name: str) -> tuple[EqualFrames, int]:
+    """Return the frames and the number of beams, by the first header."""
+    first = np.frombuffer(data[FILE_HEADER : FILE_HEADER + FRAME.itemsize].tobytes(), FRAME)[0]
+    mode, samples = int(first["ping_mode"]), int(first["samples"])
+    if mode not in BEAMS or not 0 < samples <= MOST_SAMPLES:
+        raise MitsonarError(
+            f"{name}: the first frame says ping mode {mode} and {samples:,} samples a beam; there are ping modes 1 to 12 "
+            f"and samples 1 to {MOST_SAMPLES:,}: the file is damaged"
+        )
+    frames = EqualFrames(data, FILE_HEADER, FRAME, samples * BEAMS[mode])
+    if not len(frames):
+        raise MitsonarError(f"{name} holds no whole frame: {len(data):,} bytes, and a frame takes {frames.stride:,}")
+    return frames, BEAMS[mode]
+
+
+def _whole(headers: Header, frames: EqualFrames) -> tuple[NDArray[np.bool_], list[str]]:
+    """Return which frames have a header that can be, and sentences on the others."""
+    first, told = headers[0], headers["sound_speed"].astype(float)
+    speed = np.where((told > ARIS_LEAST_SPEED) & (told < ARIS_MOST_SPEED), told, np.nan)
+    whole = (headers["signature"] == SIGNATURE) & (headers["ping_mode"] == first["ping_mode"])
+    whole &= headers["samples"] == first["samples"]
+    end_us = headers["start_delay_us"] + headers["sample_period_us"] * headers["samples"].astype(float)
+    whole &= (
+        (headers["sample_period_us"] > 0) & (end_us * 1e-6 * speed / 2 < LONGEST_M) & np.isin(headers["system"], list(KINDS))
+    )
+    tabled = whole & _tabled(headers)
+    whole = tabled if tabled.any() else whole  # where all frames lack a table, the error says which
+    notes = []
+    if not whole.all():
+        notes.append(f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header")
+    if frames.left_over:
+        notes.append(f"the last {frames.left_over:,} bytes are no whole frame and are left out")
+    return whole, notes
+
+
+def _tabled(headers: Header) -> NDArray[np.bool_]:
+    """Return which frames ``(frames,)`` have a table of beam angles."""
+    beams, lens = BEAMS[int(headers["ping_mode"][0])], headers["large_lens"] != 0
+    known = lens & (("telephoto", beams) in TABLES)
+    for system, kind in KINDS.items():
+        known |= ~lens & (headers["system"] == system) & ((kind.name, beams) in TABLES)
+    return np.asarray(known, dtype=bool)
+
+
+def windows_of(headers: Header) -> list[tuple[float, ...]]:
+    """Return what the geometry of each frame follows from; small drifts of the sound speed count as none."""
+    names = ("start_delay_us", "sample_period_us", "large_lens", "system", "high_frequency")
+    keys, speed = [], 0.0
+    for header in headers:
+        if abs(float(header["sound_speed"]) - speed) > SAME_SPEED * speed:
+            speed = float(header["sound_speed"])
+        keys.append((speed, *(float(header[name]) for name in names)))
+    return keys
+
+
+def _aris_part(frames: EqualFrames, headers: Header, places: NDArray[np.intp], beams: int) -> Part:
+    mine = headers[places]
+    samples = int(mine["samples"][0])
+    raw = _ArisSamples(frames, places, samples, beams, int(mine["ping_mode"][0]), bool(mine["reordered"].all()))
+    attitude = attitude_of(mine)
+    return Part(
+        like=like_of(mine, samples, beams),
+        time_s=mine["time_us"] * 1e-6,
+        images=raw,
+        poses=poses_of(mine, attitude),
+        attitude_rad=attitude,
+        height_m=height_of(mine),
+        gain_db=mine["gain_db"].astype(float),
+    )
+
+
+@dataclass(frozen=True)
+class _ArisSamples:
+    """The samples of a part's frames, as images."""
+
+    frames: EqualFrames
+    places: NDArray[np.intp]
+    samples: int
+    beams: int
+    mode: int
+    reordered: bool
+
+    def __call__(self, index: NDArray[np.intp]) -> Bytes:
+        """Return ``(n, bins, beams)``, column 0 most to port."""
+        raw = self.frames.read(self.places[index], (self.samples, self.beams))
+        if not self.reordered:
+            flags = self.frames.headers()["reordered"][self.places[index]]
+            raw = np.stack([one if flag else in_beam_order(one, self.mode) for one, flag in zip(raw, flags, strict=True)])
+        return raw[:, :, ::-1]
+
+
+def in_beam_order(samples: Bytes, mode: int) -> Bytes:
+    """Return a frame ``(samples, beams)`` of a live stream in the order of its beams.
+
+    A live stream holds pings x samples x 16 channels. Channel c of ping p is beam ``CHANNELS[c] * pings + p``.
+
+    Raises:
+        MitsonarError: a ping mode whose order is not known.
+    """
+    if mode not in PINGS:
+        known = ", ".join(str(one) for one in PINGS)
+        raise MitsonarError(
+            f"the order of ping mode {mode} is not known: known are {known}; record it with the vendor's program"
+        )
+    pings = PINGS[mode]
+    by_ping = samples.reshape(pings, -1, len(CHANNELS))
+    beams = np.array(CHANNELS)[None, :] * pings + np.arange(pings)[:, None]
+    ordered = np.empty((by_ping.shape[1], pings * len(CHANNELS)), dtype=samples.dtype)
+    ordered[:, beams.ravel()] = by_ping.transpose(1, 0, 2).reshape(by_ping.shape[1], -1)
+    return ordered
+
+
+def like_of(headers: Header, samples: int, beams: int) -> SonarFrames:
+    """Return frames without images: the geometry of a part."""
+    first = headers[0]
+    kind = KINDS[int(first["system"])]
+    lens = bool(first["large_lens"])
+    bearings = aris_bearings("telephoto" if lens else kind.name, beams)
+    speed = float(np.median(headers["sound_speed"]))
+    step = float(first["sample_period_us"]) * 1e-6 * speed / 2
+    near = float(first["start_delay_us"]) * 1e-6 * speed / 2
+    sonar = Sonar.create(
+        name=f"aris{kind.name}",
+        azimuth_fov_deg=float(np.degrees(bearings[-1] - bearings[0]) * beams / (beams - 1)),
+        elevation_fov_deg=TELEPHOTO_ELEVATION_DEG if lens else kind.elevation_deg,
+        beams=beams,
+        range_min=near,
+        range_max=near + samples * step,
+        range_bins=samples,
+        sound_speed=speed,
+        bearing="cone",
+        frequency_hz=kind.high_hz if first["high_frequency"] else kind.low_hz,
+        frame_rate_hz=_rate(headers),
+        coding="dB",
+        coding_db=ARIS_CODING_DB,
+    )
+    return SonarFrames(
+        image=np.zeros((0, samples, beams), np.uint8),
+        range_m=near + np.arange(samples, dtype=np.float64) * step,
+        bearing_rad=bearings,
+        time_s=np.zeros(0),
+        sonar=sonar,
+        level="dB",
+    )
+
+
+def _rate(headers: Header) -> float:
+    """Return the frames a second: as stated, or by the times."""
+    stated = float(headers["frame_rate_hz"][0])
+    if math.isfinite(stated) and 0 < stated < 1e3:
+        return stated
+    seconds = float(headers["time_us"][-1] - headers["time_us"][0]) * 1e-6
+    return (len(headers) - 1) / seconds if seconds > 0 else 10.0
+
+
+def facts_of(headers: Header, beams: int) -> Facts:
+    """Return what the headers tell, by name."""
+    if not len(headers):
+        return {}
+    first = headers[0]
+    names = (
+        "ping_mode",
+        "high_frequency",
+        "large_lens",
+        "serial",
+        "sample_period_us",
+        "start_delay_us",
+        "pulse_us",
+        "samples",
+    )
+    facts: Facts = {"system": f"ARIS {KINDS[int(first['system'])].name}", "beams": beams}
+    facts |= {name: int(first[name]) for name in names} | {"gain_db": int(first["gain_db"])}
+    facts["sound_speed"] = float(first["sound_speed"])
+    known = headers["temperature_c"][np.isfinite(headers["temperature_c"])]  # attitude is in the frames, in our signs
+    if len(known):
+        facts["temperature_c"] = [float(known.min()), float(known.max())]
+    return facts
+
+
+def notes_of(headers: Header) -> list[str]:
+    """Return sentences on what changes inside the file."""
+    gains = np.unique(headers["gain_db"])
+    return [f"the receiver's gain changes between {gains[0]} and {gains[-1]} dB"] if len(gains) > 1 else []
+
+
+# ---------------- DIDSON files (``.ddf``, DDF 3 and 4) of Sound Metrics: frames, range axis by timing, beams of the lens
+# Source: public readers of such files, Sound Metrics' MATLAB reader as they quote it, and what Echoview says of the
+# format. No real file was at hand: the reader was tested on files that its tests write by this description, not on a
+# recording. The authors of hydroformats (Apache-2.0) report that ten recordings of version 3 have headers of these
+# sizes, this clock, and a sound speed at this place.
+
+Index = NDArray[np.intp]
+
+SIGNATURES = {b"DDF\x03": 3, b"DDF\x04": 4}
+"""First four bytes of a file and version."""
+
+FILE = layout(
+    {
+        "signature": (0, "S4"), "frames": (4, "<u4"), "frame_rate_hz": (8, "<u4"), "high_frequency": (12, "<u4"),
+        "beams": (16, "<u4"), "sample_rate_hz": (20, "<f4"), "samples": (24, "<u4"), "gain_db": (28, "<u4"),
+        "start_code": (32, "<u4"), "length_code": (36, "<u4"), "reverse": (40, "<u4"), "serial": (44, "<u4"),
+        "sound_speed": (384, "<u4"),
+    },
+    512,
+)  # fmt: skip
+"""Fields of the file's header: offset [bytes] and type."""
+
+COMMON = MOTION | {
+    "index": (0, "<u4"), "time_s": (4, "<u4"), "signature": (12, "S4"), "year": (20, "<u4"), "month": (24, "<u4"),
+    "day": (28, "<u4"), "hour": (32, "<u4"), "minute": (36, "<u4"), "second": (40, "<u4"), "hundredth": (44, "<u4"),
+    "start_code": (52, "<u4"), "length_code": (56, "<u4"), "gain_db": (68, "<u4"), "config": (192, "<u4"),
+}  # fmt: skip
+
+FRAME_HEADER = {3: layout(COMMON, 256), 4: layout(COMMON, 1024)}
+"""Fields of a frame's header by version."""
+
+FILE_HEADERS = {3: (512,), 4: (1024, 512)}
+"""Sizes of the file's header [bytes] by version. Readers disagree on version 4: the frames' signature decides."""
+
+CLASSIC, LONG_RANGE = 1, 2
+"""Bits of a frame's configuration: classic windows instead of extended ones; DIDSON-LR instead of DIDSON-S."""
+
+LAST_CLASSIC, LONG_RANGE_SERIAL = 18, 15
+"""Serial numbers up to which windows are classic whatever the configuration says; the one of a long-range sonar."""
+
+LENGTHS_M = {
+    0: (1.25, 2.5, 5.0, 10.0, 20.0, 40.0),
+    CLASSIC: (1.125, 2.25, 4.5, 9.0, 18.0, 36.0),
+    LONG_RANGE: (2.5, 5.0, 10.0, 20.0, 40.0, 80.0),
+    LONG_RANGE | CLASSIC: (2.25, 4.5, 9.0, 18.0, 36.0, 72.0),
+}
+"""Nominal lengths of windows [m] by configuration; code 0 is the first at high frequency, the third at low."""
+
+STEPS_M = {0: 0.42, CLASSIC: 0.375}
+"""Nominal step of the window's start [m] at high frequency, extended and classic; twice as much at low."""
+
+MOST_START, MOST_LENGTH = 31, 3
+"""Largest codes of a window's start and length."""
+
+DELAY_S = {True: 0.512e-3, False: 0.572e-3}
+"""Time of one step of the window's start [s] at high frequency, for serial numbers up to 18 and above; twice that at low."""
+
+FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), LONG_RANGE: (0.7e6, 1.2e6)}
+"""Carriers at low and high frequency [Hz] (data sheets)."""
+
+NOMINAL_SPEED = 1500.0
+"""Sound speed where the file tells none [m/s]."""
+
+DIDSON_LEAST_SPEED, DIDSON_MOST_SPEED = 1300, 1700
+"""What is believed of a sound speed [m/s]."""
+
+DIDSON_CODING_DB = 90.0
+"""Span of the values 0..255 [dB]."""
+
+DIFFERS = 0.1
+"""Part of the nominal window by which the one by timing may differ without a note."""
+
+CLOCK = {
+    "year": (1970, 2200), "month": (1, 12), "day": (1, 31), "hour": (0, 23), "minute": (0, 59), "second": (0, 60),
+    "hundredth": (0, 99),
+}  # fmt: skip
+"""Fields of the sonar's clock, and what is believed of them."""
+
+LONGEST_TIE = 3.0
+"""Frames of one time are spread over the time to the next, at most so many times that of the frame rate."""
+
+LENS = {48: (1.0, 0.0015, 1.3351), 96: (1.012, 0.0030, 2.6829)}
+"""Of the lens, by number of beams: beams from the axis = factor (cubic t^3 + linear t), t in degrees from the axis."""
+
+
+def read_didson(path: str | Path) -> Recording:
+    """Open a DIDSON recording; pixels are read on demand.
+
+    The window of each frame follows from its own codes and from the timing: it begins at ``code * delay * c / 2``, and
+    sample n lies at (n + 1/2) ``c / (2 sample rate)`` from there. The file's sample rate belongs to the window's length in
+    its header; in frames of another length it changes in proportion. Without a sample rate the nominal lengths stand in.
+    A note says where timing and nominal window differ. The sound speed is that of the file, or 1500 m/s.
+
+    Values 0..255 stand for 0..90 dB. Beam 0 is the one most to starboard, where ``reverse`` is not 0 the one most to port.
+    Attitude is that of the sonar's compass. Times are the sonar's clock, local time to 0.01 s; frames that share one are
+    spread evenly up to the next.
+
+    Raises:
+        MitsonarError: no such file, another format, or no frame that can be read.
+    """
+    name = str(path)
+    data = mapped(path, "a DIDSON file", FILE.itemsize)
+    version = SIGNATURES.get(data[:4].tobytes())
+    if version is None:
+        raise MitsonarError(f"{name} is no DIDSON file: it begins with {data[:4].tobytes()!r}, not with DDF and 3 or 4")
+    head = np.frombuffer(data[: FILE.itemsize].tobytes(), FILE)[0]
+    frames = _didson_frames(data, head, version, name)
+    headers = frames.table()
+    whole = (
+        (headers["signature"] == data[:4].tobytes()) & (headers["start_code"] <= MOST_START) & (headers["length_code"] < 4)
+    )
+    notes = [f"left out: {counted(int((~whole).sum()), 'frame')} with a damaged header"] if not whole.all() else []
+    notes += [f"the last {frames.left_over:,} bytes are no whole frame and are left out"] if frames.left_over else []
+    time_s, timing = _times(headers, head)
+    kept, sorting = in_time_order(np.where(whole, time_s, np.nan), headers["index"])
+    windows = _Windows(head)
+    parts = tuple(
+        _didson_part(frames, headers[kept[run]], kept[run], time_s[kept[run]], windows)
+        for _, run in runs_of([windows.key(one) for one in headers[kept]])
+    )
+    notes = [*notes, *timing, *sorting, *windows.notes(headers[kept])]
+    return Recording(name, f"DIDSON {version} (.ddf)", parts, _facts(head, headers[kept], windows), tuple(notes))
+
+
+def _didson_frames(data: Bytes, head: np.void, version: int, name: str) -> EqualFrames:
+    """Return the frames, behind the header of the file whose size puts the signature into them."""
+    beams, samples = int(head["beams"]), int(head["samples"])
+    if beams not in LENS or not 0 < samples <= MOST_SAMPLES:
+        raise MitsonarError(
+            f"{name}: the file says {beams:,} beams and {samples:,} samples a beam; a DIDSON has 48 or 96 beams and 1 to "
+            f"{MOST_SAMPLES:,} samples: the file is damaged"
+        )
+    for size in FILE_HEADERS[version]:
+        if data[size + 12 : size + 16].tobytes() == data[:4].tobytes():
+            frames = EqualFrames(data, size, FRAME_HEADER[version], beams * samples)
+            if not len(frames):
+                raise MitsonarError(f"{name} holds no whole frame: {len(data):,} bytes, and a frame takes {frames.stride:,}")
+            return frames
+    sizes = " or ".join(f"{size:,}" for size in FILE_HEADERS[version])
+    raise MitsonarError(f"{name}: no frame begins behind a header of {sizes} bytes: the file is cut off or damaged")
+
+
+def _times(headers: Header, head: np.void) -> tuple[Array, list[str]]:
+    """Return the times of the frames ``(frames,)`` [s] by the sonar's clock; by the frame rate where that never ran."""
+    stated = int(head["frame_rate_hz"])
+    rate = float(stated) if 0 < stated <= 100 else 10.0
+    parts = {name: headers[name].astype(np.int64) for name in CLOCK}
+    known = np.ones(len(headers), dtype=bool)
+    for name, (least, most) in CLOCK.items():
+        known &= (parts[name] >= least) & (parts[name] <= most)
+    if known.any():
+        months = np.where(known, (parts["year"] - 1970) * 12 + parts["month"] - 1, 0)
+        days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + parts["day"] - 1
+        seconds = ((days * 24 + parts["hour"]) * 60 + parts["minute"]) * 60 + parts["second"]
+        time_s = np.where(known, seconds + parts["hundredth"] / 100, np.nan)
+        return _spread(time_s, headers["index"], 1 / rate)
+    note = f"the sonar's clock tells no times: frames follow each other at {rate:g} Hz, by their numbers"
+    return headers["index"].astype(float) / rate, [note]
+
+
+def _spread(time_s: Array, number: Index, period_s: float) -> tuple[Array, list[str]]:
+    """Return times ``(frames,)`` [s] with frames of one time, but of rising numbers, spread up to the time of the next."""
+    new = np.ones(len(time_s), dtype=bool)
+    new[1:] = (np.diff(time_s) != 0) | (np.diff(number.astype(np.int64)) <= 0)
+    if new.all():
+        return time_s, []
+    begin = np.flatnonzero(new)
+    count = np.diff(begin, append=len(time_s))
+    gap = np.append(np.diff(time_s[begin]), np.nan)
+    gap = np.where((gap > 0) & (gap < LONGEST_TIE * period_s * count), gap, period_s * count)
+    group = np.cumsum(new) - 1
+    part = (np.arange(len(time_s)) - begin[group]) / count[group]
+    note = f"{counted(int((~new).sum()), 'frame')} with the clock of the one before: spread evenly up to the next"
+    return time_s + part * gap[group], [note]
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """How the windows of a file's frames follow from their codes."""
+
+    head: np.void
+
+    @property
+    def high(self) -> bool:
+        return int(self.head["high_frequency"]) == 1
+
+    @property
+    def old(self) -> bool:
+        return int(self.head["serial"]) <= LAST_CLASSIC
+
+    @property
+    def sound_speed(self) -> float:
+        stated = int(self.head["sound_speed"])
+        return float(stated) if DIDSON_LEAST_SPEED <= stated <= DIDSON_MOST_SPEED else NOMINAL_SPEED
+
+    def config(self, header: np.void) -> int:
+        """Return the configuration of a frame, which old sonars do not tell."""
+        told = int(header["config"]) & (CLASSIC | LONG_RANGE)
+        told |= CLASSIC if self.old else 0
+        return told | LONG_RANGE if int(self.head["serial"]) == LONG_RANGE_SERIAL else told
+
+    def key(self, header: np.void) -> tuple[int, int, int]:
+        """Return what the geometry of a frame follows from."""
+        return int(header["start_code"]), int(header["length_code"]), self.config(header)
+
+    def nominal(self, header: np.void) -> tuple[float, float]:
+        """Return start and length of a frame's window by the tables [m]."""
+        return nominal_window(*self.key(header), high=self.high)
+
+    def timed(self, header: np.void) -> tuple[float, float]:
+        """Return start and length of a frame's window by the timing [m]."""
+        start, code, config = self.key(header)
+        begin = start * DELAY_S[self.old] * (1 if self.high else 2) * self.sound_speed / 2
+        rate, samples = float(self.head["sample_rate_hz"]), int(self.head["samples"])
+        length = self.nominal(header)[1]
+        if not (math.isfinite(rate) and 1e2 < rate < 1e8):
+            return begin, length * self.sound_speed / NOMINAL_SPEED
+        reference = int(self.head["length_code"])
+        whole = nominal_window(0, reference if reference <= MOST_LENGTH else code, config, high=self.high)[1]
+        return begin, samples * self.sound_speed / (2 * rate) * length / whole
+
+    def notes(self, headers: Header) -> list[str]:
+        """Return sentences on what is assumed, and on windows whose timing and tables differ."""
+        notes = []
+        if not DIDSON_LEAST_SPEED <= int(self.head["sound_speed"]) <= DIDSON_MOST_SPEED:
+            notes.append(f"the file tells no sound speed: {NOMINAL_SPEED:g} m/s is taken")
+        rate = float(self.head["sample_rate_hz"])
+        if not (math.isfinite(rate) and 1e2 < rate < 1e8):
+            notes.append("the file tells no sample rate: windows have their nominal lengths")
+        for one in {self.key(header): header for header in headers}.values():
+            (start, length), (expected, whole) = self.timed(one), self.nominal(one)
+            if abs(start - expected) > DIFFERS * max(expected, 1.0) or abs(length - whole) > DIFFERS * whole:
+                notes.append(
+                    f"a window lies at {start:.3g} to {start + length:.3g} m by its timing, and nominally at "
+                    f"{expected:.3g} to {expected + whole:.3g} m: the timing is taken"
+                )
+        return notes[:10]
+
+
+def nominal_window(start: int, code: int, config: int, *, high: bool) -> tuple[float, float]:
+    """Return start and length of a window by Sound Metrics' tables [m].
+
+    Args:
+        start: code of the window's start, 0 to 31.
+        code: code of its length, 0 to 3.
+        config: of the frame: 1 classic, 2 long range, or both, or 0.
+        high: at high frequency.
+    """
+    begin = start * STEPS_M[config & CLASSIC] * (1 if high else 2)
+    return begin, LENGTHS_M[config][code + (0 if high else 2)]
+
+
+@cache
+def didson_bearings(beams: int) -> Array:
+    """Return the bearings of a DIDSON's beams ``(beams,)`` [rad], most to port first, starboard positive.
+
+    They follow the empirical polynomial of the lens, without its even terms: these shift the fan by 0.4 deg, to a side that
+    depends on how the reader that it comes from turns its images. Beams are not even: 0.37 deg apart in the middle and 0.22
+    at the sides, of 96. Beam tables of the ARIS 1800, which has the same number of beams and field of view, show the same
+    (0.35 and 0.21 deg), so that the polynomial was preferred to even beams of 0.3 deg.
+
+    Args:
+        beams: 48 or 96.
+    """
+    factor, cubic, linear = LENS[beams]
+    angles = np.linspace(-20.0, 20.0, 40_001)
+    degrees = np.interp(np.arange(beams) - (beams - 1) / 2, factor * (cubic * angles**3 + linear * angles), angles)
+    return np.asarray(np.radians(degrees))
+
+
+@dataclass(frozen=True)
+class _DidsonImages:
+    """The images of a part's frames."""
+
+    frames: EqualFrames
+    places: Index
+    shape: tuple[int, int]
+    flipped: bool
+
+    def __call__(self, index: Index) -> Bytes:
+        """Return ``(n, bins, beams)``, column 0 most to port."""
+        raw = self.frames.read(self.places[index], self.shape)
+        return raw[:, :, ::-1] if self.flipped else raw
+
+
+def _didson_part(frames: EqualFrames, headers: Header, places: Index, time_s: Array, windows: _Windows) -> Part:
+    shape = (int(windows.head["samples"]), int(windows.head["beams"]))
+    attitude = attitude_of(headers)
+    return Part(
+        like=_didson_sonar(headers[0], windows, time_s),
+        time_s=time_s,
+        images=_DidsonImages(frames, places, shape, flipped=int(windows.head["reverse"]) == 0),
+        poses=poses_of(headers, attitude),
+        attitude_rad=attitude,
+        height_m=height_of(headers),
+        gain_db=headers["gain_db"].astype(float),
+    )
+
+
+def _didson_sonar(header: np.void, windows: _Windows, time_s: Array) -> SonarFrames:
+    """Return frames without images: the geometry of a part."""
+    samples, beams = int(windows.head["samples"]), int(windows.head["beams"])
+    start, length = windows.timed(header)
+    bearings = didson_bearings(beams)
+    far = windows.config(header) & LONG_RANGE
+    seconds = float(time_s[-1] - time_s[0])
+    sonar = Sonar.create(
+        name="didson-lr" if far else "didson",
+        azimuth_fov_deg=float(np.degrees(bearings[-1] - bearings[0])) * beams / (beams - 1),
+        elevation_fov_deg=preset("didson300").elevation_fov_deg,
+        beams=beams,
+        range_min=start,
+        range_max=start + length,
+        range_bins=samples,
+        sound_speed=windows.sound_speed,
+        bearing="cone",
+        frequency_hz=FREQUENCIES_HZ[far][windows.high],
+        frame_rate_hz=min(1e6, (len(time_s) - 1) / seconds) if seconds > 0 else 10.0,
+        coding="dB",
+        coding_db=DIDSON_CODING_DB,
+    )
+    return SonarFrames(
+        image=np.zeros((0, samples, beams), np.uint8),
+        range_m=sonar.range_m,
+        bearing_rad=bearings,
+        time_s=np.zeros(0),
+        sonar=sonar,
+        level="dB",
+    )
+
+
+def _facts(head: np.void, headers: Header, windows: _Windows) -> Facts:
+    """Return what the headers tell, by name."""
+    if not len(headers):
+        return {}
+    names = ("high_frequency", "beams", "samples", "reverse", "serial")
+    config = windows.config(headers[0])
+    facts: Facts = {"system": "DIDSON-LR" if config & LONG_RANGE else "DIDSON-S"}
+    facts |= {"windows": "classic" if config & CLASSIC else "extended"} | {name: int(head[name]) for name in names}
+    facts |= {"gain_db": int(headers["gain_db"][0]), "sound_speed": windows.sound_speed}
+    rate = float(head["sample_rate_hz"])
+    return facts | ({"sample_rate_hz": rate} if math.isfinite(rate) else {})
+
+
+# ---------------- Beam angles of ARIS sonars by lens and number of beams (Sound Metrics, aris-file-sdk, MIT)
+
+
+TABLES = {
+    ("telephoto", 48): "aris_telephoto_48",
+    ("telephoto", 96): "aris_telephoto_96",
+    ("1200", 48): "aris1200_1800_48",
+    ("1800", 48): "aris1200_1800_48",
+    ("1800", 96): "aris1800_96",
+    ("3000", 64): "aris3000_64",
+    ("3000", 128): "aris3000_128",
+}
+"""Tables by lens or type of the sonar and number of beams."""
+
+
+@cache
+def aris_bearings(kind: str, beams: int) -> NDArray[np.float64]:
+    """Return the bearings of an ARIS' beams ``(beams,)`` [rad], most to port first, starboard positive.
+
+    Beam 0 of a file is the one most to starboard, and of the table the one of the least angle. So the angle of a beam is
+    the negative one of its row, and the beams in falling order of their numbers are the table as it is, negated.
+
+    Args:
+        kind: ``1200``, ``1800`` or ``3000``, or ``telephoto`` for any of them with the large lens.
+        beams: number of beams.
+
+    Raises:
+        MitsonarError: no table for them.
+    """
+    if (kind, beams) not in TABLES:
+        known = ", ".join(f"{one} with {number}" for one, number in TABLES)
+        raise MitsonarError(f"no beam angles are known for an ARIS {kind} with {beams} beams: known are {known}")
+    lines = files("mitsonar.recordings").joinpath(f"beam_tables/{TABLES[kind, beams]}.csv").read_text().splitlines()
+    degrees = np.array([float(line.split(",")[1]) for line in lines[1:]])
+    return np.asarray(-np.radians(degrees)[::-1])
