@@ -19,7 +19,7 @@ import numpy as np
 from mitsonar import ChannelSimulator, ChannelSonar
 from mitsonar.instruments.hydrophones import FieldOfView, Hydrophone
 from mitsonar.simulation.variant import ensure_variant, use_threads
-from mitsonar.worlds.sea_surface import SeaSurface
+from mitsonar.worlds.sea import SeaSurface
 
 if TYPE_CHECKING:
     import mitsuba as mi

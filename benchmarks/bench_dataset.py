@@ -277,7 +277,7 @@ def reading(url: Path, size: Size) -> Iterator[Row]:
 def largest_field(folder: Path, rocks: int) -> Row:
     """Seconds to build, write and load a field of rocks, and the memory of it all."""
     from mitsonar.simulation.scene import load_scene
-    from mitsonar.worlds.rocky_field import RockyField
+    from mitsonar.worlds.families import RockyField
 
     start = time.perf_counter()
     world = RockyField(size_m=50, a_side=(rocks, rocks)).build(0)

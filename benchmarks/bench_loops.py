@@ -102,7 +102,7 @@ def rendered(path: Trajectory, *, coarse: bool) -> SonarFrames:
     """Render the frames of a path over the rocky field, in 256 grey values."""
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
-    from mitsonar.worlds.rocky_field import RockyField
+    from mitsonar.worlds.families import RockyField
 
     sonar = load_recipe(RECIPES["physical"]).instrument.replace(**(COARSE if coarse else {}))
     with tempfile.TemporaryDirectory(prefix="bench-loops-") as folder:

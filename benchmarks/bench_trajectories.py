@@ -318,8 +318,7 @@ def rendered(job: Job) -> SonarFrames:
     """Render the frames of a run as a sonar would store them: noisy, in 256 grey values."""
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
-    from mitsonar.worlds.pattern import Pattern
-    from mitsonar.worlds.rocky_field import RockyField
+    from mitsonar.worlds.families import Pattern, RockyField
 
     recipe, speckle = (RECIPES["physical"], SONARS["speckle"]) if job.model == SPECKLE else (RECIPES[job.model], {})
     sonar = load_recipe(recipe).instrument.replace(**(COARSE if job.coarse else {}), **speckle)

@@ -23,7 +23,7 @@ from mitsonar.instruments.hydrophones import FieldOfView, Hydrophone
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator, impulse_response
 from mitsonar.simulation.variant import ensure_variant
-from mitsonar.worlds.sea_surface import SeaSurface
+from mitsonar.worlds.sea import SeaSurface
 
 if TYPE_CHECKING:
     import mitsuba as mi

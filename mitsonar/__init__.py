@@ -63,8 +63,7 @@ if TYPE_CHECKING:
     from mitsonar.simulation.vehicle import Mounted, VehicleSimulator, load_vehicle
     from mitsonar.training.document_tables import load_tables
     from mitsonar.training.reproduce import Effort, reproduce
-    from mitsonar.worlds.sea_surface import SeaSurface
-    from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
+    from mitsonar.worlds.sea import SeaSurface, fishing_net_mesh, particle_mesh
 
 __all__ = [
     "ChannelSimulator",
@@ -150,7 +149,7 @@ _MODULES = {
     "Mounted": "simulation.vehicle",
     "Pose": "motion.pose",
     "RenderedPairs": "datasets.rendered_pairs",
-    "SeaSurface": "worlds.sea_surface",
+    "SeaSurface": "worlds.sea",
     "SensorNoise": "mapping.simulated_sensors",
     "Simulator": "simulation.imaging",
     "Sonar": "instruments.sonar",
@@ -168,7 +167,7 @@ _MODULES = {
     "compare": "estimation.comparison_run",
     "cramer_rao_bound": "estimation.crlb.image_crlb",
     "create_estimator": "estimation.named_estimators",
-    "fishing_net_mesh": "worlds.water_bodies",
+    "fishing_net_mesh": "worlds.sea",
     "illumination": "mapping.illumination",
     "load_checkpoint": "estimation.named_estimators",
     "load_frames": "mapping.open_frames",
@@ -186,7 +185,7 @@ _MODULES = {
     "mosaic_figure": "plotting.map_figure",
     "odometry": "mapping.odometry",
     "open_recording": "recordings.open",
-    "particle_mesh": "worlds.water_bodies",
+    "particle_mesh": "worlds.sea",
     "path_figure": "plotting.map_figure",
     "path_of": "mapping.motion_series",
     "range_rates": "records.soundings",

@@ -414,7 +414,7 @@ def spoil_mesh(rng: Rng, folder: Path) -> None:
 
 
 def read_meshes(folder: Path) -> None:
-    from mitsonar.worlds.mesh_check import _check_once, check_mesh
+    from mitsonar.worlds.scene_check import _check_once, check_mesh
 
     _check_once.cache_clear()
     for name, kind in CHECKED.items():
@@ -428,7 +428,7 @@ def spoil_model(rng: Rng, folder: Path) -> None:
 
 
 def read_model(folder: Path) -> None:
-    from mitsonar.worlds.user_mesh import mesh_world
+    from mitsonar.worlds.meshes import mesh_world
 
     chosen = folder / "chosen"
     mesh_world(folder / (chosen.read_text() if chosen.exists() else "model.ply"), floor=False)

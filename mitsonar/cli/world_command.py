@@ -141,7 +141,7 @@ def mesh(
     ] = None,
 ) -> None:
     """Make a scene from your own model, with or without textures: on a seabed, with a sonar that looks at it."""
-    from mitsonar.worlds.user_mesh import mesh_world
+    from mitsonar.worlds.meshes import mesh_world
 
     world = mesh_world(file, scale=scale, up=up, reflectivity=reflectivity, floor=floor, floor_m=floor_m)
     if not SMALLEST_M <= world.size_m <= LARGEST_M:

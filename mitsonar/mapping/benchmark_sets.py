@@ -29,10 +29,8 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.render_run import RENDERING, Outputs, run
 from mitsonar.simulation.scene import load_scene
 from mitsonar.simulation.variant import release_memory
-from mitsonar.worlds.rocky_field import RockyField
-from mitsonar.worlds.ship_hull import ShipHull
-from mitsonar.worlds.slope import sloped
-from mitsonar.worlds.world import Family
+from mitsonar.worlds.families import RockyField, ShipHull
+from mitsonar.worlds.world import Family, sloped
 
 if TYPE_CHECKING:
     from mitsonar.simulation.imaging import Simulator

@@ -16,7 +16,7 @@ from mitsonar.io.runs import digest, file_digest
 from mitsonar.motion.bodies import VEHICLE, BodyMotion, Deforming, MeshSequence, files_of, read_motions
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.plugins.native_plugins import load_dict
-from mitsonar.worlds.mesh_check import check_mesh
+from mitsonar.worlds.scene_check import check_mesh
 
 if TYPE_CHECKING:
     import mitsuba as mi

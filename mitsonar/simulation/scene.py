@@ -19,8 +19,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.plugins.native_plugins import file_resolver, own_code_only, search_in
 from mitsonar.simulation.moving_files import refuse_unread_motions
 from mitsonar.simulation.variant import ensure_variant
-from mitsonar.worlds.scene_check import check_parsed
-from mitsonar.worlds.scene_text import check_text
+from mitsonar.worlds.scene_check import check_parsed, check_text
 
 if TYPE_CHECKING:
     import mitsuba as mi

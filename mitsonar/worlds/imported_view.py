@@ -8,8 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.worlds.model_pieces import Piece
-from mitsonar.worlds.user_mesh import overview
+from mitsonar.worlds.meshes import Piece, overview
 from mitsonar.worlds.world import Standpoint
 
 __all__ = ["ImportedView", "view_of_objects"]

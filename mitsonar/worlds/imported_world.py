@@ -14,13 +14,12 @@ from mitsonar.acoustics.materials import named_materials
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, nearest_names
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.worlds.imported_view import view_of_objects
-from mitsonar.worlds.model_pieces import Piece, merged, reflectivity_of
+from mitsonar.worlds.meshes import Piece, merged, random_seabed, reflectivity_of
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.scene_parts import Matrix, ReadScene, Shapes, rigid
 from mitsonar.worlds.sdf_file import read_sdf
 from mitsonar.worlds.urdf_file import read_urdf
 from mitsonar.worlds.usd_file import read_usd
-from mitsonar.worlds.user_mesh import random_seabed
 from mitsonar.worlds.world import Mesh, World
 
 __all__ = ["SCENE_FORMATS", "imported_world"]

@@ -2,23 +2,43 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import os
+import re
+import struct
+import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
 from mitsonar.errors import MitsonarError, shortened
-from mitsonar.io.files import refuse_beyond_memory, refuse_irregular
+from mitsonar.io.files import read_bytes, refuse_beyond_memory, refuse_irregular
 from mitsonar.plugins.native_plugins import file_resolver, foreign_names
-from mitsonar.worlds.grid_check import check_grid, check_tensors, pixels_of
-from mitsonar.worlds.mesh_check import CHECKS, LARGEST_COORDINATE, check_counts, check_mesh, refuse_foreign_format
+from mitsonar.worlds.world import Family, World
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["check_parsed"]
+__all__ = [
+    "CHECKS",
+    "LARGEST_COORDINATE",
+    "SceneFile",
+    "check_counts",
+    "check_grid",
+    "check_mesh",
+    "check_parsed",
+    "check_tensors",
+    "check_text",
+    "pixels_of",
+    "refuse_foreign_format",
+]
+
 
 DEEPEST = 100
 """Largest depth of objects that hold or refer to each other."""
@@ -189,3 +209,819 @@ def _check_references(state: mi.parser.ParserState) -> None:
         raise MitsonarError(f"its objects refer to each other more than {DEEPEST} deep: it is no scene")
     if sum(ways) > MOST_WAYS:
         raise MitsonarError(f"its objects refer to each other in more than {MOST_WAYS:,} ways: it is no scene")
+
+
+# ---------------- The world ``scene``: a Mitsuba XML file of the user's own
+
+
+class SceneFile(Family):
+    """A scene that exists already; the seed determines only the motion of the vehicle."""
+
+    called: ClassVar[str] = "scene"
+    described: ClassVar[str] = "docs/guides/data-sets.md, `A scene of your own`"
+
+    file: str = Field(description="the XML file; in a recipe, relative to the recipe's folder")
+    size_m: float = Field(gt=0, le=1e6, description="edge of the square around the origin to stay inside [m]")
+    parameters: dict[str, str] = Field(default_factory=dict, description="values of the scene's $names")
+
+    @property
+    def half_m(self) -> float:
+        """Return half the edge of the square to stay inside [m]."""
+        return self.size_m / 2
+
+    @property
+    def seeded(self) -> bool:
+        """Return False: the scene is the same for each seed."""
+        return False
+
+    def refuse_smaller(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Refuse a ``size_m`` whose square reaches beyond the file's shapes: frames there would be empty.
+
+        Args:
+            low: least x, y, z of the scene ``(3,)`` [m].
+            high: largest ``(3,)`` [m].
+
+        Raises:
+            MitsonarError: the square is too large, or the scene has no shapes.
+        """
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise MitsonarError(f"{self.file} holds nothing that a sonar could see: give a scene with shapes")
+        fits = 2 * max(0.0, float(min(-low[0], -low[1], high[0], high[1])))
+        if self.size_m > fits * (1 + 1e-3):
+            raise MitsonarError(
+                f"world.size_m, {self.size_m:g} m, is larger than what {self.file} holds, x {low[0]:.3g}..{high[0]:.3g} m "
+                f"and y {low[1]:.3g}..{high[1]:.3g} m: frames taken beyond it would be empty; give at most {fits:.3g} (a "
+                "square around the origin), or a larger ground"
+            )
+
+    def build(self, seed: int) -> World:
+        """Refuse: the scene exists already.
+
+        Raises:
+            MitsonarError: always.
+        """
+        raise MitsonarError(f"{self.file} is a scene already: there is nothing to build")
+
+    def prepare(self, seed: int, folder: Path) -> tuple[Path, dict[str, str]]:
+        """Return the file and its parameters; nothing is written.
+
+        Raises:
+            MitsonarError: the file does not exist.
+        """
+        if not os.path.isfile(self.file):
+            raise MitsonarError(f"no scene file {self.file}: world.file must name a Mitsuba XML file that is there")
+        return Path(self.file), self.parameters
+
+
+# ---------------- Check a scene's XML before Mitsuba reads it: how deep it nests, what it includes, how its
+# parameters grow
+# Mitsuba's parser recurses, follows every include and copies every parameter without a limit. The check reads the text
+# as that parser does, once from its beginning to its end.
+
+
+LARGEST = 2**28
+"""Largest size of a scene's XML with all that it includes [bytes]."""
+
+LARGEST_SPECTRUM = 2**22
+"""Largest size of the file of a spectrum [bytes]."""
+
+MOST_ELEMENTS = 2_000_000
+"""Largest number of elements."""
+
+MOST_FILES = 1_000
+"""Largest number of times that files are included."""
+
+MOST_INCLUDED = 15
+"""Largest depth of files that include each other: Mitsuba's own."""
+
+MOST_PARAMETERS = 1_000
+"""Largest number of parameters: Mitsuba compares each with each."""
+
+LONGEST_VALUE = 2**16
+"""Largest length of an attribute whose parameters are replaced."""
+
+MOST_WORK = 2**31
+"""Letters that Mitsuba may compare and move to replace parameters: about a second."""
+
+SEARCH = 300
+"""What a search for a parameter takes, in letters."""
+
+SKIPPED = {b"<!--": b"-->", b"<![CDATA[": b"]]>", b"<?": b"?>"}
+"""Begin and end of what is no element."""
+
+NAME = rb"[A-Za-z_:\x80-\xff][A-Za-z0-9_:.\x80-\xff-]*+"
+OPENED = re.compile(rb"<(" + NAME + rb")((?:\s*+" + NAME + rb"\s*+=\s*+(?:\"[^\"]*+\"|'[^']*+'))*+)\s*+(/?)>")
+CLOSED = re.compile(rb"</(" + NAME + rb")\s*+>")
+ATTRIBUTE = re.compile(rb"(" + NAME + rb")\s*+=\s*+(?:\"([^\"]*+)\"|'([^']*+)')")
+DOCTYPE = re.compile(rb"<!DOCTYPE[^\[<>\"']*+>")
+LATIN = re.compile(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"'](?:iso-8859-1|latin1)[\"']", re.IGNORECASE)
+ENTITY = re.compile(r"&(?:#([0-9]+)|#x([0-9a-fA-F]+)|(amp|lt|gt|quot|apos));")
+ENTITIES = {"amp": "&", "lt": "<", "gt": ">", "quot": '"', "apos": "'"}
+
+
+def check_text(path: Path, parameters: dict[str, str], folders: list[Path]) -> None:
+    """Check a scene's XML file and what it includes.
+
+    Args:
+        path: of the file.
+        parameters: values of the scene's ``$name``.
+        folders: that Mitsuba searches for the files that the scene names.
+
+    Raises:
+        MitsonarError: it is no XML, nests too deep, is too large, includes too much, or reads something that is no file.
+    """
+    _Text(dict(parameters)).check(path, folders, 0)
+
+
+@dataclass
+class _Text:
+    """What is known of a scene's text so far.
+
+    Attributes:
+        values: of the parameters, by their names.
+        size: of the files read [bytes].
+        files: how many were read.
+        elements: how many there were.
+        work: letters compared and moved to replace parameters.
+        longest_first: names of the parameters, in the order in which Mitsuba replaces them.
+    """
+
+    values: dict[str, str]
+    size: int = 0
+    files: int = 0
+    elements: int = 0
+    work: int = 0
+    longest_first: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.longest_first = sorted(self.values, key=len, reverse=True)
+        self._count(len(self.values))
+
+    def check(self, path: Path, folders: list[Path], depth: int) -> None:
+        """Check a file and what it includes; ``folders`` are searched for the files that it names."""
+        if depth >= MOST_INCLUDED:
+            raise MitsonarError(
+                f"{path} is included {depth} files deep: {MOST_INCLUDED} are the most; does it include itself?"
+            )
+        self.files += 1
+        if self.files > MOST_FILES:
+            raise MitsonarError(f"{path} is one of more than {MOST_FILES:,} files that the scene includes: include fewer")
+        refuse_irregular(path, "scene", LARGEST - self.size)
+        content = _utf8(read_bytes(path, "scene", LARGEST - self.size), path)
+        self.size += len(content)
+        for name, attributes in self._elements(content, path):
+            plain = b"$" not in attributes and b"&" not in attributes and name not in READ
+            given = {} if plain else self._expanded(attributes, path)
+            match name:
+                case b"default":
+                    self._add(given.get("name", ""), given.get("value", ""))
+                case b"include":
+                    inner = [path.parent, *folders]
+                    found = _found(given.get("filename", ""), inner)
+                    if found is not None:
+                        self.check(found, inner, depth + 1)
+                case b"path":
+                    found = _found(given.get("value", ""), [path.parent, *folders])
+                    folders[:0] = [found] if found is not None else []
+                case b"spectrum":
+                    found = _found(given.get("filename", ""), folders)
+                    if found is not None:
+                        refuse_irregular(found, "spectrum", LARGEST_SPECTRUM)
+
+    def _elements(self, content: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
+        """Yield name and attributes of the elements."""
+        opened: list[bytes] = []
+        before, place = self.elements, content.find(b"<")
+        while place >= 0:
+            marked = content[place + 1 : place + 2] in (b"!", b"?")
+            skipped = next((begin for begin in SKIPPED if marked and content.startswith(begin, place)), None)
+            if skipped is not None:
+                end = content.find(SKIPPED[skipped], place + len(skipped))
+                if end < 0:
+                    raise _malformed(path, content, place, f"a {skipped.decode()} does not end")
+                place = content.find(b"<", end)
+                continue
+            if (found := OPENED.match(content, place)) is not None:
+                name, attributes, closed = found.groups()
+                if not opened and self.elements > before:
+                    raise _malformed(path, content, place, "there is a second root element")
+                self.elements += 1
+                if self.elements > MOST_ELEMENTS:
+                    raise MitsonarError(f"{path} has more than {MOST_ELEMENTS:,} elements: put the shapes into mesh files")
+                if not closed:
+                    opened.append(name)
+                if len(opened) > DEEPEST:
+                    raise MitsonarError(f"{path} nests its elements more than {DEEPEST} deep: it is no scene")
+                yield name, attributes
+            elif (found := CLOSED.match(content, place)) is not None:
+                if not opened or opened.pop() != found[1]:
+                    raise _malformed(path, content, place, "an element is closed that is not open")
+            elif opened or (found := DOCTYPE.match(content, place)) is None:  # a document type may define entities
+                raise _malformed(path, content, place, "the XML of an element or of one of its attributes is malformed")
+            place = content.find(b"<", found.end())
+        if opened:
+            raise _malformed(path, content, len(content), f"<{opened[-1].decode('utf-8', 'replace')[:40]}> is not closed")
+
+    def _expanded(self, attributes: bytes, path: Path) -> dict[str, str]:
+        """Return attributes, their parameters replaced as Mitsuba replaces them."""
+        found: dict[str, str] = {}
+        for name, double, single in ATTRIBUTE.findall(attributes):
+            raw = (double or single).replace(b"\r\n", b" ").translate(SPACES)
+            value = ENTITY.sub(_character, raw.decode("utf-8", "surrogateescape"))
+            if "$" in value:
+                value = self._replaced(value, path)
+            found.setdefault(name.decode("utf-8", "surrogateescape"), value)
+        return found
+
+    def _replaced(self, value: str, path: Path) -> str:
+        for name in self.longest_first:
+            key, new, place = f"${name}", self.values[name], 0
+            self._work(len(value), path)
+            while (place := value.find(key, place)) >= 0:
+                if value[:place].endswith("\\"):
+                    place += len(key)
+                    continue
+                value = value[:place] + new + value[place + len(key) :]
+                place += len(new)
+                self._work(len(value), path)
+                if len(value) > LONGEST_VALUE:
+                    raise MitsonarError(f"{path} has a value that its parameters make longer than {LONGEST_VALUE:,} letters")
+        return value.replace("\\$", "$")
+
+    def _work(self, letters: int, path: Path) -> None:
+        self.work += letters + SEARCH
+        if self.work > MOST_WORK:
+            raise MitsonarError(f"{path} uses its parameters too often: write the values themselves")
+
+    def _count(self, parameters: int) -> None:
+        if parameters > MOST_PARAMETERS:
+            raise MitsonarError(f"a scene may have {MOST_PARAMETERS:,} parameters: got more; write the values themselves")
+
+    def _add(self, name: str, value: str) -> None:
+        """Add the default of a parameter; a value that was given stays."""
+        if name in self.values or not name:
+            return
+        self.values[name] = value
+        self._count(len(self.values))
+        place = next((k for k, other in enumerate(self.longest_first) if len(name) > len(other)), len(self.longest_first))
+        self.longest_first.insert(place, name)
+
+
+SPACES = bytes.maketrans(b"\t\r\n", b"   ")
+"""White space in an attribute reads as blanks."""
+
+READ = (b"default", b"include", b"path", b"spectrum")
+"""Elements that are followed while the text is read."""
+
+
+def _utf8(content: bytes, path: Path) -> bytes:
+    """Return a text as UTF-8, also of the other encodings that Mitsuba knows by a mark or a declaration."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        try:
+            content = content.decode("utf-16").encode()
+        except UnicodeDecodeError:
+            raise MitsonarError(f"{path} is not text: save it as UTF-8") from None
+    elif LATIN.match(content):
+        content = content.decode("latin-1").encode()
+    if b"\0" in content:
+        raise MitsonarError(f"{path} holds a zero byte: it is damaged, or not text in UTF-8")
+    return content
+
+
+def _character(found: re.Match[str]) -> str:
+    """Return the character of an entity."""
+    decimal, hexadecimal, name = found.groups()
+    if name:
+        return ENTITIES[name]
+    digits = (decimal or hexadecimal).lstrip("0")
+    number = int(digits or "0", 10 if decimal else 16) if len(digits) < 10 else 0x110000
+    if not 0 < number < 0x110000 or 0xD800 <= number < 0xE000:
+        raise MitsonarError(f"the scene has {shortened(found[0])}, which is no character")
+    return chr(number)
+
+
+def _found(name: str, folders: list[Path]) -> Path | None:
+    """Return the file that Mitsuba finds for a name, None where there is none."""
+    if not name or "\0" in name:
+        return None
+    try:
+        return next((path for path in [*(folder / name for folder in folders), Path(name)] if path.exists()), None)
+    except OSError:  # such as a name too long
+        raise MitsonarError(f"there cannot be a file of the name {shortened(name)}") from None
+
+
+def _malformed(path: Path, content: bytes, place: int, reason: str) -> MitsonarError:
+    line = content.count(b"\n", 0, place) + 1
+    return MitsonarError(f"{path}, line {line:,}: {reason}")
+
+
+# ---------------- Check a mesh before Mitsuba reads it: it checks no indices, and a wrong index ends the process
+
+
+LARGEST_COORDINATE = 1e12
+"""Largest coordinate of vertices, normals and textures: beyond it single precision overflows."""
+
+LONGEST_MESH_HEADER = 2**16
+"""Largest size of a PLY header [bytes]."""
+
+MESH_INFLATION = 1032
+"""Largest ratio of inflated to deflated data."""
+
+TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
+    **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4"},
+    **{"double": "f8", "float64": "f8"},
+}
+"""Types of PLY properties to NumPy's types."""
+
+ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+class _FaultError(ValueError):
+    """A fault of a mesh file, in words."""
+
+
+@dataclass
+class _Element:
+    """An element of a PLY header: its name, its count, and names and types of its properties.
+
+    A list has the type of its count in ``counted``, and holds three values.
+    """
+
+    name: str
+    count: int
+    scalars: dict[str, str] = field(default_factory=dict)
+    counted: dict[str, str] = field(default_factory=dict)
+
+    def dtype(self, order: str) -> np.dtype[np.void]:
+        """Return the type of one row of a binary file; a list is a count and three values."""
+        parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+        for name, kind in self.scalars.items():
+            if name in self.counted:
+                parts += [(f"count of {name}", order + self.counted[name]), (name, order + kind, (3,))]
+            else:
+                parts.append((name, order + kind))
+        return np.dtype(parts)
+
+
+def check_mesh(path: str | Path, kind: str) -> None:
+    """Check a mesh file, once in a process: counts against its size, indices against vertices, finite numbers.
+
+    Args:
+        path: of the file.
+        kind: name of the Mitsuba plugin that reads it: ``ply``, ``obj`` or ``serialized``.
+
+    Raises:
+        MitsonarError: it is damaged, or has no triangles.
+    """
+    refuse_irregular(path, "mesh")
+    try:
+        known = Path(path).stat()
+        _check_once(str(path), kind, known.st_size, known.st_mtime_ns)
+    except OSError as error:
+        raise MitsonarError(f"cannot read mesh {path}: {error.strerror}; give a {kind} file") from None
+
+
+@functools.lru_cache(maxsize=1024)
+def _check_once(path: str, kind: str, size: int, modified_ns: int) -> None:
+    del size, modified_ns  # part of the key: a changed file is checked again
+    content = Path(path).read_bytes()
+    try:
+        CHECKS[kind](content)
+    except (_FaultError, ValueError, ArithmeticError, UnicodeDecodeError, struct.error, zlib.error, MemoryError) as error:
+        if (other := _format_of(Path(path), content)) and other.lower() != kind:
+            raise MitsonarError(_foreign(path, other, kind)) from None
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MitsonarError(f"mesh {path} is damaged: {reason}; export it again") from None
+
+
+FOREIGN_FORMATS = {
+    **{"glb": "glTF", "gltf": "glTF", "dae": "COLLADA", "stl": "STL", "fbx": "FBX", "blend": "Blender", "3mf": "3MF"},
+    **{"usd": "USD", "usda": "USD", "usdc": "USD", "usdz": "USD", "urdf": "URDF", "sdf": "SDF", "step": "STEP"},
+}
+"""Formats of models that Mitsuba does not read, by the end of a file's name."""
+
+BEGINNINGS = {
+    **{b"glTF": "glTF", b"ply": "PLY", b"solid": "STL", b"Kaydara FBX": "FBX", b"BLENDER": "Blender"},
+    **{b"PXR-USDC": "USD", b"#usda": "USD", b"ISO-10303": "STEP"},
+}
+"""Formats by the first bytes of a file."""
+
+
+def refuse_foreign_format(kind: str, filename: str) -> None:
+    """Refuse a shape whose type is a format of models that Mitsuba lacks, such as ``glb``.
+
+    Raises:
+        MitsonarError: it is; the message says how to make a scene of the file.
+    """
+    if kind in FOREIGN_FORMATS:
+        raise MitsonarError(_foreign(filename, FOREIGN_FORMATS[kind], kind))
+
+
+def _format_of(path: Path, content: bytes) -> str:
+    """Return the format of a model by its first bytes, else by the end of its name; empty where it is unknown."""
+    for begin, name in BEGINNINGS.items():
+        if content.startswith(begin):
+            return name
+    head = content[:1000]
+    if b"<COLLADA" in head:
+        return "COLLADA"
+    if head.lstrip().startswith(b"{") and b'"asset"' in content:
+        return "glTF"
+    if len(content) > 84 and len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        return "STL"
+    return FOREIGN_FORMATS.get(path.suffix.lower()[1:], "")
+
+
+def _foreign(path: str, name: str, kind: str) -> str:
+    """Describe what to do with a model in a format that Mitsuba's plugin does not read."""
+    reads = f"Mitsuba's shape {kind} does not read it" if kind in CHECKS else f"Mitsuba has no shape {kind}"
+    make = {
+        "PLY": "name the shape ply",
+        "USD": f"`mitsonar world import {path} -o FOLDER` makes a scene of it",
+        "FBX": "export it as glTF, for `mitsonar world mesh`",
+    }
+    make |= {"URDF": make["USD"], "SDF": make["USD"]} | dict.fromkeys(("Blender", "3MF", "STEP"), make["FBX"])
+    do = make.get(name, f"`mitsonar world mesh {path} -o FOLDER` makes a scene of it")
+    return f"mesh {path} is a file of {name}, and {reads}: the formats are ply, obj and serialized; {do}"
+
+
+def _check_triangles(indices: NDArray[np.generic], vertices: int, what: str = "a triangle names vertex") -> None:
+    """Check that indices, which count from 0, name vertices."""
+    if not indices.size:
+        raise _FaultError("it has no triangles")
+    low, high = int(indices.min()), int(indices.max())
+    if low < 0 or high >= vertices:
+        raise _FaultError(f"{what} {low if low < 0 else high:,}, there are {vertices:,} (counted from 0)")
+
+
+def _check_mesh_numbers(values: NDArray[np.generic], what: str) -> None:
+    if values.size and not np.abs(values).max() <= LARGEST_COORDINATE:
+        raise _FaultError(f"{what} must be finite and at most {LARGEST_COORDINATE:g}")
+
+
+# ---------------------------------------------------------------- PLY
+
+
+def check_counts(path: Path) -> None:
+    """Check that a PLY file has at least the bytes that its header promises; faces may have any number of corners.
+
+    Raises:
+        ValueError: it has fewer.
+    """
+    with path.open("rb") as file:
+        order, elements, start = _ply_header(file.read(LONGEST_MESH_HEADER), strict=False)
+    for element in elements:
+        kinds = [element.counted.get(name, kind) for name, kind in element.scalars.items()]
+        start += element.count * (2 * len(kinds) if order is None else sum(np.dtype(kind).itemsize for kind in kinds))
+    size = path.stat().st_size
+    if start > size + 1:
+        raise _FaultError(f"its header promises {start:,} bytes at least, it has {size:,}")
+
+
+def _check_ply(content: bytes) -> None:
+    """Check a file in Stanford's PLY, binary or text."""
+    order, elements, start = _ply_header(content)
+    counts = {element.name: element.count for element in elements}
+    if min(counts.get("vertex", 0), counts.get("face", 0)) < 1:
+        raise _FaultError("it has no triangles")
+    rows = _ply_rows_of_text(content[start:], elements) if order is None else _ply_rows(content, start, elements, order)
+    for element, table in zip(elements, rows, strict=False):
+        for name, kind in element.scalars.items():
+            if name in element.counted and (table[f"count of {name}"] != 3).any():
+                raise _FaultError(f"{element.name}: lists of {name} must have 3 entries, triangles")
+            if kind.startswith("f") and element.name in ("vertex", "face"):
+                _check_mesh_numbers(table[name], f"{name} of a {element.name}")
+        if element.name == "face":
+            _check_triangles(table[next(iter(element.counted))], counts["vertex"])
+
+
+def _ply_header(content: bytes, strict: bool = True) -> tuple[str | None, list[_Element], int]:
+    """Return byte order (None: text), elements, and offset of the data."""
+    end = content.find(b"end_header", 0, LONGEST_MESH_HEADER)
+    stop = content.find(b"\n", end)
+    if not content.startswith(b"ply") or end < 0 or stop < 0 or content[end + 10 : stop].strip():
+        raise _FaultError("it has no header of PLY")
+    first, *lines = (line.split() for line in content[:end].decode("utf-8", "strict").splitlines())
+    order, elements = "", list[_Element]()
+    if first != ["ply"]:
+        raise _FaultError("it has no header of PLY")
+    for words in lines:
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", kind, "1.0"] if kind in ORDERS and not order:
+                order = kind
+            case ["element", name, count] if count.isascii() and count.isdigit() and len(count) < 20:
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", counted, kind, name] if elements and {counted, kind} <= set(TYPES):
+                _add_property(elements[-1], name, TYPES[kind], TYPES[counted])
+            case ["property", kind, name] if elements and kind in TYPES:
+                _add_property(elements[-1], name, TYPES[kind])
+            case _:
+                raise _FaultError(f"its header has the line {' '.join(words)[:60]!r}")
+    if strict:
+        _check_elements(elements)
+    if not order:
+        raise _FaultError("its header has no format")
+    return (None if order == "ascii" else ORDERS[order]), elements, stop + 1
+
+
+def _add_property(element: _Element, name: str, kind: str, counted: str | None = None) -> None:
+    if name in element.scalars:
+        raise _FaultError(f"its header names {name} of {element.name} twice")
+    element.scalars[name] = kind
+    if counted is not None:
+        element.counted[name] = counted
+
+
+def _check_elements(elements: list[_Element]) -> None:
+    """Check that a header has the elements and properties of a triangle mesh."""
+    names = [element.name for element in elements]
+    if len(set(names)) < len(names):
+        raise _FaultError("its header names an element twice")
+    for element in elements:
+        if element.name == "vertex" and (element.counted or not {"x", "y", "z"} <= set(element.scalars)):
+            raise _FaultError("its vertices must have x, y and z, and no lists")
+        if element.name == "face":
+            lists = list(element.counted)
+            if lists not in (["vertex_index"], ["vertex_indices"]) or element.scalars[lists[0]].startswith("f"):
+                raise _FaultError("its faces must have one list of whole numbers, vertex_index or vertex_indices")
+
+
+def _ply_rows(content: bytes, start: int, elements: list[_Element], order: str) -> list[NDArray[np.void]]:
+    """Read the tables of a binary file, up to its faces."""
+    rows = []
+    for element in elements:
+        kind = element.dtype(order)
+        if element.count * kind.itemsize > len(content) - start:
+            raise _FaultError(f"{element.count:,} of {element.name} need more bytes than are there")
+        rows.append(np.frombuffer(content, kind, element.count, start))
+        start += element.count * kind.itemsize
+        if element.counted and element.name != "face" and (rows[-1][f"count of {next(iter(element.counted))}"] != 3).any():
+            raise _FaultError(f"lists of {element.name} must have 3 entries")
+        if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
+            break  # Mitsuba reads no further
+    if len(rows) == len(elements) and content[start:].strip(b" \t\r\n\0"):
+        raise _FaultError(f"{len(content) - start:,} bytes are left over after what its header promises")
+    return rows
+
+
+def _ply_rows_of_text(text: bytes, elements: list[_Element]) -> list[NDArray[np.void]]:
+    """Read the tables of a text file, up to its faces."""
+    words, start, rows = text.split(), 0, list[NDArray[np.void]]()
+    for element in elements:
+        width = len(element.scalars) + 3 * len(element.counted)
+        if element.count * width > len(words) - start:
+            raise _FaultError(f"{element.count:,} of {element.name} need more numbers than are there")
+        numbers = np.array(words[start : start + element.count * width], dtype=np.float64).reshape(element.count, width)
+        rows.append(_as_table(numbers, element))
+        start += element.count * width
+        if {"vertex", "face"} <= {one.name for one in elements[: len(rows)]}:
+            break
+    if len(rows) == len(elements) and start < len(words):
+        raise _FaultError(f"{len(words) - start:,} numbers are left over after what its header promises")
+    return rows
+
+
+def _as_table(numbers: NDArray[np.float64], element: _Element) -> NDArray[np.void]:
+    """Return the columns of an element by name, and check that integers are whole numbers."""
+    kinds: list[tuple[str, type] | tuple[str, type, tuple[int]]] = []
+    for name in element.scalars:
+        listed = name in element.counted
+        kinds += [(f"count of {name}", np.float64), (name, np.float64, (3,))] if listed else [(name, np.float64)]
+    table = np.ascontiguousarray(numbers).view(np.dtype(kinds)).reshape(-1)
+    for name, kind in element.scalars.items():
+        if not kind.startswith("f") and (table[name] != np.rint(table[name])).any():
+            raise _FaultError(f"{name} of {element.name} must be whole numbers")
+    return table
+
+
+# ---------------------------------------------------------------- OBJ
+
+
+def _check_obj(content: bytes) -> None:
+    """Check a file in Wavefront OBJ, whose faces name positions, texture coordinates and normals from 1."""
+    lines: dict[bytes, list[list[bytes]]] = {b"v": [], b"vt": [], b"vn": [], b"f": []}
+    for line in content.splitlines():
+        words = line.partition(b"#")[0].split()
+        if words and words[0] in lines:
+            lines[words[0]].append(words[1:])
+    for name in (b"v", b"vt", b"vn"):
+        fewest = 2 if name == b"vt" else 3
+        if any(len(words) < fewest for words in lines[name]):
+            raise _FaultError(f"a line {name.decode()} has fewer than {fewest} numbers")
+        _check_mesh_numbers(
+            np.array([words[:fewest] for words in lines[name]], dtype=np.float64), f"numbers of {name.decode()}"
+        )
+    if not lines[b"f"]:
+        raise _FaultError("it has no triangles")
+    if any(len(words) < 3 for words in lines[b"f"]):
+        raise _FaultError("a face must have 3 corners or more")
+    corners = [corner.split(b"/") for words in lines[b"f"] for corner in words]
+    if any(len(corner) > 3 for corner in corners):
+        raise _FaultError("a corner of a face is v, v/vt, v//vn or v/vt/vn")
+    for place, name in enumerate((b"v", b"vt", b"vn")):
+        named = [corner[place] for corner in corners if len(corner) > place and (corner[place] or place == 0)]
+        if any(len(word) > 12 for word in named):
+            raise _FaultError("an index of a face is not a number that can be")
+        if named:
+            indices = np.array(named, dtype=np.int64) - 1
+            _check_triangles(indices, len(lines[name]), f"a face names, of its {name.decode()}, number")
+
+
+# ---------------------------------------------------------------- Mitsuba's own
+
+
+def _check_serialized(content: bytes) -> None:
+    """Check a file of Mitsuba's serialized meshes: several deflated meshes, with a table of offsets at the end."""
+    if len(content) < 8:
+        raise _FaultError("it is too short")
+    (count,) = struct.unpack_from("<I", content, len(content) - 4)
+    _, number = struct.unpack_from("<HH", content)
+    width = 8 if number >= 4 else 4
+    table = len(content) - 4 - count * width
+    if count < 1 or table < 4:
+        raise _FaultError(f"it promises {count:,} meshes, more than fit in it")
+    starts = np.frombuffer(content, "<u8" if width == 8 else "<u4", count, table).tolist()
+    for start, stop in zip(starts, [*starts[1:], table], strict=True):
+        if not start + 4 < stop <= table:
+            raise _FaultError("its table of meshes points outside it")
+        _check_one_serialized(content[start:stop])
+
+
+def _check_one_serialized(content: bytes) -> None:
+    """Check one serialized mesh."""
+    ours, number = struct.unpack_from("<HH", content)
+    if ours != 0x041C or number not in (3, 4):
+        raise _FaultError("it is no serialized mesh of version 3 or 4")
+    unpack = zlib.decompressobj()
+    data = unpack.decompress(content[4:], max_length=MESH_INFLATION * len(content))
+    (flags,) = struct.unpack_from("<I", data)
+    start = 4 if number == 3 else data.index(b"\0", 4) + 1
+    vertices, triangles = struct.unpack_from("<QQ", data, start)
+    start += 16
+    size = 8 if flags & 0x2000 else 4
+    columns = 3 + 3 * bool(flags & 0x0001) + 2 * bool(flags & 0x0002) + 3 * bool(flags & 0x0008)
+    if vertices * columns * size + triangles * 12 > len(data) - start:
+        raise _FaultError(f"{vertices:,} vertices and {triangles:,} triangles need more bytes than are there")
+    numbers = np.frombuffer(data, f"<f{size}", vertices * columns, start)
+    _check_mesh_numbers(numbers, "its numbers")
+    _check_triangles(np.frombuffer(data, "<u4", triangles * 3, start + numbers.nbytes), vertices)
+
+
+CHECKS = {"ply": _check_ply, "obj": _check_obj, "serialized": _check_serialized}
+"""Checks by the name of the Mitsuba plugin that reads the file."""
+
+
+# ---------------- Check pictures, grids and tables of a scene by their headers, before Mitsuba allocates what these
+# promise
+
+
+LONGEST_PICTURE_HEADER = 2**20
+"""Bytes at the beginning of a picture that are searched for its size."""
+
+PICTURE_INFLATION = 1100
+"""Largest ratio of a picture's pixels to the bytes of its file, in bits of one channel: that of deflated data."""
+
+FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of JPEG after which the size stands."""
+
+TENSORS = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 8, 8: 8, 9: 2, 10: 4, 11: 8}
+"""Bytes of the types of a table of tensors."""
+
+
+def pixels_of(path: Path) -> int:
+    """Return how many pixels a picture has, by its header: PNG, JPEG, OpenEXR, RGBE, PFM, PPM, BMP or TGA.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        MitsonarError: no picture of these formats, one without pixels, or more of them than its bytes can hold.
+    """
+    refuse_irregular(path, "picture")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(LONGEST_PICTURE_HEADER)
+        file.seek(max(0, size - 18))
+        tail = file.read(18)
+    try:
+        wide, high, channels = _shape(head, tail)
+    except (struct.error, ValueError, IndexError):
+        raise MitsonarError(f"{path} is no picture that Mitsuba reads: export it again as PNG, JPEG or OpenEXR") from None
+    if min(wide, high) < 1 or wide * high > 8 * PICTURE_INFLATION * size:
+        raise MitsonarError(f"picture {path} is damaged: {wide:,} x {high:,} pixels in {size:,} bytes; export it again")
+    return wide * high * max(1, (channels + 2) // 3)
+
+
+def _shape(head: bytes, tail: bytes) -> tuple[int, int, int]:
+    """Return width, height and channels of a picture from the beginning and the end of its file."""
+    if head.startswith(b"\x89PNG\r\n\x1a\n"):
+        wide, high = struct.unpack_from(">II", head, 16)
+        return wide, high, 3
+    if head.startswith(b"\xff\xd8"):
+        return _jpeg_shape(head)
+    if head.startswith(b"\x76\x2f\x31\x01"):
+        return _exr_shape(head)
+    if head.startswith(b"BM"):
+        wide, high = struct.unpack_from("<ii", head, 18)
+        return wide, abs(high), 3
+    if head.startswith((b"PF", b"Pf", b"P6")):
+        words = re.findall(rb"[^\s#]+", re.sub(rb"#[^\n]*", b"", head[2:2000]))
+        return int(words[0]), int(words[1]), 3
+    if head.startswith(b"#?"):
+        found = re.search(rb"[+-][XY] (\d{1,9}) [+-][XY] (\d{1,9})\n", head[: 2**16])
+        if found is None:
+            raise ValueError
+        return int(found[1]), int(found[2]), 3
+    if tail != b"TRUEVISION-XFILE.\0":  # TGA tells itself by its end
+        raise ValueError
+    wide, high = struct.unpack_from("<HH", head, 12)
+    return wide, high, 3
+
+
+def _jpeg_shape(head: bytes) -> tuple[int, int, int]:
+    place = 2
+    while True:
+        if head[place] != 0xFF:
+            raise ValueError
+        marker = head[place + 1]
+        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD7:  # filling, or without a length
+            place += 1 if marker == 0xFF else 2
+            continue
+        length, _, high, wide, channels = struct.unpack_from(">HBHHB", head, place + 2)
+        if marker in FRAMES:
+            return wide, high, channels
+        place += 2 + length
+
+
+def _exr_shape(head: bytes) -> tuple[int, int, int]:
+    """Return the size of the data window, or of the tiles where they are larger, and the number of channels."""
+    place, wide, high, channels, tile = 8, 0, 0, 0, 0
+    while head[place] != 0:
+        name_end = head.index(b"\0", place)
+        kind_end = head.index(b"\0", name_end + 1)
+        (length,) = struct.unpack_from("<i", head, kind_end + 1)
+        name, value = head[place:name_end], kind_end + 5
+        if length < 0 or value + length > len(head):
+            raise ValueError
+        if name in (b"dataWindow", b"displayWindow"):
+            left, top, right, bottom = struct.unpack_from("<4i", head, value)
+            if right < left or bottom < top:
+                raise ValueError
+            wide, high = max(wide, right - left + 1), max(high, bottom - top + 1)
+        elif name == b"channels":
+            inner = value
+            while head[inner] != 0:
+                inner, channels = head.index(b"\0", inner) + 17, channels + 1
+        elif name == b"tiles":
+            tile = max(struct.unpack_from("<2I", head, value))
+        place = value + length
+    return max(wide, tile), max(high, tile), channels
+
+
+def check_grid(path: Path) -> None:
+    """Check a grid in Mitsuba's ``.vol``: its counts against the bytes of its file.
+
+    Raises:
+        MitsonarError: it has no such header, or other bytes than it promises.
+    """
+    refuse_irregular(path, "grid")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(48)
+    if len(head) < 48 or head[:4] != b"VOL\x03":
+        raise MitsonarError(f"grid {path} is damaged: it has no header of VOL, version 3; export it again")
+    kind, *counts = struct.unpack_from("<5i", head, 4)
+    numbers = struct.unpack_from("<6f", head, 24)
+    if kind != 1 or min(counts) < 1 or 4 * math.prod(counts) != size - 48 or not all(map(math.isfinite, numbers)):
+        shape = " x ".join(f"{count:,}" for count in counts)
+        raise MitsonarError(f"grid {path} is damaged: {shape} numbers of type {kind} in {size:,} bytes; export it again")
+
+
+def check_tensors(path: Path) -> None:
+    """Check a table of tensors, as ``measured`` reads it: place and size of each against the bytes of its file.
+
+    Raises:
+        MitsonarError: it has no such header, or a tensor reaches beyond its end.
+    """
+    refuse_irregular(path, "table")
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(LONGEST_PICTURE_HEADER)
+    try:
+        if not head.startswith(b"tensor_file\0"):
+            raise ValueError
+        (count,) = struct.unpack_from("<I", head, 14)
+        place = 18
+        for _ in range(count):
+            (length,) = struct.unpack_from("<H", head, place)
+            dimensions, kind, start = struct.unpack_from("<HBQ", head, place + 2 + length)
+            place += 13 + length
+            shape = struct.unpack_from(f"<{dimensions}Q", head, place)
+            place += 8 * dimensions
+            if start + math.prod(shape) * TENSORS[kind] > size:
+                raise ValueError
+    except (struct.error, ValueError, KeyError):
+        raise MitsonarError(f"table {path} is damaged: its header promises what it does not hold; fetch it again") from None

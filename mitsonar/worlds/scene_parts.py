@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError
-from mitsonar.worlds.model_pieces import MOST_TRIANGLES, UP, Piece, read_pieces
+from mitsonar.worlds.meshes import MOST_TRIANGLES, UP, Piece, read_pieces
 from mitsonar.worlds.plain_xml import number_of, read_xml
 
 __all__ = ["Body", "Matrix", "ReadScene", "Shapes", "placed", "primitive", "rigid"]

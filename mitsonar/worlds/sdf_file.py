@@ -10,7 +10,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from mitsonar.errors import MitsonarError, nearest_names, shortened
-from mitsonar.worlds.model_pieces import UNCOLOURED, Piece, one_number
+from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.plain_xml import attribute_of, number_of, numbers_of, read_xml, refused
 from mitsonar.worlds.scene_parts import PLANE_M, Body, Matrix, ReadScene, Shapes, primitive

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, MitsonarWarning, nearest_names, shortened
-from mitsonar.worlds.model_pieces import UNCOLOURED, Piece, one_number
+from mitsonar.worlds.meshes import UNCOLOURED, Piece, one_number
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.plain_xml import attribute_of, number_of, numbers_of, read_xml, refused
 from mitsonar.worlds.scene_parts import Body, Matrix, ReadScene, Shapes, placed, primitive

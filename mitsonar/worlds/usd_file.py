@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError, explain_missing
 from mitsonar.io.files import PlainValue
-from mitsonar.worlds.model_pieces import LUMINANCE, UNCOLOURED, UP, Piece
+from mitsonar.worlds.meshes import LUMINANCE, UNCOLOURED, UP, Piece
 from mitsonar.worlds.model_search import ModelSearch
 from mitsonar.worlds.scene_parts import Body, Matrix, ReadScene, Shapes, placed, primitive
 

@@ -14,7 +14,7 @@ from helpers import PROGRAM, Command, refused
 from PIL import Image
 
 from mitsonar.records.responses import ImpulseResponses
-from mitsonar.worlds.sea_surface import SeaSurface
+from mitsonar.worlds.sea import SeaSurface
 
 SCENE = """<scene version="3.0.0">
     <default name="half" value="13"/>

@@ -206,9 +206,9 @@ def test_a_data_sets_command_is_quoted(mitsonar: Command, tmp_path: Path) -> Non
 def test_a_collada_file_without_its_package_names_the_extra(
     mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from mitsonar.worlds import model_pieces
+    from mitsonar.worlds import meshes
 
-    monkeypatch.setattr(model_pieces, "find_spec", lambda name: None)
+    monkeypatch.setattr(meshes, "find_spec", lambda name: None)
     (tmp_path / "wreck.dae").write_text("<COLLADA/>")
     done = mitsonar("world", "mesh", tmp_path / "wreck.dae", "-o", tmp_path / "w")
     refused(done, "COLLADA needs the package pycollada", "pip install 'mitsonar[meshes]'", "glb, obj, stl or ply")

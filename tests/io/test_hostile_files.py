@@ -53,7 +53,7 @@ from mitsonar.io.storage import refuse_codecs
 from mitsonar.records.frames import SonarFrames
 from mitsonar.records.responses import ImpulseResponses
 from mitsonar.worlds.imported_world import imported_world
-from mitsonar.worlds.user_mesh import mesh_world
+from mitsonar.worlds.meshes import mesh_world
 
 SLOW = {"frames.zarr", "frames.zarr, resumed", "responses.zarr", "data set", "data set, checked", "checkpoint"}
 """Readers that take 20 ms and more a mutant."""
@@ -202,7 +202,7 @@ def test_any_text_as_yaml_and_json(content: str) -> None:
 def test_any_bytes_as_files(content: bytes, tmp_path: Path) -> None:
     from mitsonar.io.files import read_json
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.worlds.mesh_check import check_mesh
+    from mitsonar.worlds.scene_check import check_mesh
 
     path = tmp_path / "any"
     path.write_bytes(content)
@@ -246,7 +246,7 @@ def ply(index: int = 2, count: int = 3, vertices: int = 4, faces: int = 1, order
 @pytest.mark.parametrize("index", [4, -1, 10**5, 10**8, 2 * 10**9])
 @pytest.mark.parametrize("order", ["little", "big"])
 def test_an_index_beyond_the_vertices_is_refused(index: int, order: str, tmp_path: Path) -> None:
-    from mitsonar.worlds.mesh_check import check_mesh
+    from mitsonar.worlds.scene_check import check_mesh
 
     (tmp_path / "good.ply").write_bytes(ply(order=order))
     check_mesh(tmp_path / "good.ply", "ply")
@@ -301,7 +301,7 @@ def test_render_of_a_bad_mesh_in_a_process_of_its_own(tmp_path: Path) -> None:
 def test_amphora_mutants_never_end_mitsuba(tmp_path: Path) -> None:
     """Mutants that the check lets pass are given to Mitsuba, in processes of their own."""
     from mitsonar.simulation.scene import shipped_scenes
-    from mitsonar.worlds.mesh_check import check_mesh
+    from mitsonar.worlds.scene_check import check_mesh
 
     content = (shipped_scenes()["observatory"].parent / "meshes" / "amphora.ply").read_bytes()
     passed = 0
@@ -341,7 +341,7 @@ def test_amphora_mutants_never_end_mitsuba(tmp_path: Path) -> None:
     ],
 )
 def test_a_ply_must_hold_what_it_promises(content: bytes, words: str, tmp_path: Path) -> None:
-    from mitsonar.worlds.mesh_check import check_mesh
+    from mitsonar.worlds.scene_check import check_mesh
 
     (tmp_path / "a.ply").write_bytes(content)
     said = refusal(lambda: check_mesh(tmp_path / "a.ply", "ply"))
@@ -350,7 +350,7 @@ def test_a_ply_must_hold_what_it_promises(content: bytes, words: str, tmp_path: 
 
 
 def test_other_meshes_must_hold_what_they_promise(tmp_path: Path) -> None:
-    from mitsonar.worlds.mesh_check import check_mesh
+    from mitsonar.worlds.scene_check import check_mesh
 
     corners = "v 0 0 0\nv 1 0 0\nv 1 1 0\n"
     box = np.eye(3)
@@ -383,7 +383,7 @@ def test_mitsuba_reads_what_the_check_was_given(tmp_path: Path, variant: str) ->
 
 def test_the_check_costs_milliseconds_once(tmp_path: Path) -> None:
     from mitsonar.simulation.scene import shipped_scenes
-    from mitsonar.worlds.mesh_check import _check_once, check_mesh
+    from mitsonar.worlds.scene_check import _check_once, check_mesh
 
     path = shipped_scenes()["observatory"].parent / "meshes" / "observatory.ply"
     _check_once.cache_clear()
@@ -411,7 +411,7 @@ def test_a_deep_scene_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_model_of_infinite_extent(tmp_path: Path) -> None:
-    from mitsonar.worlds.user_mesh import mesh_world
+    from mitsonar.worlds.meshes import mesh_world
 
     text = "v -1.7e308 0 0\nv 1.7e308 0 0\nv 0 1 0\nf 1 2 3\n"
     (tmp_path / "far.obj").write_text(text)
@@ -421,7 +421,7 @@ def test_a_model_of_infinite_extent(tmp_path: Path) -> None:
 
 
 def test_a_model_that_promises_millions_of_points(tmp_path: Path) -> None:
-    from mitsonar.worlds.user_mesh import mesh_world
+    from mitsonar.worlds.meshes import mesh_world
 
     (tmp_path / "many.ply").write_bytes(ply(vertices=169_000_000))
     assert "promises" in refusal(lambda: mesh_world(tmp_path / "many.ply"))

@@ -108,8 +108,8 @@ def test_a_slope_shows_at_constant_depth(tmp_path: Path, variant: str) -> None:
     from mitsonar.instruments.sounder import load_sonar
     from mitsonar.simulation.imaging import Simulator
     from mitsonar.simulation.scene import load_scene
-    from mitsonar.worlds.pattern import Pattern
-    from mitsonar.worlds.slope import sloped
+    from mitsonar.worlds.families import Pattern
+    from mitsonar.worlds.world import sloped
 
     sloped(Pattern(texture="photo_gravel").build(5), 10).write(tmp_path / "world")
     sonar = load_sonar("didson300").replace(

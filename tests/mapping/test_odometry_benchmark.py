@@ -28,9 +28,8 @@ from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import path_length
 from mitsonar.recordings.write_aris import write_aris
 from mitsonar.records.frames import SonarFrames
-from mitsonar.worlds.ship_hull import ShipHull
-from mitsonar.worlds.slope import sloped
-from mitsonar.worlds.world import Floor, World
+from mitsonar.worlds.families import ShipHull
+from mitsonar.worlds.world import Floor, World, sloped
 
 Row = dict[str, Any]
 

@@ -23,7 +23,7 @@ from mitsonar.motion.pose import Pose, to_world_matrices
 from mitsonar.simulation import beam_former
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
-from mitsonar.worlds.rocky_field import RockyField
+from mitsonar.worlds.families import RockyField
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -90,7 +90,7 @@ def test_the_mean_field_of_a_sea_does_not_depend_on_what_its_mesh_holds(step: fl
 
     150 seas of 2 m/s at 8 kHz, within three standard errors of 0.06: a loss of 0.41.
     """
-    from mitsonar.worlds.sea_surface import SeaSurface
+    from mitsonar.worlds.sea import SeaSurface
 
     carrier, seeds = 8e3, 150
     sea = SeaSurface(wind_m_s=2.0, size_m=16.0, step_m=step, spreading=0.0)

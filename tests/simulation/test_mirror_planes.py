@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.channel import ChannelSimulator
-from mitsonar.worlds.sea_surface import SeaSurface
+from mitsonar.worlds.sea import SeaSurface
 from mitsonar.worlds.world import Mesh
 
 if TYPE_CHECKING:

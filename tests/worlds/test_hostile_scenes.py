@@ -15,8 +15,7 @@ import pytest
 
 from mitsonar.errors import MitsonarError
 from mitsonar.simulation.scene import load_scene
-from mitsonar.worlds.grid_check import check_grid, check_tensors, pixels_of
-from mitsonar.worlds.scene_text import check_text
+from mitsonar.worlds.scene_check import check_grid, check_tensors, check_text, pixels_of
 
 SCENE = '<scene version="3.0.0">{}</scene>'
 OPEN = '<scene version="3.0.0">'
@@ -121,7 +120,7 @@ def test_files_that_include_each_other_are_counted(tmp_path: Path) -> None:
 
 
 def test_elements_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mitsonar.worlds.scene_text.MOST_ELEMENTS", 100)
+    monkeypatch.setattr("mitsonar.worlds.scene_check.MOST_ELEMENTS", 100)
     (tmp_path / "many.xml").write_text(SCENE.format(DIFFUSE * 99))
     check_text(tmp_path / "many.xml", {}, [tmp_path])
     (tmp_path / "many.xml").write_text(SCENE.format(DIFFUSE * 100))

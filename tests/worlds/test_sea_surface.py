@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.worlds.families import create_family
-from mitsonar.worlds.sea_surface import SeaSurface
+from mitsonar.worlds.sea import SeaSurface
 
 SMALL: dict[str, Any] = {"size_m": 8.0, "step_m": 0.25, "wind_m_s": 3.0, "water_m": 6.0}
 

@@ -16,7 +16,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, sonar_in
-from mitsonar.worlds.user_mesh import mesh_world
+from mitsonar.worlds.meshes import mesh_world
 
 
 def painted(kind: str) -> trimesh.Trimesh:

@@ -11,7 +11,7 @@ from helpers import scene, sphere
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.simulation.imaging import Simulator
-from mitsonar.worlds.water_bodies import fishing_net_mesh, particle_mesh
+from mitsonar.worlds.sea import fishing_net_mesh, particle_mesh
 
 
 def normals(vertices: Any, faces: Any) -> Any:

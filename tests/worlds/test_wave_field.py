@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from mitsonar.worlds.wave_field import SHORTEST, Sea, wave_heights
-from mitsonar.worlds.wave_spectrum import GRAVITY, WaveSpectrum, jonswap, pierson_moskowitz
+from mitsonar.worlds.sea import GRAVITY, SHORTEST, Sea, WaveSpectrum, jonswap, pierson_moskowitz, wave_heights
 
 STEP = 0.25
 SHORT = SHORTEST * STEP

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mitsonar.errors import MitsonarError
-from mitsonar.worlds.wave_spectrum import GRAVITY, WaveSpectrum, jonswap, pierson_moskowitz, spreading
+from mitsonar.worlds.sea import GRAVITY, WaveSpectrum, jonswap, pierson_moskowitz, spreading
 
 
 @pytest.mark.parametrize("wind", [1.0, 5.0, 15.0])

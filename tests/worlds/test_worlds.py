@@ -17,12 +17,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, sonar_in
-from mitsonar.worlds.families import FAMILIES, create_family
-from mitsonar.worlds.flat_objects import FlatObjects
-from mitsonar.worlds.pattern import Pattern
-from mitsonar.worlds.perlin_noise import perlin_reflectivity
-from mitsonar.worlds.rocky_field import RockyField
-from mitsonar.worlds.ship_hull import ShipHull
+from mitsonar.worlds.families import FAMILIES, FlatObjects, Pattern, RockyField, ShipHull, create_family, perlin_reflectivity
 from mitsonar.worlds.world import BuiltFamily, Mesh, stream, whole
 
 P = 1e-5

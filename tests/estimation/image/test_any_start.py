@@ -23,7 +23,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene, shipped_trajectory, sonar_in
-from mitsonar.worlds.rocky_field import RockyField
+from mitsonar.worlds.families import RockyField
 
 pytestmark = pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 

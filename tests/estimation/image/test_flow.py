@@ -21,7 +21,7 @@ from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
-from mitsonar.worlds.flat_objects import FlatObjects
+from mitsonar.worlds.families import FlatObjects
 
 UNITS = np.array([1e3, 1e3, 180 / np.pi])
 START = Pose(0.3, -3.5, 2.5, np.radians(35), 0, 0.4)

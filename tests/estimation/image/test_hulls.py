@@ -13,7 +13,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
-from mitsonar.worlds.ship_hull import ShipHull
+from mitsonar.worlds.families import ShipHull
 
 pytestmark = [
     pytest.mark.thorough,

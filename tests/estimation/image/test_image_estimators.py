@@ -26,8 +26,7 @@ from mitsonar.networks.shipped import SHIPPED
 from mitsonar.records.frames import SonarFrames
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene
-from mitsonar.worlds.flat_objects import FlatObjects
-from mitsonar.worlds.rocky_field import RockyField
+from mitsonar.worlds.families import FlatObjects, RockyField
 
 pytestmark = [
     pytest.mark.usefixtures("variant"),
