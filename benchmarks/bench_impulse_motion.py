@@ -51,8 +51,7 @@ from mitsonar import (
     load_scene,
     load_sonar,
 )
-from mitsonar.config.data_recipe import Recipe
-from mitsonar.config.recipe_parts import Split
+from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of, sequences_of
 from mitsonar.datasets.response_packing import with_noise

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from trajectory_jobs import COARSE, FIELD_M, FIELD_SEED, HEIGHT_M, PITCH_DEG, RECIPES
 
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.config.data_recipe import load_recipe
+from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named_estimators import create_estimator

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from mitsonar.acoustics.noise import NoiseModel, information, load_noise
-from mitsonar.config.data_recipe import load_recipe
+from mitsonar.config.data import load_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer

@@ -62,7 +62,7 @@ from trajectory_jobs import (
 from trajectory_pictures import draw, draw_errors, draw_network
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.config.data_recipe import load_recipe, shipped_recipes
+from mitsonar.config.data import load_recipe, shipped_recipes
 from mitsonar.datasets.plan import run_poses
 from mitsonar.errors import MitsonarWarning
 from mitsonar.estimation.estimator import Estimate

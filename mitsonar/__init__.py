@@ -19,7 +19,7 @@ from mitsonar.errors import explain_missing
 
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import load_noise
-    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.config.data import load_recipe
     from mitsonar.datasets.generation import make_dataset
     from mitsonar.datasets.rendered_pairs import RenderedPairs
     from mitsonar.datasets.response_pairs import ImpulsePairs
@@ -174,7 +174,7 @@ _MODULES = {
     "load_meshes": "simulation.moving_files",
     "load_motions": "simulation.moving_files",
     "load_noise": "acoustics.noise",
-    "load_recipe": "config.data_recipe",
+    "load_recipe": "config.data",
     "load_scene": "simulation.scene",
     "load_sensors": "motion.sensors",
     "load_sonar": "instruments.sounder",

@@ -275,7 +275,7 @@ def tiny_recipe(**changes: Any) -> Any:
     """The tiny recipe with some keys changed; dots between levels become ``__``."""
     import copy
 
-    from mitsonar.config.data_recipe import recipe_from
+    from mitsonar.config.data import recipe_from
 
     fields = copy.deepcopy(TINY)
     for key, value in changes.items():
@@ -336,7 +336,7 @@ HEARD: RecipeFields = {
 
 def impulse_recipe(**changes: Any) -> Any:
     """The small recipe of responses with some groups of keys changed."""
-    from mitsonar.config.data_recipe import recipe_from
+    from mitsonar.config.data import recipe_from
 
     groups = {
         name: {**HEARD[name], **value} if isinstance(value, dict) and name in HEARD else value

@@ -199,7 +199,7 @@ def make_recipe(folder: Path) -> None:
 
 
 def read_recipe(folder: Path) -> None:
-    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.config.data import load_recipe
 
     load_recipe(folder / "recipe.yaml")
     load_recipe(folder / "heard.yaml")
@@ -219,7 +219,7 @@ def make_sonar(folder: Path) -> None:
 
 def read_sonar(folder: Path) -> None:
     from mitsonar.acoustics.noise import load_noise
-    from mitsonar.config.training_recipe import load_training_recipe
+    from mitsonar.config.training import load_training_recipe
     from mitsonar.instruments.sounder import load_sonar
 
     load_sonar(folder / "sonar.yaml")

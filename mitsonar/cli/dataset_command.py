@@ -31,7 +31,7 @@ from mitsonar.cli.odometry_command import Geometry
 from mitsonar.errors import MitsonarError, counted
 
 if TYPE_CHECKING:
-    from mitsonar.config.data_recipe import Recipe
+    from mitsonar.config.data import Recipe
     from mitsonar.datasets.generation import Made
 
 __all__ = ["datasets"]
@@ -65,7 +65,7 @@ def make(
     verify: Annotated[bool, typer.Option("--verify", help="Read all stored shards and make damaged ones anew.")] = False,
 ) -> None:
     """Make a data set. After a stop at any moment the same command resumes and ends with the same bytes."""
-    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.config.data import load_recipe
 
     described = load_recipe(recipe, changes_of(change or [], seed))
     if sequences is not None and scale is not None:
@@ -257,7 +257,7 @@ def recipes(
     name: Annotated[str | None, typer.Argument(help="Print the YAML of this recipe, to start your own from.")] = None,
 ) -> None:
     """Print the shipped recipes, or one of them."""
-    from mitsonar.config.data_recipe import load_recipe, shipped_recipes
+    from mitsonar.config.data import load_recipe, shipped_recipes
 
     if name is not None:
         load_recipe(name)

@@ -96,7 +96,7 @@ def height(
 
 def _portions(where: str, view: str | None) -> tuple[tuple[str, ...], str] | None:
     """Return views and their kind, of a data set of vectors alone or of portions of a view; else None."""
-    from mitsonar.config.data_recipe import array_names
+    from mitsonar.config.data import array_names
     from mitsonar.datasets.store import DataStore
     from mitsonar.mapping.open_frames import is_data_set
 

@@ -61,7 +61,7 @@ def train(
     ] = 5.0,
 ) -> None:
     """Train a network. After a stop at any moment --resume continues; on a CPU the result has the same bits."""
-    from mitsonar.config.training_recipe import load_training_recipe
+    from mitsonar.config.training import load_training_recipe
     from mitsonar.training.training_run import leads
     from mitsonar.training.training_run import train as train_network
 

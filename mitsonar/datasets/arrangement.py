@@ -11,7 +11,7 @@ from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise, uniform
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import empty_sentence, renderer_of
 from mitsonar.datasets.plan import Plan, scenes_of

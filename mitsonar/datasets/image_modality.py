@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, load_noise
-from mitsonar.config.data_recipe import Recipe, array_names
+from mitsonar.config.data import Recipe, array_names
 from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, Values, ground_reach
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.views import directions

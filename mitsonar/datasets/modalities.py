@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Modality
 from mitsonar.datasets.response_modality import ResponseModality

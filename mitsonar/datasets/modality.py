@@ -17,7 +17,7 @@ from mitsonar.errors import MitsonarError
 
 if TYPE_CHECKING:
     from mitsonar.acoustics.noise import NoiseModel
-    from mitsonar.config.data_recipe import Recipe
+    from mitsonar.config.data import Recipe
     from mitsonar.datasets.plan import Scene
     from mitsonar.instruments.sonar import Instrument
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Flight, Recipe
+from mitsonar.config.data import Flight, Recipe
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.composition import Motion, compose, motions

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import recipe_from
+from mitsonar.config.data import recipe_from
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.torch_pairs import SonarPairs

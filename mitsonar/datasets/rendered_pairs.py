@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import IterableDataset, get_worker_info
 
-from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
+from mitsonar.config.data import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.batches import Batch, Device, RawSample
 from mitsonar.datasets.modality import Values
 from mitsonar.datasets.plan import Scene, sequences_of, world_seed

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import snr_of
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.modality import Fields, Read, StoredArray, StoredAxis, ground_reach
 from mitsonar.instruments.hydrophones import ChannelSonar, FieldOfView
 

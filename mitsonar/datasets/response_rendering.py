@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene
 from mitsonar.datasets.scene_rendering import loaded_world, refuse_worlds

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import snr_of
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.datasets.response_packing import Packing, packed
 from mitsonar.datasets.sample_index import AnySplit, Part
@@ -41,7 +41,7 @@ class ImpulseSamples:
     Args:
         url: path or URL of the store.
         part: ``train``, ``validation``, ``test``, or ``all``.
-        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
+        split: ``scene``, ``sequence``, keys, or a :class:`~mitsonar.config.data.Split`; default: the recipe's own.
         frames: Q, pings of a sample; default: the recipe's.
         noise: ``none``, a signal-to-noise ratio such as ``20 dB`` (see
             :func:`~mitsonar.datasets.response_packing.noise_power`), or a list of them, of which each sample draws one.

@@ -8,8 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Recipe, Split, split_from
-from mitsonar.config.recipe_parts import SPLITS
+from mitsonar.config.data import SPLITS, Recipe, Split, split_from
 from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.split import deal, deal_samples, world_of
 from mitsonar.datasets.store import DataStore

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.water import noise_of
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.image_modality import ImageModality
 from mitsonar.datasets.modality import Fields, Values
 from mitsonar.datasets.plan import Scene, scenes_of, sequences_of, world_seed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.plan import Scene
 from mitsonar.errors import MitsonarError, meant
 from mitsonar.worlds.world import Family

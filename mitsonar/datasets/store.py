@@ -13,7 +13,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Recipe, recipe_from
+from mitsonar.config.data import Recipe, recipe_from
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import Fields, Modality, Values
 from mitsonar.datasets.plan import Plan, Scene

@@ -9,7 +9,7 @@ import numpy as np
 import zarr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import Modality, StoredArray, Values
 from mitsonar.datasets.plan import Plan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.modality import Fields, Modality
 from mitsonar.io.files import finite_number, whole_number
 

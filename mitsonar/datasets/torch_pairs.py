@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mitsonar.acoustics.noise import NOISE_MODELS, NoiseModel, load_noise
-from mitsonar.config.data_recipe import Recipe, array_names
+from mitsonar.config.data import Recipe, array_names
 from mitsonar.datasets.arrangement import Arrangement, Labels, arrangement_of
 from mitsonar.datasets.batches import Batch, Batches, Device, RawSample, StoredBatches
 from mitsonar.datasets.ground_nodes import ground_of
@@ -212,7 +212,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             together), ``sequence`` (95 and 5 % of the sequences), ``sample`` (Almanza-Medina's: samples are dealt out one by
             one, 90 and 5 %, so that those for validation have a frame in common with those of training; 5 % of the
             sequences are for test), or by, train, validation, test and seed as a dictionary or
-            :class:`~mitsonar.config.data_recipe.Split`; default: the recipe's own.
+            :class:`~mitsonar.config.data.Split`; default: the recipe's own.
         frames: number of frames of a sample; with 1 the labels are heights; default: the recipe's.
         views: which views; default: all.
         kind: ``image`` or ``vector``; default: what is stored.

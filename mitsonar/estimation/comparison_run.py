@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NoiseModel
-from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.modality import samples_of
 from mitsonar.datasets.response_samples import ImpulseSamples

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from, shipped_recipes
-from mitsonar.config.recipe_keys import Keys, set_key
+from mitsonar.config.data import Keys, Recipe, load_recipe, recipe_from, set_key, shipped_recipes
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar, named_sonars

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Split
+from mitsonar.config.data import Split
 from mitsonar.datasets.scene_names import names_of_scenes
 from mitsonar.datasets.split import PARTS, deal, world_of
 from mitsonar.datasets.store import DataStore

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.data_recipe import Recipe, recipe_from
+from mitsonar.config.data import Recipe, recipe_from
 from mitsonar.datasets.modality import Values
 from mitsonar.datasets.plan import Plan, Scene
 from mitsonar.datasets.store import PACKAGES, DataStore

@@ -200,7 +200,7 @@ def view_in(store: DataStore, view: str | None = None) -> StoredView:
     Raises:
         MitsonarError: no images, or no such view.
     """
-    from mitsonar.config.data_recipe import array_names
+    from mitsonar.config.data import array_names
 
     stored = {name: array for array, (kind, name) in array_names(store.recipe).items() if kind == "image"}
     if not stored:

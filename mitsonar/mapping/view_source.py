@@ -104,7 +104,7 @@ class ViewSource:
 
     def _read(self, chosen: NDArray[np.intp], views: tuple[str, ...], kind: str) -> ViewFrames:
         """Read pings as they are stored, with noise."""
-        from mitsonar.config.data_recipe import array_names
+        from mitsonar.config.data import array_names
         from mitsonar.datasets.arrangement import arrangement_of
 
         here = slice(self.first + int(chosen[0]), self.first + int(chosen[-1]) + 1)
@@ -163,7 +163,7 @@ def _check_there(store: DataStore, views: Sequence[str], kind: str) -> None:
     Raises:
         MitsonarError: it does not.
     """
-    from mitsonar.config.data_recipe import array_names
+    from mitsonar.config.data import array_names
 
     there = {view for kind_there, view in array_names(store.recipe).values() if kind_there == kind}
     lacking = [view for view in views if view not in there]

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.datasets.batches import Batches
 from mitsonar.datasets.modality import Fields

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.config.data_recipe import array_names
+from mitsonar.config.data import array_names
 from mitsonar.errors import MitsonarError, counted, nearest_names
 from mitsonar.plotting.response_sheet import response_sheet
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import default_collate
 
-from mitsonar.config.data_recipe import Recipe, Split
+from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.modalities import modality_of
 from mitsonar.datasets.response_pairs import ImpulsePairs
 from mitsonar.datasets.sample_index import split_for

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mitsonar.config.training_recipe import Loss
+from mitsonar.config.training import Loss
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.networks.gaussian_head import GaussianHead, likelihood
 

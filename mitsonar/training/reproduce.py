@@ -15,8 +15,8 @@ from typing import Protocol
 
 from pydantic import ValidationError
 
-from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
-from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
+from mitsonar.config.data import Recipe, load_recipe, recipe_from
+from mitsonar.config.training import TrainingRecipe, load_training_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.sample_index import split_for
 from mitsonar.datasets.store import DataStore

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
-from mitsonar.config.data_recipe import Recipe, load_recipe
-from mitsonar.config.training_recipe import TrainingRecipe
+from mitsonar.config.data import Recipe, load_recipe
+from mitsonar.config.training import TrainingRecipe
 from mitsonar.datasets.joined_pairs import JoinedPairs
 from mitsonar.datasets.rendered_pairs import RawStream, RenderedPairs
 from mitsonar.datasets.response_pairs import ImpulsePairs

@@ -16,7 +16,7 @@ import torch
 import yaml
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from mitsonar.config.training_recipe import TrainingRecipe
+from mitsonar.config.training import TrainingRecipe
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import whole_number, write_whole
 from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind

@@ -20,7 +20,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils import deterministic
 
-from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe
+from mitsonar.config.training import TrainingRecipe, load_training_recipe
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import RunDirectory, other_versions
 from mitsonar.networks.checkpoint import Checkpoint

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mitsonar.config.training_recipe import TrainingRecipe
+from mitsonar.config.training import TrainingRecipe
 from mitsonar.datasets.arrangement import Labels
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import AXES, Axis

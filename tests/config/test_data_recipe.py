@@ -8,7 +8,7 @@ import pytest
 import yaml
 from helpers import TINY
 
-from mitsonar.config.data_recipe import load_recipe, shipped_recipes
+from mitsonar.config.data import load_recipe, shipped_recipes
 from mitsonar.datasets.plan import Plan
 from mitsonar.errors import MitsonarError
 from mitsonar.worlds.families import create_family

@@ -9,7 +9,7 @@ import pytest
 from helpers import files_of, tiny_recipe
 
 from mitsonar.acoustics.levels import coded
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import instrument_in

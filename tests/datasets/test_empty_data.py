@@ -9,7 +9,7 @@ import pytest
 import yaml
 from helpers import HEARD, TINY, Command, essence, refused, tiny_recipe
 
-from mitsonar.config.data_recipe import Recipe, load_recipe, recipe_from
+from mitsonar.config.data import Recipe, load_recipe, recipe_from
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.image_modality import ImageModality

@@ -20,7 +20,7 @@ import pytest
 import yaml
 from helpers import PROGRAM, TINY, Command, by_itself, files_of, refused, tiny_recipe
 
-from mitsonar.config.data_recipe import array_names
+from mitsonar.config.data import array_names
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import Plan, sequences_of
@@ -654,7 +654,7 @@ def test_a_worker_that_dies_again_and_again_is_an_error(tmp_path: Path, monkeypa
 import os, sys
 import mitsonar.datasets.workers as workers
 from mitsonar.datasets.generation import make_dataset
-from mitsonar.config.data_recipe import array_names
+from mitsonar.config.data import array_names
 from helpers import tiny_recipe
 from mitsonar.errors import MitsonarError
 

@@ -11,7 +11,7 @@ import pytest
 from helpers import impulse_recipe, tiny_recipe
 
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.re_render import re_rendered

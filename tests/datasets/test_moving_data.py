@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import place_of, tiny_recipe
 
-from mitsonar.config.data_recipe import Recipe
+from mitsonar.config.data import Recipe
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore

@@ -10,7 +10,7 @@ import pytest
 from helpers import essence, tiny_recipe, world_directions
 from scipy import stats
 
-from mitsonar.config.data_recipe import Recipe, load_recipe
+from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.datasets.image_modality import footprint
 from mitsonar.datasets.plan import Plan, run_poses, scenes_of, sequences_of
 from mitsonar.errors import MitsonarError

@@ -13,7 +13,7 @@ import pytest
 from helpers import Command, files_of, impulse_recipe, refused, run_python, tiny_recipe
 
 from mitsonar.acoustics.noise import snr_of
-from mitsonar.config.data_recipe import load_recipe, shipped_recipes
+from mitsonar.config.data import load_recipe, shipped_recipes
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.modalities import modality_of

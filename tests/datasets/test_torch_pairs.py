@@ -13,7 +13,7 @@ import pytest
 from helpers import DOWN, run_python, tiny_recipe
 
 from mitsonar.acoustics.noise import NOISE_MODELS
-from mitsonar.config.data_recipe import Split, load_recipe
+from mitsonar.config.data import Split, load_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.geometry.fan import to_cartesian

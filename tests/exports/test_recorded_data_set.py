@@ -14,7 +14,7 @@ from helpers import Command, refused
 from numpy.typing import NDArray
 
 from mitsonar import SonarFrames, Trajectory
-from mitsonar.config.data_recipe import load_recipe, recipe_from
+from mitsonar.config.data import load_recipe, recipe_from
 from mitsonar.datasets.data_check import check
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.store import DataStore
@@ -221,7 +221,7 @@ def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[
 @pytest.mark.thorough
 def test_a_network_is_trained_on_it_and_evaluated(places: dict[str, Path], tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    from mitsonar.config.training_recipe import training_recipe_from
+    from mitsonar.config.training import training_recipe_from
     from mitsonar.networks.checkpoint import Checkpoint
     from mitsonar.training.evaluation import evaluate
     from mitsonar.training.training_run import train

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import diffuse, floor, floor_levels, scene, slope
 
-from mitsonar.config.data_recipe import load_recipe
+from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import (
     FAR_GRAZING_RAD,

@@ -768,7 +768,7 @@ HOSTILE_YAML = {
 @pytest.mark.parametrize("kind", ["recipe", "sonar", "noise", "training"])
 def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
     from mitsonar.acoustics.noise import load_noise
-    from mitsonar.config.data_recipe import load_recipe
+    from mitsonar.config.data import load_recipe
     from mitsonar.instruments.sounder import load_sonar
 
     path = tmp_path / f"{kind}.yaml"
@@ -776,7 +776,7 @@ def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
     read: dict[str, Callable[[Any], Any]] = {"recipe": load_recipe, "sonar": load_sonar, "noise": load_noise}
     if kind == "training":
         pytest.importorskip("torch")
-        from mitsonar.config.training_recipe import load_training_recipe
+        from mitsonar.config.training import load_training_recipe
 
         read["training"] = load_training_recipe
     begun = time.monotonic()
@@ -791,8 +791,7 @@ def test_yaml_made_to_harm(kind: str, name: str, tmp_path: Path) -> None:
 def test_values_of_a_recipe_that_cannot_be(key: str, value: Any) -> None:
     import copy
 
-    from mitsonar.config.data_recipe import recipe_from
-    from mitsonar.config.recipe_keys import set_key
+    from mitsonar.config.data import recipe_from, set_key
 
     fields = copy.deepcopy(TINY)
     set_key(fields, key, value)
@@ -814,8 +813,7 @@ def test_long_words_of_a_recipe_are_cut(key: str, value: Any) -> None:
     """A refusal repeated a stranger's word whole."""
     import copy
 
-    from mitsonar.config.data_recipe import recipe_from
-    from mitsonar.config.recipe_keys import set_key
+    from mitsonar.config.data import recipe_from, set_key
 
     fields = copy.deepcopy(TINY)
     set_key(fields, key, value)

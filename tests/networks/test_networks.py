@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsonar.config.data_recipe import Recipe, load_recipe
+from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.errors import MitsonarError
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")

@@ -17,7 +17,7 @@ from helpers import Command, refused
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mitsonar.config.data_recipe import Recipe, load_recipe
+from mitsonar.config.data import Recipe, load_recipe
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import in_units
@@ -42,7 +42,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.config.training_recipe import TrainingRecipe, load_training_recipe, shipped_training_recipes  # noqa: E402
+from mitsonar.config.training import TrainingRecipe, load_training_recipe, shipped_training_recipes  # noqa: E402
 from mitsonar.datasets.torch_pairs import Samples  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402

@@ -16,8 +16,8 @@ from mitsonar.errors import MitsonarError
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
-from mitsonar.config.training_recipe import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
-from mitsonar.config.training_recipe import training_recipe_from as recipe_of  # noqa: E402
+from mitsonar.config.training import Optimiser, load_training_recipe, shipped_training_recipes  # noqa: E402
+from mitsonar.config.training import training_recipe_from as recipe_of  # noqa: E402
 from mitsonar.datasets.response_pairs import ImpulsePairs  # noqa: E402
 from mitsonar.estimation.learned.response_network import ResponseNetwork  # noqa: E402
 from mitsonar.estimation.named_estimators import create_estimator  # noqa: E402

@@ -31,7 +31,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: install mit
 pytestmark = [pytest.mark.learn, pytest.mark.usefixtures("variant", "bare_curves")]
 
 from mitsonar.cli.train_command import train as command  # noqa: E402
-from mitsonar.config.training_recipe import (  # noqa: E402
+from mitsonar.config.training import (  # noqa: E402
     Loss,
     Optimiser,
     TrainingRecipe,
@@ -364,7 +364,7 @@ def test_a_part_of_the_data_is_its_first_frames(made: Path) -> None:
 KILLED = """
     import os, sys
     from mitsonar.io import whole_files as files
-    from mitsonar.config.training_recipe import load_training_recipe
+    from mitsonar.config.training import load_training_recipe
     from mitsonar.training.training_run import train
 
     if __name__ == "__main__":

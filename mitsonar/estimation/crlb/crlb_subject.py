@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.config.recipe_parts import MirrorKeys
+from mitsonar.config.data import MirrorKeys
 from mitsonar.datasets.scene_rendering import SceneRenderer
 from mitsonar.datasets.split import deal, world_of
 from mitsonar.datasets.store import DataStore

@@ -243,7 +243,7 @@ class TestNetworks:
 
     @staticmethod
     def trained(data: Path, run: Path, **words: Any) -> Any:
-        from mitsonar.config.training_recipe import training_recipe_from
+        from mitsonar.config.training import training_recipe_from
         from mitsonar.training.training_run import train
 
         small = {

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mitsonar.config.data_recipe import load_recipe
+from mitsonar.config.data import load_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.errors import MitsonarError
 from mitsonar.motion.errors import in_units

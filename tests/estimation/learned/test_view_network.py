@@ -13,7 +13,7 @@ import pytest
 from helpers import DOWN, Command, essence, tiny_recipe
 
 from mitsonar.acoustics.noise import load_noise
-from mitsonar.config.data_recipe import load_recipe
+from mitsonar.config.data import load_recipe
 from mitsonar.datasets.generation import make_dataset
 from mitsonar.datasets.plan import scenes_of
 from mitsonar.datasets.scene_rendering import SceneRenderer
@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning"),
 ]
 
-from mitsonar.config.training_recipe import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
+from mitsonar.config.training import Optimiser, load_training_recipe, training_recipe_from  # noqa: E402
 from mitsonar.datasets.torch_pairs import Samples, SonarPairs  # noqa: E402
 from mitsonar.estimation.learned.image_network import ImageNetwork  # noqa: E402
 from mitsonar.estimation.learned.view_network import ViewNetwork, _rejection_of_profiles  # noqa: E402

@@ -13,9 +13,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from mitsonar.acoustics.noise import load_noise, snr_of
-from mitsonar.config.data_recipe import Split, split_from
-from mitsonar.config.recipe_keys import Keys, recipe_fields, set_key
-from mitsonar.config.recipe_parts import SPLITS
+from mitsonar.config.data import SPLITS, Keys, Split, recipe_fields, set_key, split_from
 from mitsonar.errors import MitsonarError, complaint, shortened
 
 __all__ = ["Input", "Loss", "Optimiser", "TrainingRecipe", "Validate", "load_training_recipe", "shipped_training_recipes"]
