@@ -30,7 +30,7 @@ from rocky_seabed import mitsuba_scene, rocky_seabed
 from mitsonar import MitsonarWarning, Simulator, Sonar, SonarFrames, Trajectory, load_scene
 from mitsonar.instruments.sonar import frame_period_s, scans
 from mitsonar.instruments.sounder import named_sonars, preset
-from mitsonar.plotting.fan_figure import fan_figure
+from mitsonar.plotting.fans import fan_figure
 from mitsonar.simulation.variant import ensure_variant
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from mitsonar.mapping.illumination import ILLUMINATION_FRAMES, illumination
 from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
 from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.plotting.fan_figure import GAMMA
+from mitsonar.plotting.fans import GAMMA
 from mitsonar.records.frames import SonarFrames
 
 if TYPE_CHECKING:

@@ -18,8 +18,7 @@ import numpy as np
 import mitsonar
 from mitsonar.mapping.sounding_run import run_sounder
 from mitsonar.motion.pose import Pose
-from mitsonar.plotting.fan_figure import save_fan
-from mitsonar.plotting.fan_video import write_fan_video
+from mitsonar.plotting.fans import save_fan, write_fan_video
 
 SOUNDED = {
     "sidescan": ("waterfall.png", Pose(-6, -3, 2.5, heading=math.pi / 2), Pose(6, -3, 2.5, heading=math.pi / 2), 240),

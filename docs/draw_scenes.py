@@ -19,7 +19,7 @@ from PIL import Image
 
 import mitsonar
 from mitsonar.motion.pose import Pose
-from mitsonar.plotting.fan_figure import fan_figure
+from mitsonar.plotting.fans import fan_figure
 from mitsonar.simulation.scene import sonar_in
 
 SPAN_DB = 50.0

@@ -48,8 +48,7 @@ if TYPE_CHECKING:
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.sensors import VehicleSensors, load_sensors, save_sensors
     from mitsonar.motion.trajectory import Trajectory
-    from mitsonar.plotting.data_sheet import sheet_figure
-    from mitsonar.plotting.map_figure import mosaic_figure, path_figure
+    from mitsonar.plotting.figures import mosaic_figure, path_figure, sheet_figure
     from mitsonar.recordings.open import open_recording
     from mitsonar.recordings.write_mcap import write_mcap
     from mitsonar.records.frames import SonarFrames
@@ -182,16 +181,16 @@ _MODULES = {
     "load_tables": "training.document_tables",
     "load_vehicle": "simulation.vehicle",
     "make_dataset": "datasets.generation",
-    "mosaic_figure": "plotting.map_figure",
+    "mosaic_figure": "plotting.figures",
     "odometry": "mapping.odometry",
     "open_recording": "recordings.open",
     "particle_mesh": "worlds.sea",
-    "path_figure": "plotting.map_figure",
+    "path_figure": "plotting.figures",
     "path_of": "mapping.motion_series",
     "range_rates": "records.soundings",
     "reproduce": "training.reproduce",
     "save_sensors": "motion.sensors",
-    "sheet_figure": "plotting.data_sheet",
+    "sheet_figure": "plotting.figures",
     "shipped_trajectory": "simulation.scene",
     "simulated_sensors": "mapping.simulated_sensors",
     "sonar_in": "simulation.scene",

@@ -113,7 +113,7 @@ def crlb(
     report = report_of(source, subject.sonar, "of the receiver" if speckle else noise, name, rows)
     if plot is not None:
         from mitsonar.io.files import write_whole
-        from mitsonar.plotting.crlb_figure import crlb_png
+        from mitsonar.plotting.figures import crlb_png
 
         write_whole(plot, crlb_png(report))
     if as_json:

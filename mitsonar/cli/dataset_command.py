@@ -174,7 +174,7 @@ def info(
     import yaml
 
     from mitsonar.datasets.store import DataStore
-    from mitsonar.plotting.data_sheet import info as information
+    from mitsonar.plotting.figures import info as information
 
     store = DataStore.open(data, unfinished=True)
     if recipe:
@@ -220,7 +220,7 @@ def show(
     from mitsonar.datasets.store import DataStore
     from mitsonar.io.files import write_whole
     from mitsonar.io.runs import refuse_to_replace
-    from mitsonar.plotting.data_sheet import sheet_figure
+    from mitsonar.plotting.figures import sheet_figure
 
     store = DataStore.open(data)
     path = out or Path(Path(store.place.url).stem + ".png")

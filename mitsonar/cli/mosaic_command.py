@@ -186,7 +186,7 @@ def _counted(chunks: Iterator[SonarFrames], progress: Callable[[int], None]) -> 
 def _save_figures(
     out: Path, quality: Path, found: Mosaic, paths: dict[str, Trajectory], source: FrameSource, along: str
 ) -> None:
-    from mitsonar.plotting.map_figure import mosaic_figure, quality_figure, save_figure
+    from mitsonar.plotting.figures import mosaic_figure, quality_figure, save_figure
 
     name = Path(source.name).name
     save_figure(out, mosaic_figure(found, paths, title=f"{name}, along the {along} path"))

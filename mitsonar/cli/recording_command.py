@@ -94,8 +94,7 @@ def show(
     overwrite: Overwrite = False,
 ) -> None:
     """Draw one frame as a fan with axes in metres and a colour bar in dB."""
-    from mitsonar.plotting.decibel_frames import coded_in_decibels
-    from mitsonar.plotting.fan_figure import save_fan
+    from mitsonar.plotting.fans import coded_in_decibels, save_fan
 
     refuse_to_replace(out, overwrite=overwrite)
     recording = _opened(file, topic, geometry)
@@ -116,7 +115,7 @@ def video(
     overwrite: Overwrite = False,
 ) -> None:
     """Write the frames as a video of fans."""
-    from mitsonar.plotting.fan_video import write_fan_video
+    from mitsonar.plotting.fans import write_fan_video
 
     recording = _opened(file, topic, geometry)
     _say_notes(recording)

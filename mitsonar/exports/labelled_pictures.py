@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mitsonar.acoustics.water import noise_of
 from mitsonar.errors import MitsonarError, nearest_names
 from mitsonar.geometry.fan import nearest_cells
-from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.plotting.fans import FanPictures
 from mitsonar.records.frames import SonarFrames, to_uint8
 
 __all__ = ["LEAST_SNR_DB", "LabelledPictures", "PictureKind", "Region", "class_rules"]

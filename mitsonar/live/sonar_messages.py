@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 
 from mitsonar.io.files import PlainValue
 from mitsonar.live.live_loop import LivePing
-from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.plotting.fans import FanPictures
 from mitsonar.records.frames import SonarFrames, to_uint8
 
 __all__ = ["PROJECTED", "PROJECTED_TYPE", "FanEncoder", "projected_image", "timing"]

@@ -28,7 +28,7 @@ from mitsonar.motion.errors import AXES, in_units
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import VehicleSensors
 from mitsonar.motion.trajectory import Trajectory, convention_named
-from mitsonar.plotting.map_figure import path_figure, save_figure
+from mitsonar.plotting.figures import path_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,7 +18,7 @@ from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.mapping.dvl_sensors import dvl_sensors
 from mitsonar.motion.sensors import save_sensors
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.plotting import sounding_figures
+from mitsonar.plotting import figures
 from mitsonar.recordings.write_xtf import write_xtf
 from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.dvl import dvl_readings
@@ -169,16 +169,16 @@ def _draw(folder: Path, echogram: Echogram, soundings: Soundings) -> None:
     """Write the pictures of an echogram, and a side-scan's XTF file."""
     if echogram.sounder.kind == "sidescan":
         write_xtf(folder / "sidescan.xtf", echogram)
-        sounding_figures.save_sounding_figure(sounding_figures.waterfall_figure_of(echogram), folder / "waterfall.png")
+        figures.save_sounding_figure(figures.waterfall_figure_of(echogram), folder / "waterfall.png")
     else:
-        sounding_figures.save_sounding_figure(sounding_figures.echogram_figure(echogram, soundings), folder / "echogram.png")
+        figures.save_sounding_figure(figures.echogram_figure(echogram, soundings), folder / "echogram.png")
 
 
 def _write_dvl(folder: Path, soundings: Soundings) -> list[str]:
     """Write the readings of a DVL, and the file that odometry takes."""
     readings = dvl_readings(soundings, soundings.sounder.fan.seed)
     readings.save(folder / "dvl.csv")
-    sounding_figures.save_sounding_figure(sounding_figures.dvl_figure(readings), folder / "dvl.png")
+    figures.save_sounding_figure(figures.dvl_figure(readings), folder / "dvl.png")
     lost = int((~readings.locked).sum())
     if lost == len(readings.locked):
         return ["the DVL has no bottom lock in any ping: there is no sensors.csv"]
@@ -191,10 +191,10 @@ def _write_points(folder: Path, soundings: Soundings) -> list[str]:
     soundings.save(folder / "soundings.csv")
     if soundings.sounder.kind == "altimeter":
         return []
-    drawn = sounding_figures.soundings_figure(soundings)
-    sounding_figures.save_sounding_figure(drawn, folder / "soundings.png")
+    drawn = figures.soundings_figure(soundings)
+    figures.save_sounding_figure(drawn, folder / "soundings.png")
     if soundings.sounder.kind == "range-image":
-        sounding_figures.save_sounding_figure(sounding_figures.range_figure(soundings), folder / "range.png")
+        figures.save_sounding_figure(figures.range_figure(soundings), folder / "range.png")
     if find_spec("trimesh") is None:
         return ["there is no soundings.ply without trimesh: pip install 'mitsonar[meshes]'"]
     soundings.save(folder / "soundings.ply")

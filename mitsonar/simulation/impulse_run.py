@@ -17,7 +17,7 @@ from mitsonar.io.files import write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.plotting.response_figure import response_png, waterfall_png
+from mitsonar.plotting.figures import response_png, waterfall_png
 from mitsonar.records.frames import check_column
 from mitsonar.records.responses import COLUMNS, ImpulseResponses
 from mitsonar.simulation.channel import ChannelSimulator, Paths

@@ -20,8 +20,7 @@ from mitsonar.io.files import write_whole
 from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.motion.bodies import BodyStates
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.plotting.fan_figure import save_fan
-from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.plotting.fans import FanPictures, save_fan
 from mitsonar.records.echoes import Echoes, load_exr, save_exr
 from mitsonar.records.frames import LONGEST_NPZ, FrameStore, SonarFrames, to_uint8
 from mitsonar.simulation.device_arrays import padded

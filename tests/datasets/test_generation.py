@@ -32,7 +32,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import versions
 from mitsonar.io.storage import Storage
 from mitsonar.motion.pose import mounted
-from mitsonar.plotting.data_sheet import info, sheet_figure
+from mitsonar.plotting.figures import info, sheet_figure
 from mitsonar.records.frames import to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene

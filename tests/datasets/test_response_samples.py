@@ -27,7 +27,7 @@ from mitsonar.estimation.named_estimators import create_estimator
 from mitsonar.motion.composition import Motion, compose, motions, steady
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory, velocities
-from mitsonar.plotting.data_sheet import info
+from mitsonar.plotting.figures import info
 from mitsonar.simulation.scene import load_scene
 
 

@@ -27,7 +27,7 @@ from mitsonar.geometry.fan import nearest_cells
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
-from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.plotting.fans import FanPictures
 from mitsonar.records.frames import FrameStore, SonarFrames, to_uint8
 from mitsonar.simulation.scene import shape_names_in, shipped_scenes
 

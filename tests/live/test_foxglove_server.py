@@ -33,7 +33,7 @@ from mitsonar.live.live_loop import LivePing, live_pings
 from mitsonar.live.pose_mailbox import PoseMailbox
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.plotting.fans import FanPictures
 from mitsonar.records.frames import SonarFrames, to_uint8
 from mitsonar.simulation.imaging import Simulator
 from mitsonar.simulation.scene import load_scene

@@ -24,7 +24,7 @@ from mitsonar.mapping.illumination import illumination
 from mitsonar.mapping.mosaic import Blend, Mosaic, build_mosaic
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
-from mitsonar.plotting.map_figure import mosaic_figure, path_figure, quality_figure, save_figure
+from mitsonar.plotting.figures import mosaic_figure, path_figure, quality_figure, save_figure
 from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from PIL import Image
 
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
-from mitsonar.plotting.fan_pictures import FanPictures
+from mitsonar.plotting.fans import FanPictures
 from mitsonar.records.frames import SonarFrames
 
 SONAR = Sonar(beams=8, range_bins=24, rays_per_beam=40, rays_across=1, range_min=2.0, range_max=6.0, bearing="azimuth")

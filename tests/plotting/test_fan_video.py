@@ -10,8 +10,7 @@ import pytest
 from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError
-from mitsonar.plotting.decibel_frames import coded_in_decibels
-from mitsonar.plotting.fan_video import write_fan_video
+from mitsonar.plotting.fans import coded_in_decibels, write_fan_video
 
 cv2 = pytest.importorskip("cv2")
 

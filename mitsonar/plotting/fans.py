@@ -1,0 +1,247 @@
+"""Figures."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from mitsonar.acoustics.levels import decoded
+from mitsonar.errors import MitsonarError, explain_missing
+from mitsonar.geometry.fan import CartesianMap, cartesian_map, nearest_cells, to_cartesian
+from mitsonar.io.files import write_json, write_whole
+from mitsonar.io.runs import refuse_to_replace
+from mitsonar.records.frames import SonarFrames, to_float32, to_uint8
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["CODECS", "FanPictures", "coded_in_decibels", "fan_figure", "save_fan", "write_fan_video"]
+
+
+GAMMA = 0.6
+"""Power that levels are shown with, so that faint ground can be seen beside bright faces; the colour bar says it."""
+
+
+def fan_figure(frames: SonarFrames, index: int = 0, *, title: str = "") -> Figure:
+    """One frame as a fan with metre axes: forward up, starboard to the right."""
+    from matplotlib.colors import Normalize, PowerNorm
+    from matplotlib.figure import Figure
+
+    fan = to_cartesian(frames.image[index], frames.range_m, frames.bearing_rad)
+    left, right, low, high = fan.extent
+    height = 6.0
+    width = float(np.clip(height * (right - left) / (high - low), 3.0, 14.0))
+    figure = Figure(figsize=(width + 1.6, height), layout="constrained")
+    axes = figure.add_subplot(facecolor="black")
+    values = fan.image / (255 if frames.image.dtype == np.uint8 else 1)
+    if frames.level == "dB":
+        low, high = frames.decibels_of(0.0), frames.decibels_of(1.0)
+        values, norm = low + values * (high - low), Normalize(low, high)
+        label = "level (dB re 1 uPa)" if frames.sonar.source_level_db else "level (dB re the source at 1 m)"
+        label = "level (dB re full scale)" if (low, high) == (-frames.sonar.coding_db, 0.0) else label
+        label += " with gain" if frames.sonar.gain_exponent or frames.sonar.gain_absorption else ""
+    else:
+        norm, label = PowerNorm(GAMMA, vmin=0, vmax=1), f"level (1 = full scale; shown with gamma {GAMMA:g})"
+    shown = axes.imshow(values, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
+    axes.set(xlabel="starboard (m)", ylabel="forward (m)", title=title)
+    figure.colorbar(shown, ax=axes, label=label, fraction=0.04)
+    return figure
+
+
+def save_fan(path: str | Path, frames: SonarFrames, index: int = 0, *, title: str = "") -> None:
+    """Write :func:`fan_figure` as PNG; whole or not at all."""
+    import io
+
+    from mitsonar.io.files import write_whole
+
+    buffer = io.BytesIO()
+    fan_figure(frames, index, title=title).savefig(buffer, format="png", dpi=110)
+    write_whole(path, buffer.getvalue())
+
+
+# ---------------- Plain fan pictures: pixels in metres without axes or colours, and label maps beside them that mix
+# nothing
+
+
+LABELS: dict[str, tuple[str, type[np.uint8] | type[np.uint16]]] = {
+    "shape_id": ("shape", np.uint16),
+    "object_id": ("object", np.uint16),
+    "shadow": ("shadow", np.uint8),
+}
+"""Label maps that become pictures: the picture's name and type. Identifiers are stored plus one: 0 is no echo."""
+
+
+class FanPictures:
+    """Fan pictures of frames of one sonar, forward up and starboard to the right; a pixel is as long as a range bin.
+
+    Args:
+        frames: whose ranges and bearings the pictures have.
+
+    Attributes:
+        fan: which cells make each pixel.
+        pixel_m: edge of a pixel [m].
+    """
+
+    def __init__(self, frames: SonarFrames) -> None:
+        step = float(np.diff(frames.range_m).mean()) if len(frames.range_m) > 1 else 1.0
+        coarse = cartesian_map(frames.range_m, frames.bearing_rad, rows=2)
+        low, high = coarse.extent[2:]
+        self.fan: CartesianMap = cartesian_map(frames.range_m, frames.bearing_rad, rows=max(2, round((high - low) / step)))
+        self.pixel_m = (high - low) / self.fan.index.shape[1]
+
+    def picture(self, image: NDArray[Any]) -> NDArray[np.uint8]:
+        """Return the levels of one frame ``(bins, beams)``, 0..1 or 0..255, as ``(rows, columns)``; 0 outside the fan."""
+        return to_uint8(np.asarray(self.fan.apply(to_float32(image))))
+
+    def labels(self, frames: SonarFrames, index: int) -> dict[str, NDArray[Any]]:
+        """Return the label pictures of one frame by name, each pixel the label of the nearest cell."""
+        found = {}
+        for label, (name, kind) in LABELS.items():
+            values = getattr(frames, label)
+            if values is not None:
+                shown = values[index] + (0 if label == "shadow" else 1)
+                found[name] = nearest_cells(self.fan, np.clip(shown, 0, np.iinfo(kind).max).astype(kind), 0)
+        return found
+
+    def save(self, folder: Path, frames: SonarFrames, index: int, number: int) -> None:
+        """Write ``NUMBER.png`` and ``NUMBER.LABEL.png`` of one frame, and ``fan.json`` once, each whole or not at all."""
+        pictures = {"": self.picture(frames.image[index]), **self.labels(frames, index)}
+        for name, values in pictures.items():
+            buffer = io.BytesIO()
+            Image.fromarray(values).save(buffer, format="PNG", compress_level=3)
+            write_whole(folder / f"{number:06d}{'.' * bool(name)}{name}.png", buffer.getvalue())
+        if not (folder / "fan.json").is_file():
+            starboard, forward = self.fan.extent[:2], self.fan.extent[2:]
+            write_json(folder / "fan.json", {"pixel_m": self.pixel_m, "starboard_m": starboard, "forward_m": forward})
+
+
+# ---------------- Videos of fans (MP4, AVI), written frame by frame
+
+
+CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
+"""Codec by the ending of the name."""
+
+Picture = NDArray[np.uint8]
+
+
+def write_fan_video(
+    chunks: Iterable[SonarFrames],
+    path: str | Path,
+    rate_hz: float,
+    *,
+    span_db: float = 60.0,
+    rows: int = 720,
+    overwrite: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> int:
+    """Write frames of one geometry as a video: forward up, starboard right, with number and time since the first.
+
+    The file is whole or absent.
+
+    Args:
+        chunks: the frames, some at a time.
+        path: of the video, ``.mp4`` or ``.avi``.
+        rate_hz: frames a second.
+        span_db: levels from full scale down that are shown [dB].
+        rows: height of the picture [px].
+        overwrite: replace a file that is there.
+        progress: called with how many more frames are written.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        MitsonarError: a file that is there, another ending, no frames, or OpenCV cannot write the codec.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in CODECS:
+        raise MitsonarError(f"{path}: videos end with {' or '.join(CODECS)}")
+    refuse_to_replace(path, overwrite=overwrite)
+    if not path.parent.is_dir():
+        raise MitsonarError(f"cannot write {path}: there is no folder {path.parent}; make it first")
+    part = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        count = _write(chunks, part, rate_hz, span_db, rows, progress or (lambda done: None))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return count
+
+
+def _write(
+    chunks: Iterable[SonarFrames], path: Path, rate_hz: float, span_db: float, rows: int, progress: Callable[[int], None]
+) -> int:
+    """Write all frames and return their number."""
+    try:
+        import cv2
+    except ModuleNotFoundError as error:
+        raise explain_missing(error) from None
+    colours = _colours()
+    writer, fan, count, begin = None, None, 0, 0.0
+    try:
+        for frames in chunks:
+            if fan is None:
+                fan = cartesian_map(frames.range_m, frames.bearing_rad, rows=2 * (rows // 2))
+            shown = coded_in_decibels(frames, span_db).image
+            for image, time in zip(shown, np.atleast_2d(frames.time_s.T).T.mean(axis=1), strict=True):
+                values = np.asarray(fan.apply(np.asarray(image, np.float32)))
+                picture = _even(colours[np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)])
+                begin = begin if count else float(time)
+                text = f"{count}   {time - begin:.2f} s"
+                cv2.putText(picture, text, (8, 22), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+                if writer is None:
+                    codec = cv2.VideoWriter.fourcc(*CODECS[path.suffix.lower()])
+                    writer = cv2.VideoWriter(str(path), codec, rate_hz, (picture.shape[1], picture.shape[0]))
+                    if not writer.isOpened():
+                        raise MitsonarError(f"OpenCV cannot write {path.suffix} here: choose another ending")
+                writer.write(picture)
+                count += 1
+                progress(1)
+    finally:
+        if writer is not None:
+            writer.release()
+    if not count:
+        raise MitsonarError("there are no frames to show")
+    return count
+
+
+def _colours() -> Picture:
+    """Return blue, green, red of each value ``(256, 3)``, those of the other figures."""
+    from matplotlib import colormaps
+
+    table = np.asarray(colormaps["copper"](np.arange(256)))[:, 2::-1]
+    return np.asarray(np.rint(255 * table), dtype=np.uint8)
+
+
+def _even(picture: Picture) -> Picture:
+    """Return a picture with an even number of columns, as codecs want it."""
+    return np.ascontiguousarray(np.pad(picture, ((0, 0), (0, picture.shape[1] % 2), (0, 0))))
+
+
+# ---------------- Frames of any coding with values that are decibels, for pictures
+
+
+def coded_in_decibels(frames: SonarFrames, span_db: float) -> SonarFrames:
+    """Return frames whose values 0..1, float32, are the ``span_db`` decibels below full scale; what is lower is 0.
+
+    Raises:
+        MitsonarError: a span that is not above 0.
+    """
+    if not 0 < span_db <= 300:
+        raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
+    values = to_float32(frames.image)
+    if frames.level == "dB":
+        shown = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db)
+        shown[values <= 0] = 0
+    else:
+        with np.errstate(divide="ignore"):
+            shown = 1 + 10 * np.log10(decoded(np.clip(values, 0, 1), frames.sonar, frames.level)) / span_db
+    sonar = frames.sonar.replace(coding="dB", coding_db=span_db)
+    return replace(frames, image=np.clip(shown, 0, 1).astype(np.float32), level="dB", sonar=sonar)

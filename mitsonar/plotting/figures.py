@@ -1,0 +1,827 @@
+"""Figures of mosaics and paths."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from matplotlib.colors import PowerNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from mitsonar.acoustics.noise import NOISE_MODELS
+from mitsonar.config.data import array_names
+from mitsonar.errors import MitsonarError, counted, nearest_names
+from mitsonar.io.files import write_whole
+from mitsonar.motion.composition import motions
+from mitsonar.motion.errors import AXES
+from mitsonar.motion.trajectory import Trajectory
+from mitsonar.plotting.fans import GAMMA
+from mitsonar.records.responses import ImpulseResponses
+from mitsonar.records.soundings import DvlReadings, Echogram, Soundings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from mitsonar.datasets.store import DataStore
+    from mitsonar.mapping.mosaic import Mosaic
+
+__all__ = [
+    "crlb_png",
+    "dvl_figure",
+    "echogram_figure",
+    "info",
+    "mosaic_figure",
+    "path_figure",
+    "quality_figure",
+    "range_figure",
+    "response_figure",
+    "response_png",
+    "response_sheet",
+    "save_figure",
+    "save_sounding_figure",
+    "sheet_figure",
+    "soundings_figure",
+    "waterfall_figure",
+    "waterfall_figure_of",
+    "waterfall_png",
+]
+
+
+ALMANZA_COLOURS = {"estimated": ("red", "darkblue"), "true": ("limegreen", "cyan")}
+"""Line and arrows of a path (Almanza-Medina, fig. 2.9 and 3.7)."""
+
+OTHER_COLOURS = (("tab:orange", "tab:brown"), ("tab:purple", "tab:pink"), ("tab:olive", "tab:gray"))
+
+ARROWS = 20
+"""Number of headings drawn along a path, about."""
+
+UNSEEN = "0.9"
+"""Grey of cells that no frame observed."""
+
+BAND = 2
+"""Half width of error bands [standard deviations]."""
+
+
+def mosaic_figure(mosaic: Mosaic, paths: Mapping[str, Trajectory] | None = None, *, title: str = "") -> Figure:
+    """Draw the mean level of a mosaic in metres, with a scale bar, and paths of the sonar with arrows along its heading.
+
+    Args:
+        mosaic: to draw.
+        paths: by name, for the legend; ``estimated`` and ``true`` have the colours of Almanza-Medina's figures: red line and
+            dark blue arrows, green line and cyan arrows.
+        title: of the figure.
+    """
+    from matplotlib.colors import PowerNorm
+
+    figure, (axes,) = _maps(1, mosaic, paths)
+    level = mosaic.mean
+    norm = PowerNorm(GAMMA, vmin=0, vmax=float(np.nanpercentile(level, 99.9)) or 1.0)
+    shown = axes.imshow(level, extent=mosaic.extent, cmap="copper", norm=norm, interpolation="antialiased")
+    figure.colorbar(shown, ax=axes, label=f"mean level (1 = full scale; shown with gamma {GAMMA:g})", fraction=0.04)
+    _draw_paths(axes, paths or {})
+    _finish_map(axes, mosaic, paths or {}, title)
+    return figure
+
+
+def quality_figure(mosaic: Mosaic, *, title: str = "") -> Figure:
+    """Draw the standard deviation of the frames that observed each cell, and their number."""
+    figure, (left, right) = _maps(2, mosaic, None)
+    spread = mosaic.std
+    top = float(np.nanpercentile(spread, 99.5)) if np.isfinite(spread).any() else 1.0
+    shown = left.imshow(spread, extent=mosaic.extent, cmap="magma", vmin=0, vmax=top or 1.0, interpolation="antialiased")
+    figure.colorbar(shown, ax=left, label="standard deviation of the frames' levels", fraction=0.04)
+    count = np.where(mosaic.count > 0, mosaic.count, np.nan)
+    shown = right.imshow(count, extent=mosaic.extent, cmap="viridis", vmin=0, interpolation="antialiased")
+    figure.colorbar(shown, ax=right, label="frames that saw the cell", fraction=0.04)
+    for axes in (left, right):
+        _finish_map(axes, mosaic, {}, title if axes is left else "")
+    return figure
+
+
+def path_figure(
+    paths: Mapping[str, Trajectory],
+    *,
+    motion_covariances: Mapping[str, NDArray[np.float64]] | None = None,
+    pose_covariances: Mapping[str, NDArray[np.float64]] | None = None,
+    title: str = "",
+) -> Figure:
+    """Draw paths from above, and over time the heading and the motion between frames on each axis (eq. 3.4).
+
+    Args:
+        paths: by name; colours as in :func:`mosaic_figure`.
+        motion_covariances: of (sideways, forward [m], yaw [rad]) ``(frames - 1, 3, 3)`` of the paths that have them; nan
+            where unknown. Bands show two standard deviations.
+        pose_covariances: of (x, y [m], heading [rad]) ``(frames, 3, 3)``, for ellipses along the path and the band of the
+            heading; two standard deviations too.
+        title: of the figure.
+
+    Raises:
+        MitsonarError: no path, a covariance of an unknown path, or one whose shape does not fit its path.
+    """
+    from matplotlib.figure import Figure
+
+    if not paths:
+        raise MitsonarError("there is no path to draw: give at least one")
+    of_motions = _checked(paths, motion_covariances or {}, "motion_covariances", fewer=1)
+    of_poses = _checked(paths, pose_covariances or {}, "pose_covariances", fewer=0)
+    figure = Figure(figsize=(13.0, 7.0), layout="constrained")
+    grid = figure.add_gridspec(len(AXES) + 1, 2)
+    above = figure.add_subplot(grid[:, 0])
+    over_time = [figure.add_subplot(grid[0, 1])]
+    over_time += [figure.add_subplot(grid[row, 1], sharex=over_time[0]) for row in range(1, len(AXES) + 1)]
+    _draw_paths(above, paths)
+    for name, line, _ in _colours(paths):
+        path = paths[name]
+        if name in of_poses:
+            _draw_ellipses(above, path.poses[:, :2], of_poses[name][:, :2, :2], line)
+        heading = np.degrees(np.unwrap(path.poses[:, 5]))
+        _banded(over_time[0], path.time_s, heading, _std(of_poses.get(name), 2, math.degrees(1)), line)
+        moved = motions(path.poses)
+        for axis, (_, _, scale) in enumerate(AXES):
+            band = _std(of_motions.get(name), axis, scale)
+            _banded(over_time[1 + axis], path.time_s[1:], moved[:, axis] * scale, band, line)
+    _label_path(above, over_time, title)
+    return figure
+
+
+def save_figure(path: str | Path, figure: Figure, *, dpi: int = 130) -> None:
+    """Write a figure, whole or not at all, in the format of the name's ending: ``.png``, ``.pdf``, ``.svg``.
+
+    Raises:
+        MitsonarError: the ending is no format of figures.
+    """
+    kind = Path(path).suffix.lstrip(".").lower()
+    known = figure.canvas.get_supported_filetypes()
+    if kind not in known:
+        raise MitsonarError(f"a figure's name must end in one of {', '.join(sorted(known))}: got {str(path)!r}")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=dpi)
+    write_whole(path, buffer.getvalue())
+
+
+# ---------------------------------------------------------------- maps
+
+
+def _maps(panels: int, mosaic: Mosaic, paths: Mapping[str, Trajectory] | None) -> tuple[Figure, list[Axes]]:
+    """Create a figure of maps side by side, with the proportions of the ground and the paths."""
+    from matplotlib.figure import Figure
+
+    west, east, south, north = _view(mosaic, paths or {})
+    height = float(np.clip(9.0 * (north - south) / (east - west), 3.5, 9.0))
+    width = float(np.clip(height * (east - west) / (north - south), 3.5, 11.0))
+    figure = Figure(figsize=(panels * (width + 1.6), height + 0.8), layout="compressed")
+    axes = [figure.add_subplot(1, panels, 1 + panel, facecolor=UNSEEN) for panel in range(panels)]
+    return figure, axes
+
+
+def _view(mosaic: Mosaic, paths: Mapping[str, Trajectory]) -> tuple[float, float, float, float]:
+    """Return west, east, south, north of a map and its paths [m], with a margin."""
+    west, east, south, north = mosaic.extent
+    places = [np.array([[west, south], [east, north]]), *(path.poses[:, :2] for path in paths.values())]
+    low, high = np.min([p.min(axis=0) for p in places], axis=0), np.max([p.max(axis=0) for p in places], axis=0)
+    margin = 0.04 * float((high - low).max())
+    return low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin
+
+
+def _finish_map(axes: Axes, mosaic: Mosaic, paths: Mapping[str, Trajectory], title: str) -> None:
+    """Set limits, labels, scale bar and legend."""
+    west, east, south, north = _view(mosaic, paths)
+    axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
+    axes.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title)
+    _scale_bar(axes, east - west)
+    if paths:
+        axes.legend(loc="upper left", fontsize="small")
+
+
+def _scale_bar(axes: Axes, width_m: float) -> None:
+    """Draw a bar of a round length, about a fifth of the map."""
+    from matplotlib.patches import Rectangle
+
+    length = _round_length(width_m / 5)
+    (west, east), (south, north) = axes.get_xlim(), axes.get_ylim()
+    right, low, thick = east - 0.03 * (east - west), south + 0.03 * (north - south), 0.012 * (north - south)
+    bar = Rectangle((right - length, low), length, thick, facecolor="black", edgecolor="white", zorder=5)
+    axes.add_patch(bar)
+    label = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    box = {"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5}
+    axes.text(right - length / 2, low + 2 * thick, label, ha="center", va="bottom", bbox=box, zorder=5)
+
+
+def _round_length(wanted: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is not above ``wanted``."""
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return max(step * power for step in (1, 2, 5) if step * power <= wanted * (1 + 1e-9))
+
+
+# ---------------------------------------------------------------- paths
+
+
+def _colours(paths: Mapping[str, Trajectory]) -> Iterator[tuple[str, str, str]]:
+    """Yield name, line colour and arrow colour of each path."""
+    others = 0
+    for name in paths:
+        if name in ALMANZA_COLOURS:
+            yield name, *ALMANZA_COLOURS[name]
+        else:
+            yield name, *OTHER_COLOURS[others % len(OTHER_COLOURS)]
+            others += 1
+
+
+def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
+    """Set labels, legend and grids of :func:`path_figure`."""
+    above.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title, aspect="equal")
+    above.set_adjustable("datalim")
+    above.legend(loc="best")
+    over_time[0].set_ylabel("heading (deg)")
+    for axes, (name, unit, _) in zip(over_time[1:], AXES, strict=True):
+        axes.set_ylabel(f"{name} ({unit})")
+    over_time[-1].set_xlabel("time (s)")
+    for axes in (above, *over_time):
+        axes.grid(alpha=0.3)
+
+
+def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
+    """Draw lines with arrows along the heading, and mark the start."""
+    for name, line, arrow in _colours(paths):
+        poses = paths[name].poses
+        axes.plot(poses[:, 0], poses[:, 1], color=line, label=name, linewidth=1.5, zorder=3)
+        axes.plot(*poses[0, :2], marker="o", color=line, markersize=4, zorder=3)
+        some = poses[_some(len(poses))]
+        ahead = np.sin(some[:, 5]), np.cos(some[:, 5])
+        axes.quiver(*some[:, :2].T, *ahead, color=arrow, scale=25, width=0.003, zorder=4)
+
+
+def _some(frames: int) -> NDArray[np.intp]:
+    """Select the frames with arrows and ellipses."""
+    return np.unique(np.linspace(0, frames - 1, min(ARROWS, frames)).astype(np.intp))
+
+
+def _draw_ellipses(axes: Axes, place: NDArray[np.float64], covariance: NDArray[np.float64], colour: str) -> None:
+    """Draw ellipses of two standard deviations around some of the positions ``(frames, 2)``."""
+    from matplotlib.patches import Ellipse
+
+    for one in _some(len(place)):
+        if np.isfinite(covariance[one]).all():
+            variance, direction = np.linalg.eigh(covariance[one])
+            width, height = 2 * BAND * np.sqrt(np.maximum(variance, 0))
+            turn = math.degrees(math.atan2(direction[1, 0], direction[0, 0]))
+            axes.add_patch(Ellipse(tuple(place[one]), width, height, angle=turn, color=colour, alpha=0.2, linewidth=0))
+
+
+def _checked(
+    paths: Mapping[str, Trajectory], covariances: Mapping[str, NDArray[np.float64]], what: str, fewer: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return covariances as arrays, after a check that they fit their paths.
+
+    Raises:
+        MitsonarError: an unknown path, or another shape.
+    """
+    for name, values in covariances.items():
+        if name not in paths:
+            raise MitsonarError(f"{what} names no path that is drawn: got {name!r}; paths: {', '.join(paths)}")
+        wanted = (len(paths[name]) - fewer, 3, 3)
+        if np.shape(values) != wanted:
+            raise MitsonarError(f"{what} of {name} must be {wanted}: got {np.shape(values)}")
+    return {name: np.asarray(values, dtype=float) for name, values in covariances.items()}
+
+
+def _std(covariances: NDArray[np.float64] | None, axis: int, scale: float) -> NDArray[np.float64] | None:
+    return None if covariances is None else scale * np.sqrt(covariances[:, axis, axis])
+
+
+def _banded(
+    axes: Axes, time: NDArray[np.float64], value: NDArray[np.float64], std: NDArray[np.float64] | None, colour: str
+) -> None:
+    """Draw a line with a band of two standard deviations."""
+    axes.plot(time, value, color=colour, linewidth=1.0)
+    if std is not None:
+        axes.fill_between(time, value - BAND * std, value + BAND * std, color=colour, alpha=0.2, linewidth=0)
+
+
+# ---------------- Figures of impulse responses
+
+
+FAINT_DB = -40.0
+"""Lower end of the waterfall's scale [dB]."""
+
+
+def response_figure(responses: ImpulseResponses, ping: int = 0) -> Figure:
+    """Draw magnitude, real and imaginary part of one ping over taps and range (Almanza-Medina, fig. 5.4)."""
+    from matplotlib.figure import Figure
+
+    sonar, count = responses.sonar, len(responses.sonar.receivers)
+    values = responses.response[ping] / max(float(np.abs(responses.response[ping]).max()), 1e-30)
+    begin, end = _strong_taps(responses)
+    figure = Figure(figsize=(9, 1.2 + 1.5 * count), layout="constrained")
+    grid = figure.subplots(count, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    taps = np.arange(begin, end)
+    for axes, one, receiver in zip(grid, values, sonar.receivers, strict=True):
+        axes.plot(taps, np.abs(one[begin:end]), color="black", lw=1.2, label="magnitude")
+        axes.plot(taps, one[begin:end].real, color="tab:blue", lw=0.7, label="real")
+        axes.plot(taps, one[begin:end].imag, color="tab:orange", lw=0.7, label="imaginary")
+        axes.set_ylabel(receiver.name)
+        axes.grid(alpha=0.3)
+    per_m = 2 * sonar.sampling_hz / sonar.sound_speed
+    above = grid[0].secondary_xaxis("top", functions=(lambda tap: tap / per_m, lambda range_m: range_m * per_m))
+    above.set_xlabel("half the path's length (m)")
+    grid[0].legend(loc="upper right", fontsize=8, ncols=3)
+    grid[-1].set_xlabel(f"tap ({1e3 / sonar.sampling_hz:.4g} ms each)")
+    figure.suptitle(_title(responses, f"ping {ping}, divided by the largest magnitude"), fontsize=10)
+    return figure
+
+
+def waterfall_figure(responses: ImpulseResponses) -> Figure:
+    """Draw the magnitude over time and delay at each receiver, in dB of the largest."""
+    from matplotlib.figure import Figure
+
+    sonar, count = responses.sonar, len(responses.sonar.receivers)
+    begin, end = _strong_taps(responses)
+    level = np.abs(responses.response[:, :, begin:end])
+    decibel = 20 * np.log10(np.maximum(level / max(float(level.max()), 1e-30), 10 ** (FAINT_DB / 20)))
+    time = responses.time_s
+    half = 0.5 * (time[1] - time[0]) if len(time) > 1 else 0.5 / sonar.frame_rate_hz
+    # a row is drawn around its time
+    extent = (1e3 * begin / sonar.sampling_hz, 1e3 * end / sonar.sampling_hz, time[-1] + half, time[0] - half)
+    figure = Figure(figsize=(2.6 * count + 1.6, 4.5), layout="constrained")
+    grid = figure.subplots(1, count, sharex=True, sharey=True, squeeze=False)[0]
+    for number, (axes, receiver) in enumerate(zip(grid, sonar.receivers, strict=True)):
+        shown = axes.imshow(
+            decibel[:, number], extent=extent, aspect="auto", cmap="magma", vmin=FAINT_DB, vmax=0, interpolation="nearest"
+        )
+        axes.set(title=receiver.name, xlabel="delay (ms)")
+    grid[0].set_ylabel("time (s)")
+    figure.colorbar(shown, ax=list(grid), label="dB of the largest of all receivers", fraction=0.04)
+    figure.suptitle(_title(responses, counted(len(responses), "ping")), fontsize=10)
+    return figure
+
+
+def response_png(responses: ImpulseResponses) -> bytes:
+    """Return the PNG of :func:`response_figure` for the first ping."""
+    return _png(response_figure(responses))
+
+
+def waterfall_png(responses: ImpulseResponses) -> bytes:
+    """Return the PNG of :func:`waterfall_figure`."""
+    return _png(waterfall_figure(responses))
+
+
+def _strong_taps(responses: ImpulseResponses) -> tuple[int, int]:
+    """Return the first tap with a visible level, and the tap after the last one, with a margin."""
+    level = np.abs(responses.response).max(axis=(0, 1))
+    loud = np.flatnonzero(level > level.max() * 10 ** (FAINT_DB / 20))
+    if not level.max() > 0:
+        return 0, len(level)
+    margin = max(4, (loud[-1] - loud[0]) // 10)
+    return max(0, int(loud[0] - margin)), min(len(level), int(loud[-1] + margin + 1))
+
+
+def _title(responses: ImpulseResponses, what: str) -> str:
+    sonar = responses.sonar
+    bands = f"{sonar.carrier_hz / 1e3:g} kHz, bandwidth {sonar.bandwidth_hz / 1e3:g} kHz"
+    return f"{sonar.title}, {sonar.model} model: {bands}; {what}"
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
+
+
+# ---------------- Overview of a data set of impulse responses: pings of some samples, phase changes, labels and mean
+# energy
+
+
+SAMPLED_PINGS = 200
+"""Pings that means are taken over, about."""
+
+
+def response_sheet(store: DataStore, *, samples: int = 4, receiver: str | None = None, seed: int = 0) -> Figure:
+    """Draw the first and last ping of samples, the phase between them and the label; below, mean energy and labels.
+
+    Args:
+        store: a data set of impulse responses.
+        samples: number of samples to draw.
+        receiver: its name; default: the first.
+        seed: of the draw of the samples.
+
+    Raises:
+        MitsonarError: no such receiver, or no sequence with the recipe's number of pings.
+    """
+    names = [one.name for one in store.recipe.channel_sonar.receivers]
+    receiver = receiver or names[0]
+    if receiver not in names:
+        raise MitsonarError(f"unknown receiver {receiver}: {nearest_names(receiver, names)}")
+    pings, sequence = store.recipe.frames, store.read("sequence")
+    first = np.arange(max(0, len(sequence) - pings + 1))
+    first = first[sequence[first] == sequence[first + pings - 1]]
+    if not len(first):
+        raise MitsonarError(f"{store.place.url} has no {pings} pings in one sequence: nothing to show")
+    shown = np.sort(np.random.default_rng(seed).choice(first, size=min(samples, len(first)), replace=False))
+    figure = Figure(figsize=(13, 2.6 * (len(shown) + 1)), layout="constrained")
+    axes = figure.subplots(len(shown) + 1, 3, squeeze=False)
+    for row, start in zip(axes, shown.tolist(), strict=False):
+        _response_sample(row, store, names.index(receiver), start, pings)
+    _response_summary(axes[-1], store, names)
+    figure.suptitle(
+        f"{store.recipe.name}, receiver {receiver}: {counted(len(store), 'ping')} in "
+        f"{counted(store.about['sequences'], 'sequence')}"
+    )
+    return figure
+
+
+def _response_sample(axes: NDArray[np.object_], store: DataStore, receiver: int, start: int, pings: int) -> None:
+    """Draw magnitudes, the phase from first to last ping where the response is strong, and the label."""
+    delay_ms = 1e3 * store.read("delay_s")
+    response = store.read("response", slice(start, start + pings))[:, receiver]
+    for place, style in ((0, "-"), (pings - 1, ":")):
+        axes[0].plot(delay_ms, np.abs(response[place]), style, lw=0.8, label=f"ping {start + place}")
+    axes[0].set(xlabel="delay (ms)", ylabel="magnitude", title=f"scene {store.read('scene')[start]}")
+    axes[0].legend(fontsize=7)
+    loud = np.abs(response[0]) > 0.1 * np.abs(response[0]).max(initial=0)
+    turned = np.degrees(np.angle(response[-1] * response[0].conj()))
+    axes[1].plot(delay_ms[loud], turned[loud], ".", ms=3)
+    axes[1].set(xlabel="delay (ms)", ylabel="phase, first to last (deg)", ylim=(-180, 180))
+    axes[2].axis("off")
+    motion, pose = store.read("motion")[start], store.read("pose")[start]
+    text = (
+        f"a ping: sideways {1e3 * motion[0]:+.2f} mm\n        forward  {1e3 * motion[1]:+.2f} mm\n"
+        f"        yaw {np.degrees(motion[2]):+.3f} deg\nover z = 0 {pose[2]:.3f} m"
+    )
+    axes[2].text(0, 0.5, text, fontsize=9, va="center", family="monospace", transform=axes[2].transAxes)
+
+
+def _response_summary(axes: NDArray[np.object_], store: DataStore, names: list[str]) -> None:
+    """Draw the mean energy of the taps of each receiver, and the distribution of the motions."""
+    every = max(1, len(store) // SAMPLED_PINGS)
+    some = store.read("response", slice(None, None, every))
+    for receiver, name in enumerate(names):
+        energy = _decibels((np.abs(some[:, receiver]) ** 2).mean(axis=0))
+        axes[0].plot(1e3 * store.read("delay_s"), energy, lw=0.8, label=name)
+    axes[0].set(xlabel="delay (ms)", ylabel="mean energy (dB)", ylim=(-80, 3))
+    axes[0].legend(fontsize=7)
+    motion = store.read("motion")
+    motion = motion[~np.isnan(motion).any(axis=1)]
+    axes[1].plot(*(1e3 * motion[:, :2].T), ".", ms=2)
+    axes[1].set(xlabel="sideways (mm a ping)", ylabel="forward (mm a ping)", aspect="equal")
+    axes[2].hist(np.degrees(motion[:, 2]), bins=40, color="0.4")
+    axes[2].set(xlabel="yaw (deg a ping)", ylabel="pings")
+
+
+def _decibels(energy: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return levels over the largest [dB]."""
+    largest = energy.max() if energy.size and energy.max() > 0 else 1.0
+    return np.asarray(10 * np.log10(np.maximum(energy / largest, 1e-12)))
+
+
+# ---------------- Figures of what sounders give: waterfalls, echograms, soundings from above, range images,
+# velocities of a DVL
+
+
+SPAN_DB = 50.0
+"""Span of pictures of levels below full scale [dB]."""
+
+MOST_POINTS = 200_000
+"""Points that are drawn of a cloud, at most."""
+
+
+def save_sounding_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG, whole or absent."""
+    part = path.with_name(f".{path.name}.part")
+    figure.savefig(part, dpi=110, format="png", metadata={"Software": None})
+    part.replace(path)
+
+
+def waterfall_figure_of(echogram: Echogram) -> Figure:
+    """Draw a side-scan's waterfall: port to the left, slant range athwart, the first ping below."""
+    figure, axes = _figure(8.4, 5.2)
+    level, channels = echogram.decibels(SPAN_DB), echogram.sounder.channels
+    port, starboard = (level[:, channels.index(side)] for side in ("port", "starboard"))
+    far, near = echogram.sounder.fan.range_max, echogram.sounder.fan.range_min
+    along = _along(echogram)
+    shown = {"cmap": "copper", "vmin": -SPAN_DB, "vmax": 0, "aspect": "auto", "origin": "lower", "interpolation": "nearest"}
+    picture = axes.imshow(port[:, ::-1], extent=(-far, -near, *along), **shown)
+    axes.imshow(starboard, extent=(near, far, *along), **shown)
+    axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel="along the path (m)")
+    figure.colorbar(picture, ax=axes, label="level (dB)")
+    axes.set_title(f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
+    return figure
+
+
+def echogram_figure(echogram: Echogram, soundings: Soundings | None = None) -> Figure:
+    """Draw the levels of the first fan over time and range, and the detections over them."""
+    figure, axes = _figure(8.4, 3.8)
+    time_s, fan = echogram.time_s, echogram.sounder.fan
+    half = 0.5 * (time_s[-1] - time_s[0]) / max(1, len(time_s) - 1) or 0.5 / fan.frame_rate_hz
+    extent = (time_s[0] - half, time_s[-1] + half, fan.range_max, fan.range_min)
+    shown = {"cmap": "viridis", "vmin": -SPAN_DB, "vmax": 0, "aspect": "auto", "interpolation": "nearest"}
+    picture = axes.imshow(echogram.decibels(SPAN_DB)[:, 0].T, extent=extent, **shown)
+    if soundings is not None:
+        axes.plot(time_s, soundings.range_m[:, 0, 0], color="tab:red", lw=1, label="first echo")
+        axes.legend(loc="lower right", fontsize=8)
+    axes.set(xlabel="time (s)", ylabel="range (m)")
+    axes.set_title(f"{echogram.sounder.name}, {fan.model}, {counted(len(echogram), 'ping')}", fontsize=10)
+    figure.colorbar(picture, ax=axes, label="level (dB)")
+    return figure
+
+
+def soundings_figure(soundings: Soundings) -> Figure:
+    """Draw the soundings from above, coloured by their height."""
+    figure, axes = _figure(6.4, 5.2)
+    points = soundings.points()[soundings.found]
+    points = points[:: max(1, len(points) // MOST_POINTS)]
+    low, high = np.percentile(points[:, 2], [1, 99]) if len(points) else (0, 1)
+    drawn = axes.scatter(*points.T[:2], c=points[:, 2], s=1.5, lw=0, cmap="viridis", vmin=low, vmax=high)
+    axes.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
+    axes.set_title(f"{soundings.sounder.name}: {counted(int(soundings.found.sum()), 'sounding')}", fontsize=10)
+    figure.colorbar(drawn, ax=axes, label="z (m)")
+    return figure
+
+
+def range_figure(soundings: Soundings, ping: int = 0) -> Figure:
+    """Draw the range image of one ping: rows over beams."""
+    figure, axes = _figure(7.6, 4.2)
+    sounder = soundings.sounder
+    half = np.degrees(np.abs(sounder.fan.bearing_rad).max())
+    tall = sounder.rows * sounder.fan.elevation_fov_deg / 2
+    image = soundings.range_m[ping, : sounder.rows]
+    picture = axes.imshow(image, extent=(-half, half, -tall, tall), cmap="viridis_r", aspect="auto", interpolation="nearest")
+    axes.set(xlabel="bearing (deg)", ylabel="elevation (deg)")
+    axes.set_title(f"{sounder.name}, {sounder.fan.model}, ping {ping}", fontsize=10)
+    figure.colorbar(picture, ax=axes, label="range (m)")
+    return figure
+
+
+def dvl_figure(readings: DvlReadings, true: NDArray[np.float64] | None = None) -> Figure:
+    """Draw velocities with twice their standard deviation, and the altitude.
+
+    Args:
+        readings: of the DVL.
+        true: velocities of the vehicle ``(pings, 3)`` [m/s], where known.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.4, 4.6), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+    time_s = readings.soundings.time_s
+    std = np.sqrt(np.diagonal(readings.covariance, axis1=1, axis2=2))
+    for axis, (name, colour) in enumerate((("starboard", "tab:blue"), ("forward", "tab:orange"), ("up", "tab:green"))):
+        middle = readings.velocity[:, axis]
+        above.plot(time_s, middle, ".", ms=3, color=colour, label=name)
+        above.fill_between(time_s, middle - 2 * std[:, axis], middle + 2 * std[:, axis], color=colour, alpha=0.2, lw=0)
+        if true is not None:
+            above.plot(time_s, true[:, axis], color="black", lw=0.8)
+    above.set_ylabel("velocity (m/s)")
+    above.legend(loc="upper right", fontsize=8, ncols=3)
+    below.plot(time_s, readings.altitude_m, ".", ms=3, color="black")
+    below.set(xlabel="time (s)", ylabel="altitude (m)")
+    lost = int((~readings.locked).sum())
+    above.set_title(
+        f"{readings.soundings.sounder.name}: {counted(len(time_s), 'ping')}, {lost} without bottom lock", fontsize=10
+    )
+    return figure
+
+
+def _figure(width: float, height: float) -> tuple[Figure, Any]:
+    """Return a figure with one pair of axes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots()
+
+
+def _along(echogram: Echogram) -> tuple[float, float]:
+    """Return the first and the last edge of the pings along the path [m]; of a vehicle at rest they count pings."""
+    steps = np.linalg.norm(np.diff(echogram.poses[:, :3], axis=0), axis=1)
+    length = float(steps.sum())
+    if length < 1e-9:
+        return -0.5, len(echogram) - 0.5
+    half = length / len(steps) / 2
+    return -half, length + half
+
+
+# ---------------- Overview of a data set: a sheet of samples, labels and mean image, and a table of its contents
+
+
+SAMPLED_FRAMES = 200
+"""Frames that means are taken over, about."""
+
+Table: TypeAlias = dict[str, Any]
+"""Contents of a data set by name: numbers, words, lists of words, or tables of them."""
+
+Stored: TypeAlias = "NDArray[np.uint8] | NDArray[np.float32]"
+"""Pixels or vectors as they are stored."""
+
+
+def sheet_figure(store: DataStore, *, samples: int = 4, view: str | None = None, seed: int = 0) -> Figure:
+    """Draw samples with their labels, the distribution of the labels, and the mean image.
+
+    Data sets of responses get a :func:`~mitsonar.plotting.figures.response_sheet`.
+
+    Args:
+        store: the data set.
+        samples: number of samples to draw.
+        view: name of a view or receiver; default: the first.
+        seed: of the draw of the samples.
+
+    Raises:
+        MitsonarError: no such view, or no sequence with the recipe's number of frames.
+    """
+    if store.recipe.channel is not None:
+        return response_sheet(store, samples=samples, receiver=view, seed=seed)
+    names = {v: name for name, (kind, v) in array_names(store.recipe).items() if kind == store.recipe.kinds[0]}
+    view = view or next(iter(names))
+    if view not in names:
+        raise MitsonarError(f"unknown view {view}: {nearest_names(view, names)}")
+    frames, name = store.recipe.frames, names[view]
+    sequence = store.read("sequence")
+    first = np.arange(max(0, len(sequence) - frames + 1))
+    first = first[sequence[first] == sequence[first + frames - 1]]
+    if not len(first):
+        raise MitsonarError(f"{store.place.url} has no {frames} frames in one sequence: nothing to show")
+    shown = np.sort(np.random.default_rng(seed).choice(first, size=min(samples, len(first)), replace=False))
+    columns = max(frames + 2, 4)
+    figure = Figure(figsize=(3.1 * columns, 2.8 * (len(shown) + 1)), layout="constrained")
+    axes = figure.subplots(len(shown) + 1, columns, squeeze=False)
+    for row, start in enumerate(shown):
+        for place in range(columns):
+            _sample(axes[row, place], store, name, view, int(start), place, frames)
+    _summary(axes[-1], store, name, view)
+    figure.suptitle(
+        f"{store.recipe.name}, view {view}: {counted(len(store), 'frame')} in "
+        f"{counted(store.about['sequences'], 'sequence')}"
+    )
+    return figure
+
+
+def _extent(store: DataStore, view: str) -> tuple[float, float, float, float]:
+    """Return bearing [deg] and range [m] at the borders of an image, nearest at the bottom."""
+    shown = next(v for v in store.recipe.views if v.name == view)
+    port, starboard = np.degrees(shown.bearing_rad[[0, -1]])
+    return float(port), float(starboard), shown.sonar.range_min, shown.sonar.range_max
+
+
+def _draw(axes: Axes, store: DataStore, values: NDArray[np.float64], view: str, title: str, *, top: float = 1.0) -> None:
+    """Draw an image with gamma 0.6 and ``top`` white, or a vector as a line; axes in degrees and metres."""
+    if values.ndim == 1:
+        axes.plot(store.read("range_m"), values, lw=0.7)
+        axes.set(xlabel="range (m)", ylabel="sum of levels")
+    else:
+        norm = PowerNorm(0.6, vmin=0, vmax=top)
+        axes.imshow(values, extent=_extent(store, view), origin="lower", aspect="auto", cmap="copper", norm=norm)
+        axes.set(xlabel="bearing (deg)", ylabel="range (m)")
+    axes.set_title(title, fontsize=8)
+
+
+def _levels(values: Stored) -> NDArray[np.float64]:
+    """Return pixels as fractions of the maximum; vectors as they are."""
+    return np.asarray(values, dtype=float) / (255 if values.dtype == np.uint8 else 1)
+
+
+def _sample(axes: Axes, store: DataStore, name: str, view: str, start: int, place: int, frames: int) -> None:
+    """Draw one panel of a sample: a frame, after the last frame the difference, then the label."""
+    if place < frames:
+        title = f"frame {start + place}, scene {store.read('scene')[start + place]}"
+        _draw(axes, store, _levels(store.read(name, start + place)), view, title)
+    elif place == frames and frames > 1:
+        first, last = (_levels(store.read(name, frame)) for frame in (start, start + frames - 1))
+        if first.ndim == 1:
+            axes.plot(store.read("range_m"), last - first, lw=0.7)
+        else:
+            axes.imshow(
+                last - first, extent=_extent(store, view), origin="lower", aspect="auto", cmap="RdBu_r", vmin=-0.3, vmax=0.3
+            )
+        axes.set_title("last minus first" + (" (+-0.3)" if first.ndim == 2 else ""), fontsize=8)
+    else:
+        axes.axis("off")
+        if place == min(frames + 1, 2 * frames):
+            axes.text(
+                0, 0.5, _label(store, start, frames), fontsize=9, va="center", family="monospace", transform=axes.transAxes
+            )
+
+
+def _label(store: DataStore, start: int, frames: int) -> str:
+    """Return motion and height of a sample in words."""
+    motion, height = store.read("motion")[start], store.read("height_m")[start]
+    text = f"over z = 0  {store.read('pose')[start, 2]:.3f} m\nover what is below {height:.3f} m"
+    if frames == 1:
+        return text
+    sideways, forward, yaw = 1e3 * motion[0], 1e3 * motion[1], np.degrees(motion[2])
+    return f"sideways {sideways:+.2f} mm\nforward  {forward:+.2f} mm\nyaw {yaw:+.3f} deg\n{text}"
+
+
+def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) -> None:
+    """Draw the mean image, and histograms of the labels."""
+    mean = _levels(_sampled(store, name)).mean(axis=0)
+    top = float(mean.max()) or 1.0
+    _draw(axes[0], store, mean, view, "mean of frames" + (f" (white {top:.3g})" if mean.ndim == 2 else ""), top=top)
+    motion = store.read("motion")
+    motion = motion[~np.isnan(motion).any(axis=1)]
+    if len(motion):
+        columns = [motion[:, 0] * 1e3, motion[:, 1] * 1e3, np.degrees(motion[:, 2])]
+        names = ["sideways (mm)", "forward (mm)", "yaw (deg)"]
+    else:
+        columns, names = [store.read("pose")[:, 2]], ["height (m)"]
+    for place, axis in enumerate(axes[1:]):
+        if place < len(columns):
+            axis.hist(columns[place], bins=40, color="0.4")
+            axis.set(xlabel=names[place], ylabel="frames")
+        else:
+            axis.axis("off")
+
+
+def _sampled(store: DataStore, name: str) -> Stored:
+    """Read some frames of the whole data set: whole chunks, evenly spread."""
+    chunk = int(store.about["chunk_frames"])
+    starts = np.arange(0, len(store), chunk)
+    some = starts[np.unique(np.linspace(0, len(starts) - 1, max(1, SAMPLED_FRAMES // chunk)).astype(int))]
+    return np.concatenate([store.read(name, slice(start, start + chunk)) for start in some])
+
+
+def _level(store: DataStore, name: str, view: str) -> Table:
+    """Measure the part of the pixels with an echo, their mean level, and its ratio to the scale of each noise."""
+    some = _levels(_sampled(store, name))
+    if some.ndim == 2:  # sums over the beams
+        beams = next(len(v.bearing_rad) for v in store.recipe.views if v.name == view)
+        echoes, pixels = int(_sampled(store, name.replace("vector", "nonzero", 1)).sum()), some.size * beams
+    else:
+        echoes, pixels = int(np.count_nonzero(some)), some.size
+    mean = float(some.sum()) / max(echoes, 1)
+    noise = {model: mean / NOISE_MODELS[model].scale for model in ("low", "high", "chapter2")}
+    return {"filled": echoes / pixels, "signal_mean": mean, "signal_over_noise": noise}
+
+
+def _levels_of(store: DataStore) -> Table:
+    """Measure the level of each view of a finished data set."""
+    names = array_names(store.recipe).items() if store.finished else ()
+    return {view: _level(store, name, view) for name, (kind, view) in names if kind == store.recipe.kinds[0]}
+
+
+def info(store: DataStore) -> Table:
+    """Describe the contents of a data set by name; values are numbers, words, or tables of them."""
+    about, sizes = store.about, store.place.sizes()
+    arrays = {}
+    for name, stored in store.modality.stored.items():
+        if stored.shape:
+            size = sum(size for key, size in sizes.items() if key.startswith(f"{name}/"))
+            shape = "x".join(map(str, (len(store), *stored.shape)))
+            arrays[name] = f"{shape} {stored.kind}, {size / max(len(store), 1):,.0f} bytes a {store.modality.what}"
+    done = int((store.seals().any(axis=(1, 2))).sum())
+    return {
+        "name": store.recipe.name,
+        "about": store.recipe.about,
+        "finished": store.finished,
+        "shards": f"{done} of {store.shards}",
+        "frames": len(store),
+        "sequences": about["sequences"],
+        "scenes": len(about["scenes"]),
+        "model": store.modality.sonar.model,
+        "sonar": store.modality.sonar.name,
+        **({"views": list(about["views"])} if "views" in about else {"receivers": about["receivers"]}),
+        "seed": store.recipe.seed,
+        **{name: about[name] for name in ("gain",) if name in store.modality.settled},
+        "bytes": sum(sizes.values()),
+        "arrays": arrays,
+        **({"levels": _levels_of(store)} if store.recipe.channel is None else {}),
+        "variant": about["variant"],
+        "versions": about["versions"],
+    }
+
+
+# ---------------- The figure of Cramer-Rao bounds
+
+
+Report: TypeAlias = Mapping[str, Any]
+"""A report of :mod:`mitsonar.estimation.crlb.crlb_report`: its keys, with rows of bounds under ``rows``."""
+
+
+def crlb_png(report: Report) -> bytes:
+    """Draw the bounds of two frames against the variable, or for each pose, and return the PNG."""
+    from matplotlib.figure import Figure
+
+    name = report["vary"]
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    panels = figure.subplots(1, 3)
+    series: dict[str, list[tuple[float | str, list[float | None]]]] = {}
+    for row in report["rows"]:
+        label = " ".join([row["portion"], row["data"], row["law"]])
+        if name is None:
+            series[label] = list(enumerate(row["two_frames_each"]))
+        elif row["two_frames"] is not None:
+            x = "..".join(f"{v:g}" for v in row[name]) if name == "window" else row[name]
+            series.setdefault(label, []).append((x, row["two_frames"]))
+    for axis, (panel, unit) in enumerate(zip(panels, report["units"], strict=True)):
+        for label, points in series.items():
+            known = [(x, std[axis]) for x, std in points if std[axis] is not None]
+            panel.plot([x for x, _ in known], [y for _, y in known], "o-" if name else ".", label=label, markersize=4)
+        panel.set(xlabel=name or "pose", ylabel=unit, yscale="log")
+        panel.grid(alpha=0.3, which="both")
+    panels[0].legend(fontsize=7)
+    figure.suptitle(f"least standard deviation of two frames, noise {report['noise']}", fontsize=10)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    return buffer.getvalue()
